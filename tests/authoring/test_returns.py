@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from workbench.authoring.load import LoadedTask, load_task
 from workbench.authoring.problem import Problem
 from workbench.authoring.returns import check_step_returns
-from workbench.core.returns import wrong_reward
+from workbench.core.entries import wrong_reward
 
 Write = Callable[..., Path]
 N = 4

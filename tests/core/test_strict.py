@@ -24,7 +24,7 @@ from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.strict import BrokenRule, RuleWarning, WrongReturn
+from workbench.core.broken_rule import BrokenRule, RuleWarning, WrongReturn
 from workbench.core.strict_system import StrictCpuSystem
 from workbench.core.struct_access import STATE_PROPERTIES, TARGET_SETTERS
 from workbench.core.task_env import EnvOptions, make_env

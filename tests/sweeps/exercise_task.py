@@ -23,7 +23,7 @@ from tests.sweeps.upstream_faults import Fault, faults_of, where_it_fails
 from workbench.core import actions
 from workbench.core.assets import MissingAssets, robots_of
 from workbench.core.cpu_layout import BODY
-from workbench.core.returns import wrong_evaluate
+from workbench.core.entries import wrong_evaluate
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.take_pictures import Request, list_cameras, take_pictures
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env

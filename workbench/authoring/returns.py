@@ -9,7 +9,7 @@ here, and told at the ``def`` of the hook that returned them. (A NaN has the rig
 and flagged in the env that has it, see `workbench.session.outliers`.)
 
 Entries of ``evaluate()`` besides ``success`` and ``fail`` may be anything: ManiSkill passes them on. The checks are
-pure: nothing is stepped, changed or moved from its device. Their words are those of `workbench.core.returns`, which the core's strict mode raises with.
+pure: nothing is stepped, changed or moved from its device. Their words are those of `workbench.core.entries`, which the core's strict mode raises with.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from workbench.authoring.problem import Problem, hook_definition, hooks_of
-from workbench.core.returns import no_reward, wrong_evaluate
+from workbench.core.entries import no_reward, wrong_evaluate
 
 _REWARD_HOOKS = hooks_of("reward")
 

@@ -110,10 +110,7 @@ def refuse_downloads(task: str) -> Iterator[None]:
             raise _missing(task, names) from error
         path = _robot_file(error.__traceback__)
         if path is not None and not path.exists():
-            raise MissingAssets(
-                f"{task}: the robot's file {path} does not exist, and ManiSkill has no download for it. "
-                "Correct urdf_path or mjcf_path of the robot's class."
-            ) from error
+            raise _no_robot_file(task, "the robot", path) from error
         raise
     finally:
         download_asset.prompt_yes_no, download_asset.download = stock_ask, stock_download
@@ -161,8 +158,12 @@ def _robot_without_file(task: str, uid: str) -> MissingAssets:
     if names:
         return _missing(task, names)
     path = _file_of(uid) if uid in REGISTERED_AGENTS else None
+    return _no_robot_file(task, f"the robot {uid}", path)
+
+
+def _no_robot_file(task: str, robot: str, path: Path | None) -> MissingAssets:
     return MissingAssets(
-        f"{task}: the robot {uid}'s file {path} does not exist, and ManiSkill has no download for it. "
+        f"{task}: {robot}'s file {path} does not exist, and ManiSkill has no download for it. "
         "Correct urdf_path or mjcf_path of the robot's class."
     )
 

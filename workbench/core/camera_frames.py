@@ -185,9 +185,8 @@ def pose_of(settings: CameraSettings) -> Floats:
 def with_pose(settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
     """The same camera at another pose (7,), said in the frame of its mount."""
     p = _vector(pose, 7, "a pose")
-    x, y, z = map(float, p[:3])
     qw, qx, qy, qz = map(float, normalised(p[3:]))
-    return replace(settings, position=(x, y, z), quaternion=(qw, qx, qy, qz))
+    return replace(settings, position=triple(p[:3]), quaternion=(qw, qx, qy, qz))
 
 
 def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:

@@ -29,6 +29,7 @@ from workbench.core.camera_frames import (
     pose_from_look_at,
     quaternion_from_axes,
     rotation_matrix,
+    triple,
     with_pose,
 )
 from workbench.core.camera_report import CameraReport, OfferedPlacement, in_words, join_reports
@@ -43,6 +44,7 @@ from workbench.core.visibility import (
     entities_of,
     list_objects,
     measure,
+    mount_column,
     picture_of,
     placed_camera,
     small_size,
@@ -298,9 +300,7 @@ class _Search:
         name = self.space.mount
         if name is None:
             return None
-        if name not in self.index.names:
-            raise ValueError(f"there is no body {name!r} to mount a camera on")
-        mounts = read_poses(self.env)[:, self.index.names.index(name)]
+        mounts = read_poses(self.env)[:, mount_column(self.index, name)]
         if not np.isfinite(mounts[self.envs]).all():
             raise ValueError(f"not every env has a body {name!r} to mount a camera on")
         return mounts
@@ -308,7 +308,7 @@ class _Search:
     def _pose(self, candidate: _Candidate) -> NDArray[np.float64]:
         """(7,) of a candidate, in the frame that it is said in."""
         if self.mounts is None:
-            return pose_from_look_at(_look_at(candidate))
+            return pose_from_look_at(LookAt(triple(candidate[0]), triple(candidate[1])))
         # What is up in a link's frame means nothing: the picture stays the way up that it has now.
         eye, target = candidate
         forward, up = target - eye, self.up[1]
@@ -321,20 +321,14 @@ class _Search:
         worst = report.worst_first(self.space.objects)[0]
         e = report.envs[worst]
         placement = Placement(settings, self.space.kind, self.space.mount)
-        target = candidate[1]
         return OfferedPlacement(
             settings=settings,
-            target=(float(target[0]), float(target[1]), float(target[2])),
+            target=triple(candidate[1]),
             score=score,
             words=in_words(report, self.space.objects),
             report=report,
             picture=picture_of(self.env, e, placement),
         )
-
-
-def _look_at(candidate: _Candidate) -> LookAt:
-    (ex, ey, ez), (tx, ty, tz) = candidate[0].tolist(), candidate[1].tolist()
-    return LookAt((ex, ey, ez), (tx, ty, tz))
 
 
 def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind, index: SceneIndex) -> SceneObject:

@@ -19,7 +19,7 @@ What makes it quick:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -94,7 +94,8 @@ class BatchedCpuSystem:
         self._link_pose_at = np.zeros((0, 7), dtype=np.int64)
         self._version = 0
         """Grows whenever the simulation may hold other values than were fetched."""
-        self._links_fetched_at = self._qacc_fetched_at = self._forces_fetched_at = -1
+        self._read_at: dict[str, int] = {}
+        """Which `_version` was read last of what is only read when it is asked for."""
 
     # `Actor.create_from_entities` and `Link.create` ask isinstance(scene.px, PhysxGpuSystem) to decide
     # whether a body has a row in the tensors. It has one here; a real subclass would want CUDA.
@@ -281,37 +282,35 @@ class BatchedCpuSystem:
     def gpu_update_articulation_kinematics(self) -> None:
         """Nothing to do: on the CPU, links follow when qpos or the root pose is set."""
 
+    def _unread(self, what: str, things: Iterable[Any]) -> Iterable[Any]:
+        """`things`; none where `what` was read of them since anything moved."""
+        if self._read_at.get(what) == self._version:
+            return ()
+        self._read_at[what] = self._version
+        return things
+
     @property
     def cuda_articulation_qacc(self) -> CpuArray:
-        layout = self._laid_out
-        if self._qacc_fetched_at != self._version:
-            for i, articulation in enumerate(layout.articulations):
-                self._qacc[i, : articulation.dof] = articulation.qacc
-            self._qacc_fetched_at = self._version
+        for i, articulation in self._unread("qacc", enumerate(self._laid_out.articulations)):
+            self._qacc[i, : articulation.dof] = articulation.qacc
         return _array(self._qacc)
 
     @property
     def cuda_articulation_link_incoming_joint_forces(self) -> CpuArray:
-        layout = self._laid_out
-        if self._forces_fetched_at != self._version:
-            for i, articulation in enumerate(layout.articulations):
-                forces = articulation.get_link_incoming_joint_forces()
-                self._joint_forces[i, : len(forces)] = forces
-            self._forces_fetched_at = self._version
+        for i, articulation in self._unread("forces", enumerate(self._laid_out.articulations)):
+            forces = articulation.get_link_incoming_joint_forces()
+            self._joint_forces[i, : len(forces)] = forces
         return _array(self._joint_forces)
 
     def fetch_link_velocities(self) -> None:
         """Velocities of all links into columns 7 to 12; two getters a link, so only when asked for."""
         layout = self._laid_out
-        if self._links_fetched_at == self._version:
-            return
         # Those of roots came with the poses, and may have been written since, as any pose may.
         now, seen = self._mirrors.links.now, self._mirrors.links.seen
-        for row, link in zip(layout.link_rows, layout.links, strict=True):
+        for row, link in self._unread("links", zip(layout.link_rows, layout.links, strict=True)):
             if not link.is_root:
                 now[row, 7:10] = seen[row, 7:10] = link.linear_velocity
                 now[row, 10:13] = seen[row, 10:13] = link.angular_velocity
-        self._links_fetched_at = self._version
 
     def _pack(self) -> NDArray[np.float32]:
         self._catch_up()

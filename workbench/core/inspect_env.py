@@ -15,11 +15,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from mani_skill.utils import common
 from numpy.typing import NDArray
 
 from workbench.core import seams
@@ -27,7 +25,7 @@ from workbench.core.contact_list import Contact
 from workbench.core.env_numbers import require_env
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Section, Touching
 from workbench.core.scene_index import scene_index
-from workbench.core.snapshot import remembering
+from workbench.core.state_columns import apart, env_states, names_of_flat
 from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
 MOST_VALUES = 64
@@ -79,13 +77,8 @@ def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
         names = names_of_flat(task, value) if name in ("", "state") else None
         if names is None:
             leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
-            continue
-        row = to_numpy(value[env])
-        at = 0
-        for part, shape, dtype in names:
-            width = int(np.prod(shape, dtype=int))
-            leaves.append(_leaf(part, row[at : at + width].reshape(shape), dtype))
-            at += width
+        else:
+            leaves += [_leaf(*part) for part in apart(names, to_numpy(value[env]))]
     return tuple(leaves)
 
 
@@ -93,18 +86,14 @@ def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
     """``get_state_dict()``; 13 numbers of a body and 13 + 2 J of an articulation by what they are."""
     structs = scene_index(task.env).states
     leaves: list[Leaf] = []
-    state: Any = task.env.get_state_dict()
-    for name, value in flat_entries(state):
+    for name, value in env_states(task.env).items():
         struct = structs.get(name)
         if struct is None:
             leaves.append(_leaf(name, _row(value, env, task.num_envs)))
-            continue
-        # An object that only some envs have has a row for each of those.
-        at = np.flatnonzero(np.asarray(seams.envs_of(struct)) == env)
-        if not len(at):
-            continue
-        row = to_numpy(value[int(at[0])])
-        leaves += [_leaf(f"{name}/{part}", numbers) for part, numbers in _state_parts(row)]
+        elif env in seams.envs_of(struct):
+            leaves += [
+                _leaf(f"{name}/{part}", numbers) for part, numbers in _state_parts(to_numpy(value[env]))
+            ]
     return tuple(leaves)
 
 
@@ -184,38 +173,6 @@ def _state_parts(row: NDArray) -> Iterator[tuple[str, NDArray]]:
         at += width
 
 
-_layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...], str]] | None]] = (
-    WeakKeyDictionary()
-)
-
-
-def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
-    """Name, shape and dtype of each part of a flattened observation (N, D), or None if they cannot be told."""
-    env = task.env
-    if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:
-        return None
-    known = _layouts.get(env)
-    # A reload may put another class on an env that stays.
-    if known is None or known[:2] != (type(env), flat.shape[1]):
-        known = (type(env), flat.shape[1], _find_names(task, flat.shape[1]))
-        _layouts[env] = known
-    return known[2]
-
-
-def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], str]] | None:
-    env = task.env
-    with remembering(env):
-        obs = seams.unflattened_state(env, env.get_info())
-    parts = []
-    for name, value in flat_entries(obs):
-        if isinstance(value, torch.Tensor) and value.nelement():
-            made: Any = common.flatten_state_dict({"value": value}, use_torch=True, device=env.device)
-            shape = tuple(value.shape[1:]) if np.prod(value.shape[1:], dtype=int) == made.shape[-1] else None
-            parts.append((name, shape or (made.shape[-1],), _dtype(value)))
-    # A task may flatten in its own way: then no names are better than wrong ones.
-    return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
-
-
 def _tree(obs: Any) -> Mapping[str, Any]:
     if obs is None:
         return {}
@@ -233,10 +190,6 @@ def _leaf(name: str, value: NDArray, dtype: str | None = None) -> Leaf:
     low, high = (float(value.min()), float(value.max())) if numeric else (np.nan, np.nan)
     values = value.reshape(-1)[:MOST_VALUES].copy()
     return Leaf(name, tuple(value.shape), dtype or str(value.dtype), values, low, high)
-
-
-def _dtype(value: torch.Tensor) -> str:
-    return str(value.dtype).removeprefix("torch.")
 
 
 def _floats(value: torch.Tensor) -> NDArray[np.float32]:

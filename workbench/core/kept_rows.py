@@ -36,8 +36,8 @@ from workbench.core.broken_rule import (
     place_of_hook,
 )
 from workbench.core.strict_system import envs_named
-from workbench.core.task_buffers import is_per_env, look_over_env, version_of
-from workbench.core.task_members import Walk
+from workbench.core.task_buffers import is_per_env, version_of
+from workbench.core.task_members import Walk, look_over
 
 MOST_LINES = 2000
 """Lines of the author's after which values are looked at, in one reset."""
@@ -73,7 +73,7 @@ class KeptRows:
     def __init__(self, env: BaseEnv, chosen: Sequence[int], lines: bool) -> None:
         self._env, self._count = env, len(chosen)
         self._elsewhere = np.setdiff1d(np.arange(env.num_envs), np.asarray(chosen, dtype=np.int64))
-        self._single, self._groups = _paths(look_over_env(env), env.num_envs)
+        self._single, self._groups = _paths(look_over(env), env.num_envs)
         self._before = {path: _copy(value) for path, value in self._read().items()}
         self._lines = _Lines(self, seams.files_of_task(env)) if lines and self._before else None
 
@@ -122,7 +122,7 @@ class KeptRows:
 
     def _read(self) -> dict[str, Any]:
         """What is at the paths now; of what is an env's each, a list."""
-        now = {leaf.path: leaf.value for leaf in look_over_env(self._env).leaves}
+        now = {leaf.path: leaf.value for leaf in look_over(self._env).leaves}
         read = {path: now[path] for path in self._single if path in now}
         for path, each in self._groups.items():
             if all(one in now for one in each):
@@ -155,7 +155,7 @@ class KeptRows:
 
 def rows_of_tensors(env: BaseEnv) -> dict[str, int]:
     """How many rows each tensor, array and list has that the task keeps on itself, by path."""
-    leaves = look_over_env(env).leaves
+    leaves = look_over(env).leaves
     return {
         leaf.path: len(leaf.value)
         for leaf in leaves

@@ -24,6 +24,7 @@ from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from mani_skill.utils.structs.pose import Pose
 
 from workbench.core import seams
+from workbench.core.camera_frames import matrix3, triple
 from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
 
 
@@ -182,16 +183,16 @@ def settings_of(config: Any) -> CameraSettings | None:
     if not np.isfinite(pose).all() or length < 1e-6:
         return None
     fov, near, far = (_one(getattr(config, name)) for name in ("fov", "near", "far"))
-    intrinsic = None if config.intrinsic is None else _one_matrix(config.intrinsic)
+    matrix = _one(config.intrinsic, 3, 3)
+    intrinsic = None if matrix is None else matrix3(matrix)
     if near is None or far is None or (fov is None) == (intrinsic is None):
         return None
-    x, y, z = (float(v) for v in pose[:3])
-    w, i, j, k = (float(v) for v in pose[3:] / length)
+    w, i, j, k = (pose[3:] / length).tolist()
     return CameraSettings(
-        position=(x, y, z),
+        position=triple(pose[:3]),
         quaternion=(w, i, j, k),
         fov=fov,
-        intrinsic=intrinsic,  # type: ignore[arg-type]
+        intrinsic=intrinsic,
         width=int(config.width),
         height=int(config.height),
         near=near,
@@ -208,8 +209,7 @@ def target_of(config: Any) -> tuple[float, float, float] | None:
     target = seams.camera_target(config)
     if target is None:
         return None
-    x, y, z = (float(number) for number in _numbers(target).reshape(-1, 3)[0])
-    return x, y, z
+    return triple(_numbers(target).reshape(-1, 3)[0])
 
 
 def rows_of_pose(config: Any) -> np.ndarray:
@@ -221,19 +221,10 @@ def _numbers(value: Any) -> np.ndarray:
     return np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
 
 
-def _one(value: Any) -> float | None:
-    """The number that it is, or that all of its numbers are."""
-    if value is None:
+def _one(value: Any, *shape: int) -> Any:
+    """The number, or the matrix of this shape, that it is, or that all of its are; None where they differ."""
+    numbers = np.zeros(0) if value is None else _numbers(value)
+    if not numbers.size or numbers.shape[numbers.ndim - len(shape) :] != shape:
         return None
-    numbers = _numbers(value).reshape(-1)
-    return float(numbers[0]) if len(numbers) and (numbers == numbers[0]).all() else None
-
-
-def _one_matrix(value: Any) -> tuple[tuple[float, ...], ...] | None:
-    matrices = _numbers(value)
-    if matrices.shape[-2:] != (3, 3):
-        return None
-    matrices = matrices.reshape(-1, 3, 3)
-    if not (matrices == matrices[0]).all():
-        return None
-    return tuple(tuple(float(v) for v in row) for row in matrices[0])
+    each = numbers.reshape(-1, *shape)
+    return each[0].tolist() if (each == each[0]).all() else None

@@ -19,15 +19,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
 from numpy.typing import NDArray
 
-from workbench.core.inspect_env import names_of_flat
+from workbench.core import seams
 from workbench.core.recorded_run import OBS, STATE
 from workbench.core.scene_index import in_every_env, present_states, scene_index
+from workbench.core.snapshot import remembering
 from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
 _PICTURES = ("sensor_data", "sensor_param", "pointcloud")
@@ -48,12 +51,8 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
         parts = names_of_flat(task, values[name]) if name in (OBS, OBS + "state") else None
         if parts is None:
             columns[name] = column
-            continue
-        at = 0
-        for part, shape, _ in parts:
-            width = math.prod(shape)
-            columns[OBS + part] = column[:, at : at + width].reshape(count, *shape)
-            at += width
+        else:
+            columns.update({OBS + part: numbers for part, numbers, _ in apart(parts, column)})
     return columns
 
 
@@ -104,3 +103,53 @@ def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dic
         for name, column in zip(names, np.split(together, ends, axis=1), strict=True):
             columns[name] = np.ascontiguousarray(column).reshape(tuple(values[name].shape))
     return columns
+
+
+# --- names of a flattened observation ----------------------------------------------------------------
+
+
+_layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...], str]] | None]] = (
+    WeakKeyDictionary()
+)
+
+
+def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
+    """Name, shape and dtype of each part of a flattened observation (N, D), or None if they cannot be told."""
+    env = task.env
+    if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:
+        return None
+    known = _layouts.get(env)
+    # A reload may put another class on an env that stays.
+    if known is None or known[:2] != (type(env), flat.shape[1]):
+        known = (type(env), flat.shape[1], _find_names(task, flat.shape[1]))
+        _layouts[env] = known
+    return known[2]
+
+
+def apart(
+    names: list[tuple[str, tuple[int, ...], str]], numbers: NDArray
+) -> Iterator[tuple[str, NDArray, str]]:
+    """Name, numbers (..., *shape) and dtype of each part, as `names_of_flat` has them, of a flattened observation (..., D)."""
+    at = 0
+    for name, shape, dtype in names:
+        width = math.prod(shape)
+        yield name, numbers[..., at : at + width].reshape(*numbers.shape[:-1], *shape), dtype
+        at += width
+
+
+def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], str]] | None:
+    env = task.env
+    with remembering(env):
+        obs = seams.unflattened_state(env, env.get_info())
+    parts = []
+    for name, value in flat_entries(obs):
+        if isinstance(value, torch.Tensor) and value.nelement():
+            made: Any = common.flatten_state_dict({"value": value}, use_torch=True, device=env.device)
+            shape = tuple(value.shape[1:]) if np.prod(value.shape[1:], dtype=int) == made.shape[-1] else None
+            parts.append((name, shape or (made.shape[-1],), _dtype(value)))
+    # A task may flatten in its own way: then no names are better than wrong ones.
+    return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
+
+
+def _dtype(value: torch.Tensor) -> str:
+    return str(value.dtype).removeprefix("torch.")

@@ -6,10 +6,10 @@ changed by a partial reset, a reward of shape (). `rules` lists them, with what 
 
 * state set and not applied, applied or read without a fetch after a step, links read before their
   articulation's new qpos reached them (`strict_system`, at the line that wrote or read);
-* SAPIEN's own setters, which the GPU does not look at (`behind_tensors`, at the line that called);
+* SAPIEN's own setters, which the GPU does not look at (`struct_access`, at the line that called);
 * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or
   changed in what the task keeps on itself (here; `kept_rows` finds the assignment);
-* returns of ``evaluate``, the reward and the observation hooks without a row for each env (`returns`).
+* returns of ``evaluate``, the reward and the observation hooks without a row for each env (`entries`).
 
 What the GPU refuses in any case (a pose of another batch size, a static actor moved, two applies without a
 fetch, state touched while the scene is loaded) is refused whatever the degree, see `struct_access`.
@@ -26,22 +26,19 @@ from typing import Any
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.behind_tensors import guard_scenes
 from workbench.core.broken_rule import (
     BrokenRule,
     BrokenRules,
-    RuleWarning,
     WrongReturn,
     place_of_hook,
     warn_of,
 )
+from workbench.core.entries import wrong_evaluate, wrong_observation, wrong_reward
 from workbench.core.kept_rows import ResetWatch
 from workbench.core.partial_reset import others
-from workbench.core.returns import wrong_evaluate, wrong_observation, wrong_reward
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.strict_system import StrictCpuSystem
-
-__all__ = ["BrokenRule", "RuleWarning", "StrictMixin", "WrongReturn"]
+from workbench.core.struct_access import guard_scenes
 
 _REWARD_HOOK = {
     "dense": "compute_dense_reward",

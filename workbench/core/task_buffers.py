@@ -21,7 +21,6 @@ stay one. What cannot be carried is named, with the reason.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -30,7 +29,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.task_members import PLAIN, Found, Walk, look_over
+from workbench.core.task_members import PLAIN, Found, look_over
 
 _LARGEST_OF_BATCH = 1 << 16
 """Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
@@ -77,15 +76,9 @@ class _Scene:
 
     marks: dict[str, _Mark] = field(default_factory=dict)
     paths: frozenset[str] = frozenset()
-    plain: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Plain attributes, by the path of their owner and their name."""
 
     def add(self, leaves: list[Found]) -> None:
-        for leaf in leaves:
-            self.marks[leaf.path] = _mark(leaf.value)
-            owner, _, name = leaf.path.rpartition(".")
-            if isinstance(leaf.value, PLAIN) and name.isidentifier():
-                self.plain.setdefault(owner, {})[name] = leaf.value
+        self.marks |= {leaf.path: _mark(leaf.value) for leaf in leaves}
         self.paths = frozenset(self.marks)
 
 
@@ -99,7 +92,7 @@ def _scene_of(env: BaseEnv) -> _Scene:
 def note_scene(env: BaseEnv) -> None:
     """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
     _scenes[env.scene] = scene = _Scene()
-    scene.add(look_over_env(env).leaves)
+    scene.add(look_over(env).leaves)
 
 
 def note_constructed(env: BaseEnv) -> None:
@@ -108,12 +101,12 @@ def note_constructed(env: BaseEnv) -> None:
     An env made of the edited file would otherwise be given the old file's ``self.threshold = 0.02``.
     """
     scene = _scene_of(env)
-    scene.add([leaf for leaf in look_over_env(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
+    scene.add([leaf for leaf in look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
     """Copies of what the task remembers about the envs in `env_idx`, and of what holds for the batch."""
-    walk = look_over_env(env)
+    walk = look_over(env)
     scene = _scene_of(env)
     chosen = np.array(env_idx, dtype=np.int64)
     rows: Any = slice(None) if env_idx == list(range(env.num_envs)) else torch.from_numpy(chosen)
@@ -157,7 +150,7 @@ def write_task_state(
     Returns:
         Paths that were carried, and paths that were not with the reason.
     """
-    walk = look_over_env(env, state.buffers)
+    walk = look_over(env)
     scene = _scene_of(env)
     carried: dict[str, None] = {}
     missed = dict(state.omitted)
@@ -218,44 +211,28 @@ def _with_rows(
     value: Any, kept: Buffer, env: BaseEnv, env_idx: list[int], positions: list[int], all_envs: bool
 ) -> Any:
     """A copy of `value` with the rows put in, or a sentence that says why there is none."""
-    if isinstance(kept.values, list):
-        rows = [kept.values[k] for k in positions]
-        if isinstance(value, list) and len(value) == env.num_envs:
-            new: Any = list(value)
-        elif all_envs:
-            new = [None] * env.num_envs
-        else:
+    listed = isinstance(kept.values, list)
+    rows: Any = [kept.values[k] for k in positions] if listed else kept.values[positions]
+    kind: Any = list if listed else np.ndarray if kept.dtype is None else torch.Tensor
+    shape = (env.num_envs, *np.shape(kept.values)[1:])
+    fits = isinstance(value, kind) and is_per_env(value, env.num_envs) and (listed or value.shape == shape)
+    # Of all envs another thing may be put in its place, but for a tensor of another shape.
+    if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
+        if listed:
             return "it is no list with an entry for each env now"
+        return f"it had shape (N, {', '.join(map(str, shape[1:]))}) and is another thing now"
+    if listed:
+        new: Any = list(value) if fits else [None] * env.num_envs
         for i, row in zip(env_idx, rows, strict=True):
             new[i] = row
-        return new
-    array = kept.values[positions]
-    if kept.dtype is None:
-        if (
-            isinstance(value, np.ndarray)
-            and value.shape[1:] == array.shape[1:]
-            and len(value) == env.num_envs
-        ):
-            new = value.copy()
-        elif all_envs:
-            new = np.empty((env.num_envs, *array.shape[1:]), dtype=array.dtype)
-        else:
-            return f"it had shape (N, {_shape(array)}) and is another thing now"
-        new[env_idx] = array
-        return new
-    if isinstance(value, torch.Tensor) and value.shape == (env.num_envs, *array.shape[1:]):
-        new = value.detach().clone(memory_format=torch.contiguous_format)
-    elif all_envs and not isinstance(value, torch.Tensor):
-        new = torch.empty((env.num_envs, *array.shape[1:]), dtype=kept.dtype, device=env.device)
+    elif kept.dtype is None:
+        new = value.copy() if fits else np.empty(shape, dtype=rows.dtype)
+        new[env_idx] = rows
     else:
-        return f"it had shape (N, {_shape(array)}) and is another thing now"
-    index = torch.tensor(env_idx, device=new.device)
-    new[index] = torch.from_numpy(array).to(device=new.device, dtype=new.dtype)
+        new = value.detach().clone(memory_format=torch.contiguous_format) if fits else None
+        new = torch.empty(shape, dtype=kept.dtype, device=env.device) if new is None else new
+        new[torch.tensor(env_idx, device=new.device)] = torch.from_numpy(rows).to(new)
     return new
-
-
-def _shape(rows: np.ndarray) -> str:
-    return ", ".join(map(str, rows.shape[1:]))
 
 
 def _as_found(kept: Buffer, env: BaseEnv) -> Any:
@@ -268,18 +245,6 @@ def _as_built(mark: _Mark, num_envs: int) -> Buffer:
     if mark.copy is not None:
         return Buffer(mark.copy.cpu().numpy(), is_per_env(mark.copy, num_envs), mark.copy.dtype)
     return Buffer(mark.value, is_per_env(mark.value, num_envs), None)
-
-
-def look_over_env(env: BaseEnv, wanted: Collection[str] = ()) -> Walk:
-    """Everything that may have changed since the scene was built, and what is at the paths in `wanted`."""
-    scene = _scene_of(env)
-    built = scene.plain
-    for path in scene.paths.intersection(wanted):
-        owner, _, name = path.rpartition(".")
-        if name in built.get(owner, {}):
-            # Unchanged here, but another value is to be put.
-            built = {**built, owner: {n: v for n, v in built[owner].items() if n != name}}
-    return look_over(env, built)
 
 
 # --- comparing -------------------------------------------------------------------------------------

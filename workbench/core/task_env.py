@@ -21,9 +21,8 @@ from workbench.core import actions
 from workbench.core.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.backends import Backend, choose_backend, keep_render_device
 from workbench.core.broken_rule import BrokenRules, warn_of
-from workbench.core.constructors import refuse_unbuilt_env
 from workbench.core.contact_list import Contact, list_contacts
-from workbench.core.cpu_scene import batched_class
+from workbench.core.cpu_scene import batched_class, refuse_unbuilt_env
 from workbench.core.entries import FLAGS, split_entries
 from workbench.core.env_numbers import envs_of_batch
 from workbench.core.partial_reset import in_ascending_order, seeded

@@ -72,19 +72,13 @@ class Walk:
     """Objects that were met, by ``id``: held, and not entered a second time."""
     owners: dict[str, Any] = field(default_factory=dict)
     """Objects whose attributes were looked at, by path."""
-    built: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Plain attributes that need no look if they are still the same, by the path of their owner."""
     simulation: frozenset[int] = frozenset()
     """Where the simulation's own tensors lie: an attribute that is a view of one is no memory."""
 
 
-def look_over(env: BaseEnv, built: dict[str, dict[str, Any]]) -> Walk:
-    """Everything that a task may remember.
-
-    Args:
-        built: plain attributes that need no look if they are still the same, by the path of their owner.
-    """
-    walk = Walk(env, task_class(env).__module__, built=built)
+def look_over(env: BaseEnv) -> Walk:
+    """Everything that a task may remember."""
+    walk = Walk(env, task_class(env).__module__)
     walk.entered[id(env)] = env
     walk.simulation = frozenset(
         array.torch().untyped_storage().data_ptr()
@@ -140,12 +134,8 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
 
 def _enter_members(walk: Walk, owner: Any, path: str, skipped: frozenset[str], depth: int) -> None:
     walk.owners[path] = owner
-    built = walk.built.get(path, {})
     for name, value in list(vars(owner).items()):
-        if name in skipped:
-            continue
-        # Most members are options and links to the simulation; a path and a way to put cost more than a look.
-        if (name in built and built[name] is value) or _is_ignored(type(value), walk.author):
+        if name in skipped or _is_ignored(type(value), walk.author):
             continue
         where = f"{path}.{name}" if path else name
         _enter(walk, value, where, lambda new, n=name: object.__setattr__(owner, n, new), depth + 1)

@@ -26,7 +26,7 @@ from mani_skill.utils.scene_builder import SceneBuilder
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic
+from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic, triple
 from workbench.core.camera_report import (
     DEPTH_EDGES,
     CameraReport,
@@ -221,10 +221,9 @@ def settings_of(camera: Any, env_index: int) -> CameraSettings:
     """
     component = seams.camera_components(camera)[env_index]
     local = component.local_pose
-    px, py, pz = map(float, local.p)
     qw, qx, qy, qz = map(float, local.q)
     return CameraSettings(
-        position=(px, py, pz),
+        position=triple(local.p),
         quaternion=(qw, qx, qy, qz),
         fov=None,
         intrinsic=matrix3(component.get_intrinsic_matrix()),
@@ -260,12 +259,17 @@ def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneI
     local = make_pose(placement.settings.position, placement.settings.quaternion)
     if placement.mount is None:
         return local
-    if placement.mount not in index.names:
-        raise ValueError(f"there is no body {placement.mount!r} to mount a camera on")
-    mount = bodies[index.names.index(placement.mount)]
+    mount = bodies[mount_column(index, placement.mount)]
     if not np.isfinite(mount).all():
         raise ValueError(f"this env has no body {placement.mount!r} to mount a camera on")
     return compose(mount, local)
+
+
+def mount_column(index: SceneIndex, name: str) -> int:
+    """Which body is called so."""
+    if name not in index.names:
+        raise ValueError(f"there is no body {name!r} to mount a camera on")
+    return index.names.index(name)
 
 
 def measure(

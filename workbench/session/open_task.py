@@ -31,8 +31,7 @@ from workbench.core import actions
 from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, find_renderer, gpu_left_alone
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
-from workbench.core.constructors import ForgottenInit
-from workbench.core.cpu_scene import BatchedCpuMixin
+from workbench.core.cpu_scene import BatchedCpuMixin, ForgottenInit
 from workbench.core.env_kwargs import env_kwargs
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene_geometry import read_geometry
