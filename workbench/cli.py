@@ -324,11 +324,9 @@ def view(
 @app.command
 def doctor() -> int:
     """Say what this machine can do, and for each lack what to do about it."""
-    from workbench.machine.doctor import diagnose, exit_code, print_report
+    from workbench.machine.doctor import main
 
-    findings = diagnose()
-    print_report(findings)
-    return exit_code(findings)
+    return main()
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -27,6 +27,7 @@ from workbench.core.step import StepResult
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging
 from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
+from workbench.session.placements import Step
 from workbench.session.preview import IN_A_QUICK_LOOK, Preview, Sight
 from workbench.session.studio_cameras import StudioCameras, exported, imported
 from workbench.session.studio_file import StudioFile
@@ -97,15 +98,15 @@ class CameraStudio:
 
     def undo(self) -> None:
         """Take the last step back."""
-        with self._lock:
-            step = self._cameras.placements.undo()
-            self._cameras.problem = ""
-        self.ask_for([] if step is None else [step.key])
+        self._step(self._cameras.placements.undo)
 
     def redo(self) -> None:
         """Make the step again that was taken back last."""
+        self._step(self._cameras.placements.redo)
+
+    def _step(self, move: Callable[[], Step | None]) -> None:
         with self._lock:
-            step = self._cameras.placements.redo()
+            step = move()
             self._cameras.problem = ""
         self.ask_for([] if step is None else [step.key])
 
