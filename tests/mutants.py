@@ -87,7 +87,11 @@ PROTECTED = {
     " ui/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
     " ui/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
     " -k 'not nothing_is_printed and not command and not palette and not many_that_start'",
+    "ui/judged_panel": "ui/test_rescore_panel.py ui/test_judgement_panel.py",
+    "ui/parts": "ui/test_parts.py",
+    "ui/presses": "ui/test_presses.py ui/test_env_panel.py ui/test_judgement_panel.py ui/test_rescore_panel.py",
     "ui/replies": "ui/test_replies.py",
+    "ui/timeline_panel": "ui/test_timeline_panel.py ui/test_timeline_strip.py",
     "ui/file_reply": "ui/test_file_reply.py",
 }
 """The tests below ``tests/`` that should notice a slip in a module below ``workbench/``: the fast ones among them, since

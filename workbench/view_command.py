@@ -33,7 +33,7 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
 def _in_page(files: Sequence[Path], host: str, port: int) -> int:
     from workbench.recording.web_viewer import web_viewer_folder
     from workbench.ui.door import DoorOptions, open_door
-    from workbench.ui.offers import Offers
+    from workbench.ui.file_reply import Offers
     from workbench.ui.rerun_view import RerunPages
 
     web_viewer_folder()

@@ -11,7 +11,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from workbench.ui import deaf_clients
+from workbench.ui import strangers
 
 MESSAGE = b"x" * 2**20
 
@@ -23,11 +23,11 @@ def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
         ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
 
         async def handler(connection: ServerConnection) -> None:
-            watch = asyncio.create_task(deaf_clients.let_go_when_deaf(connection))
+            watch = asyncio.create_task(strangers.let_go_when_deaf(connection))
             try:
                 await connection.send(MESSAGE)
                 await connection.recv()
-                ended.set_result(deaf_clients.unsent(connection))
+                ended.set_result(strangers.unsent(connection))
             except ConnectionClosed:
                 ended.set_result(None)
             finally:
@@ -49,7 +49,7 @@ def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deaf_clients, "PATIENCE", 1.0)
+    monkeypatch.setattr(strangers, "READ_WITHIN", 1.0)
 
 
 def test_a_client_that_reads_nothing_is_let_go(caplog: pytest.LogCaptureFixture) -> None:

@@ -40,7 +40,7 @@ from workbench.ui.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import Admitted, Asked, Entered, Gate, Refused, cookie_name, host_is_ours, judge
 from workbench.ui.page_guard import PageGuard
-from workbench.ui.told_rarely import ToldRarely
+from workbench.ui.strangers import ToldRarely
 from workbench.ui.viser_seam import element_id
 
 # A busy machine is no failure, and one door is for all that is tried on it.

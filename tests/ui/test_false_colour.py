@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from workbench.ui.false_colour import (
+from workbench.ui.in_colours import (
     LONGEST_LEGEND,
     NOTHING,
     VIRIDIS,

@@ -20,7 +20,7 @@ from tests.drive.waiting import until
 from tests.ui.tabs import Tabs, open_deaf_tab, tabs_of
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
-from workbench.ui import deaf_clients
+from workbench.ui import strangers
 from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.page import Page
 from workbench.ui.viewpoint import Stage
@@ -83,7 +83,7 @@ def test_the_session_knows_whether_any_tab_is_open(house: House) -> None:
 def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     house: House, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(deaf_clients, "PATIENCE", 3.0)
+    monkeypatch.setattr(strangers, "READ_WITHIN", 3.0)
     reads = house.tabs.open()
     until(lambda: reads.open, "the tab that reads")
     deaf = open_deaf_tab(house.door.url)

@@ -20,8 +20,8 @@ from workbench.recording.blueprint_in_file import add_blueprint, blueprint_strea
 from workbench.recording.rerun_chunks import static_chunk
 from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.door import Door
+from workbench.ui.file_reply import Offers
 from workbench.ui.gate import cookie_name
-from workbench.ui.offers import Offers
 from workbench.ui.rerun_view import RerunPages, RerunView
 
 

@@ -12,9 +12,9 @@ import viser
 from tests.drive.panels import Panels
 from workbench.recording.sources import Source
 from workbench.ui.door import Door
+from workbench.ui.file_reply import Offers
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted
 from workbench.ui.making import Making, MakingView
-from workbench.ui.offers import Offers
 from workbench.ui.share_panel import (
     ALL_CAMERAS,
     MOST_NAMED,

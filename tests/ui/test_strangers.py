@@ -15,10 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.ui.knocking import ask, both, client, cookie_of, knock, token_of
-from workbench.ui import strangers, told_rarely
+from workbench.ui import strangers
 from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
-from workbench.ui.told_rarely import ToldRarely
+from workbench.ui.strangers import ToldRarely
 
 LONG = 300
 
@@ -206,7 +206,7 @@ def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(door, caplog)
 
 def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
     now = [1000.0]
-    monkeypatch.setattr(told_rarely.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(strangers.time, "monotonic", lambda: now[0])
     said: list[str] = []
     told = ToldRarely(said.append, pause=60.0)
     for _ in range(4 * 3600):

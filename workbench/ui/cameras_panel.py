@@ -23,9 +23,8 @@ from workbench.session.messages import CameraRequest
 from workbench.session.preview import IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import Seen, SessionView
-from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
-from workbench.ui.in_colours import COLOUR, MODALITIES, depth_span, image_format, in_colours
+from workbench.ui.in_colours import COLOUR, MODALITIES, DepthRange, depth_span, image_format, in_colours
 from workbench.ui.parts import Clock, DrawDue
 
 FASTEST = 1 / 15

@@ -36,8 +36,7 @@ from workbench.ui.replies import (
     folder_handler,
     refusals,
 )
-from workbench.ui.strangers import Connection, of_peer
-from workbench.ui.told_rarely import ToldRarely
+from workbench.ui.strangers import Connection, ToldRarely, of_peer
 from workbench.web_assets import web_assets_folder
 
 RESPONSE_SECONDS = 300.0

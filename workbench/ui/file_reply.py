@@ -1,10 +1,13 @@
-"""An answer that is read from its file while it is sent.
+"""An answer that is read from its file while it is sent, and the files that a page may fetch so.
 
 A recording may be gigabytes, and `websockets`, whose server the page is served by, knows answers only as one
 string of bytes. Read whole, a file that is opened in three tabs is in memory three times, and all of it at once on
 its way through the event loop. But the hook that makes the answer is a coroutine with the connection in its hand:
 so the head and the blocks of the file are written from there, each when the one before is nearly gone, and what is
 given back to `websockets` at the end has nothing left to say.
+
+A browser never says a path. It is given an address with a random part, made here for one file, and what it asks for is
+looked up by that part alone; the name behind it is for people (and for rerun, which tells a recording by its end).
 
 A file may be kept as gzip (rerun's viewer: 43 MB, 14 packed) and is sent so to browsers that take it.
 """
@@ -14,17 +17,22 @@ from __future__ import annotations
 import asyncio
 import gzip
 import os
+import secrets
+import threading
 import urllib.parse
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Response
+
+if TYPE_CHECKING:
+    from workbench.ui.door import Door
 
 BLOCK = 1 << 18
 """Bytes that are read and handed on at a time."""
@@ -122,3 +130,44 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
             return  # the browser went away
         if transport.is_closing():
             return
+
+
+# --- those that the server put into a table, under addresses that nobody can guess ---------------------
+
+PREFIX = "/offered/"
+_POLICY = {
+    # What is offered is data. Opened by itself, an HTML file that somebody recorded runs nothing in our name.
+    "Content-Security-Policy": "default-src 'none'; sandbox; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+}
+
+
+class Offers:
+    """The table. One a door."""
+
+    def __init__(self, door: Door) -> None:
+        self._lock = threading.Lock()
+        self._files: dict[str, FileReply] = {}
+        self._ids: dict[FileReply, str] = {}
+        door.add_route(PREFIX, self._answer, headers=_POLICY)
+
+    def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
+        """The address, from the root of the server, of the file at `path`; the same for the same file.
+
+        Args:
+            kind: Its content type.
+            download: The browser saves it instead of showing it.
+        """
+        path = Path(path).resolve()
+        reply = FileReply(path, kind, download_as=path.name if download else None)
+        with self._lock:
+            key = self._ids.setdefault(reply, secrets.token_urlsafe(16))
+            self._files[key] = reply
+        return f"{PREFIX}{key}/{urllib.parse.quote(path.name, safe='')}"
+
+    def _answer(self, asked: str) -> tuple[int, str, bytes] | FileReply:
+        with self._lock:
+            reply = self._files.get(asked.partition("/")[0])
+        if reply is None:
+            return 404, "text/plain; charset=utf-8", b"There is no such file."
+        return reply

@@ -26,7 +26,7 @@ from workbench.ui.client_messages import (
     read_value,
 )
 from workbench.ui.control_values import check_value
-from workbench.ui.told_rarely import ToldRarely
+from workbench.ui.strangers import ToldRarely
 
 HANDS_OFF = 1.2
 """Seconds without another value after which a control shows the true one again: a hand may still be on it."""

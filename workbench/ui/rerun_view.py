@@ -32,9 +32,8 @@ import viser
 from workbench.recording.reading import told_rerun
 from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
 from workbench.ui.door import Door
-from workbench.ui.file_reply import FileReply
+from workbench.ui.file_reply import FileReply, Offers
 from workbench.ui.fragments import render
-from workbench.ui.offers import Offers
 from workbench.ui.presses import Presses
 from workbench.web_assets import web_assets_folder
 

@@ -25,11 +25,11 @@ from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source
 from workbench.session.review_view import ReviewView
 from workbench.ui.door import Door
+from workbench.ui.file_reply import Offers
 from workbench.ui.fragments import counted, render, size
 from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
 from workbench.ui.making import Making, MakingView
-from workbench.ui.offers import Offers
 from workbench.ui.parts import PagePart
 from workbench.ui.rerun_view import RerunPages, RerunView
 

@@ -7,7 +7,7 @@ while a `viser.ViserServer` is being made, the name ``websockets`` in that one v
 a look-alike whose ``serve`` is ours. Ours gives the real one the same arguments, with three changed:
 the socket (ours, already bound), ``process_request`` (viser's own hook, handed to the caller to wrap)
 and the handler (viser's own, but every message from a client is looked at before viser sees it, and a
-client that reads nothing is let go, see `workbench.ui.deaf_clients`).
+client that reads nothing is let go, see `workbench.ui.strangers`).
 
 Two nets below that: `missing_names` lists what an upgrade of viser took away, and is asked before
 anything starts; and `workbench.ui.door` sends a request that must be refused through the finished
@@ -45,10 +45,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from workbench.ui.client_messages import KINDS, MAX_BYTES, MalformedMessage
-from workbench.ui.deaf_clients import let_go_when_deaf
 from workbench.ui.page_guard import PageGuard
-from workbench.ui.strangers import Connection, Strangers
-from workbench.ui.told_rarely import ToldRarely
+from workbench.ui.strangers import Connection, Strangers, ToldRarely, let_go_when_deaf
 
 WRITTEN_FOR = "1.1.1"
 
