@@ -73,7 +73,7 @@ def test_the_library_lists_them(place: Path, expected: dict[str, Any]) -> None:
             assert row.length == len(facts["reward"])
             assert row.total_reward == pytest.approx(sum(facts["reward"]))
             assert row.success is (kind != "recovered")
-            assert row.facts.recovered is (kind == "recovered")
+            assert row.recovered is (kind == "recovered")
             assert row.tags == (("good", "slips") if kind == "tagged" else ())
             assert row.note == ("the box turns a little" if kind == "tagged" else "")
             # The library looks at lengths alone: the turned bit is found by who opens the file.

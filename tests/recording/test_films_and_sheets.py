@@ -21,7 +21,7 @@ from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.recording.episode import Episode
 from workbench.recording.mp4 import Encoding, write_mp4
 from workbench.recording.read_episode import read_episode
-from workbench.recording.scene_eye import Eye, usual_eye
+from workbench.recording.scene_film import Eye, usual_eye
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -130,8 +130,8 @@ def test_each_trajectory_of_maniskills_recorder_is_a_row(maniskill: Path) -> Non
     )
     assert (first.seed, first.length, second.seed, second.length) == (5, 3, 6, 2)
     assert first.success is False and first.total_reward is not None and first.total_reward > 0
-    assert first.facts.acted_by == "test"
-    assert first.facts.control_mode == "pd_joint_delta_pos" and first.id != second.id
+    assert first.acted_by == "test"
+    assert first.control_mode == "pd_joint_delta_pos" and first.id != second.id
 
 
 def test_a_trajectory_with_pictures_has_a_thumbnail(

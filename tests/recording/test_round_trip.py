@@ -27,7 +27,7 @@ from workbench.core.pictures import CameraInfo
 from workbench.recording.episode import Episode
 from workbench.recording.layout import body_entities
 from workbench.recording.read_episode import read_episode
-from workbench.recording.read_properties import read_properties
+from workbench.recording.rerun_table import read_properties
 
 Entities = dict[str, dict[str, Column]]
 

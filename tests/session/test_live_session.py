@@ -13,7 +13,7 @@ import pytest
 
 from tests.drive.session import start_over, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
-from workbench.recording.read_properties import read_properties
+from workbench.recording.rerun_table import read_properties
 from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 

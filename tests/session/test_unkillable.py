@@ -20,7 +20,7 @@ import pytest
 from tests.drive.session import live_session, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
-from workbench.recording.read_properties import read_properties
+from workbench.recording.rerun_table import read_properties
 from workbench.session import kept_worker
 from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions

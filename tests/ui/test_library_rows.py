@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.recording.library_row import Facts, LibraryRow, clean_facts
+from workbench.recording.library_row import LibraryRow, clean_facts
 from workbench.ui.library_rows import (
     COLUMNS,
     SECOND_LINE,
@@ -29,7 +29,7 @@ def row(id: str, **facts: Any) -> LibraryRow:
     kind = facts.pop("kind", "workbench")
     paths = facts.pop("paths", (Path(f"{id}.json"), Path(f"{id}.h5")))
     values = {"task": "Push-v1", "written": NOW.timestamp(), **facts}
-    return LibraryRow(id, f"name-{id}", paths, 1000, Facts(kind, **values))
+    return LibraryRow(kind, **values, id=id, name=f"name-{id}", paths=paths, size=1000)
 
 
 ROWS = (
@@ -161,7 +161,7 @@ def test_an_empty_list_says_which_filter_emptied_it() -> None:
 
 
 def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted() -> None:
-    kept = clean_facts(row("n", total_reward=float("nan")).facts)
+    kept = clean_facts(row("n", total_reward=float("nan")))
     lost = row("n", total_reward=kept.total_reward)
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
     assert cells(lost, {}, NOW)["total"] == "NaN"

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording.encoded_pictures import MOST_PIXELS, encode_jpeg
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import UnreadableRecording
 
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 29

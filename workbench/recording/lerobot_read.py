@@ -28,7 +28,7 @@ from workbench.recording.document import read_json
 from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.recording.film_pictures import FilmPictures
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import UnreadableRecording
 
 USUAL_FOVY = math.radians(60)
 """A dataset does not say how its cameras see; nothing is computed from this."""

@@ -250,7 +250,8 @@ class Library:
         name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
         name += "" if facts.trajectory is None else f"#{facts.trajectory}"
         # A file's name may hold bytes that are no text, which no page can be sent.
-        return LibraryRow(id, text(name, 400), found.paths(self.folder), sum(found.sizes.values()), facts)
+        paths, size = found.paths(self.folder), sum(found.sizes.values())
+        return LibraryRow(**vars(facts), id=id, name=text(name, 400), paths=paths, size=size)
 
     def _publish(self, places: dict[str, tuple[str, int]] | None = None, **changes: object) -> None:
         with self._changed:
@@ -286,7 +287,7 @@ class Library:
             try:
                 for id in ids:
                     row, found = self._there(id)
-                    tags, note = change(row.facts)
+                    tags, note = change(row)
                     if (tags, note) == (row.tags, row.note):
                         continue
                     touched.add(found.key)

@@ -39,7 +39,7 @@ from workbench.recording.library_row import (
 )
 from workbench.recording.library_scan import DATASET_KEY, NOTES, Found
 from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import UnreadableRecording
 
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
@@ -302,7 +302,7 @@ def _last_picture(group: H5Group) -> bytes | None:
 
 def _rrd_only(folder: Path, found: Found) -> Entry:
     # It takes rerun along, which is half a second that a library without such files has no need of.
-    from workbench.recording.read_properties import read_properties
+    from workbench.recording.rerun_table import read_properties
 
     path = found.path(folder, ".rrd")
     try:

@@ -60,8 +60,8 @@ Entry = tuple[Facts, bytes | None]
 """A recording and its thumbnail (jpeg)."""
 
 
-@dataclass(frozen=True)
-class LibraryRow:
+@dataclass(frozen=True, kw_only=True)
+class LibraryRow(Facts):
     """A recording in the table."""
 
     id: str
@@ -73,65 +73,20 @@ class LibraryRow:
     """Its files, the one to open it by first. All of them are what *delete* takes."""
     size: int
     """Bytes of `paths` together."""
-    facts: Facts
 
     @property
     def source(self) -> Source:
         """What it is read from."""
         path = self.paths[0]
-        if self.facts.trajectory is not None:
-            path = path.parents[1] if self.facts.kind == "lerobot" else path.with_suffix(".h5")
-        return Source(path, self.facts.trajectory, self.id, self.name)
-
-    @property
-    def kind(self) -> Kind:
-        return self.facts.kind
-
-    @property
-    def task(self) -> str:
-        return self.facts.task
-
-    @property
-    def trajectory(self) -> str | None:
-        return self.facts.trajectory
+        if self.trajectory is not None:
+            path = path.parents[1] if self.kind == "lerobot" else path.with_suffix(".h5")
+        return Source(path, self.trajectory, self.id, self.name)
 
     @property
     def date(self) -> datetime.datetime | None:
         """When it was written, in UTC."""
-        written = self.facts.written
+        written = self.written
         return None if written is None else datetime.datetime.fromtimestamp(written, datetime.timezone.utc)
-
-    @property
-    def seed(self) -> int | None:
-        return self.facts.seed
-
-    @property
-    def length(self) -> int | None:
-        return self.facts.length
-
-    @property
-    def total_reward(self) -> float | None:
-        return self.facts.total_reward
-
-    @property
-    def success(self) -> bool | None:
-        return self.facts.success
-
-    @property
-    def source_hash(self) -> str:
-        return self.facts.source_hash
-
-    @property
-    def tags(self) -> tuple[str, ...]:
-        return self.facts.tags
-
-    @property
-    def note(self) -> str:
-        return self.facts.note
-
-    @property
-    def problem(self) -> str | None:
-        return self.facts.problem
 
 
 def clean_facts(facts: Facts) -> Facts:

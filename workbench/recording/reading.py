@@ -45,8 +45,7 @@ from workbench.recording.reader.requests import (
     ToldRerun,
 )
 from workbench.recording.reader.wire import ArrayReader, Garbled, bytes_of, path_of
-from workbench.recording.sources import Kind, Source
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import Kind, Source, UnreadableRecording
 
 ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0

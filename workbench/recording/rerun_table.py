@@ -238,3 +238,28 @@ def _plain(values: pa.Array) -> NDArray:
     while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
         values = values.flatten()
     return values.to_numpy(zero_copy_only=False)
+
+
+def read_properties(path: Path) -> dict[str, dict[str, Any]]:
+    """The properties of the first recording in `path`, by name and then by component.
+
+    A component of one value is that value, a longer one a list. It is all that a library needs of a bare ``.rrd``; a file without a footer
+    (its writer was killed) is read as far as it goes.
+
+    Raises:
+        ValueError: `path` holds no recording.
+        OSError: `path` cannot be read.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for chunk in RrdReader(path).stream():
+        if not chunk.entity_path.startswith(_PROPERTIES):
+            continue
+        name = chunk.entity_path[len(_PROPERTIES) :].lstrip("/")
+        batch = chunk.to_record_batch()
+        for field, column in zip(batch.schema, batch.columns):
+            if (field.metadata or {}).get(b"rerun:kind") == b"data" and batch.num_rows:
+                value = column[batch.num_rows - 1].as_py()
+                if value is not None:
+                    component = field.name.rsplit(":", 1)[-1]
+                    found.setdefault(name, {})[component] = value[0] if len(value) == 1 else value
+    return found

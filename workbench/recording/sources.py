@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from workbench.recording.unreadable import UnreadableRecording
-
 if TYPE_CHECKING:
     from workbench.core.geometry import SharedShapes
     from workbench.recording.episode import Episode
 
 Kind = Literal["ours", "maniskill", "lerobot"]
 """Who made a recording: which of the three ways to read it."""
+
+
+class UnreadableRecording(ValueError):
+    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
 
 
 @dataclass(frozen=True)

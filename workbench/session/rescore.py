@@ -19,8 +19,7 @@ from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import made_here
 from workbench.recording.side_files import side_files_in_words
-from workbench.recording.sources import Source
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import Source, UnreadableRecording
 from workbench.session.clearance import NotCleared, Wanted, recorded_content
 from workbench.session.lane import JobFailed
 from workbench.session.messages import TaskOptions

@@ -13,8 +13,7 @@ from workbench.authoring.reference import TaskName
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.machine.current_folder import CurrentFolder
-from workbench.recording.sources import Source, sources_among
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import Source, UnreadableRecording, sources_among
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask

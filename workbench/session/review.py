@@ -28,7 +28,7 @@ from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
 from workbench.recording.library_row import LibraryRow
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import UnreadableRecording
 from workbench.session.lane import Stopped
 from workbench.session.memory_limit import in_words, total_memory
 from workbench.session.recorded_scene import SceneError, SceneProcess

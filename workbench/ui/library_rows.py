@@ -47,8 +47,8 @@ def newest_sources(rows: Iterable[LibraryRow]) -> dict[str, str]:
     """Source hash of the newest recording of each task that has one."""
     newest: dict[str, tuple[float, str]] = {}
     for row in rows:
-        if row.source_hash and row.facts.written is not None:
-            newest[row.task] = max(newest.get(row.task, (-1.0, "")), (row.facts.written, row.source_hash))
+        if row.source_hash and row.written is not None:
+            newest[row.task] = max(newest.get(row.task, (-1.0, "")), (row.written, row.source_hash))
     return {task: source for task, (_, source) in newest.items()}
 
 
@@ -66,7 +66,7 @@ def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
     """Whether each of these lower-case words is somewhere in its task, tags, note, name, source hash or what chose its
     actions; ``seed:3`` means that seed."""
     said = "\n".join(
-        (row.task, *row.tags, row.note, row.name, row.source_hash, row.facts.acted_by, row.problem or "")
+        (row.task, *row.tags, row.note, row.name, row.source_hash, row.acted_by, row.problem or "")
     ).lower()
     return all(
         row.seed is not None and word == f"seed:{row.seed}" if word.startswith("seed:") else word in said
@@ -107,7 +107,7 @@ def begins_descending(column: Column) -> bool:
 
 
 def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> list[LibraryRow]:
-    newest_first = sorted(rows, key=lambda row: (-(row.facts.written or 0.0), row.name))
+    newest_first = sorted(rows, key=lambda row: (-(row.written or 0.0), row.name))
     known = [row for row in newest_first if _key(row, column) is not None]
     unknown = [row for row in newest_first if _key(row, column) is None]
     known.sort(key=lambda row: _key(row, column), reverse=descending)  # type: ignore[arg-type,return-value]
@@ -117,7 +117,7 @@ def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> lis
 def _key(row: LibraryRow, column: Column) -> float | str | None:
     """What a row is sorted by; None for no value."""
     if column == "date":
-        return row.facts.written
+        return row.written
     if column == "seed":
         return row.seed
     if column == "steps":
@@ -140,9 +140,9 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> di
         now: with the zone that dates are shown in.
     """
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
-    env = "" if row.facts.env_index is None else f"env {row.facts.env_index}"
-    actions = f"actions: {row.facts.acted_by}" if row.facts.acted_by else ""
-    about = (row.name, env, size(row.size), row.facts.control_mode, actions)
+    env = "" if row.env_index is None else f"env {row.env_index}"
+    actions = f"actions: {row.acted_by}" if row.acted_by else ""
+    about = (row.name, env, size(row.size), row.control_mode, actions)
     return {
         "task": row.task or ("?" if row.problem else ""),
         "date": "" if when is None else _short_date(when, now),
@@ -157,7 +157,7 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> di
 
 
 def _remark(row: LibraryRow) -> str:
-    if row.facts.recovered:
+    if row.recovered:
         return "cut short"
     if row.kind == "workbench" or row.problem:
         return ""
@@ -167,11 +167,11 @@ def _remark(row: LibraryRow) -> str:
 def _outcome(row: LibraryRow) -> str:
     if row.success:
         return "success"
-    if row.facts.fail:
+    if row.fail:
         return "fail"
     if row.success is None:
         return ""
-    return "once" if row.facts.success_once else "no"
+    return "once" if row.success_once else "no"
 
 
 def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:

@@ -20,8 +20,7 @@ from workbench.recording.contact_sheet import contact_sheet
 from workbench.recording.episode import Episode
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
 from workbench.recording.mp4 import write_mp4
-from workbench.recording.scene_eye import Eye
-from workbench.recording.scene_film import scene_frames
+from workbench.recording.scene_film import Eye, scene_frames
 from workbench.recording.sources import Source
 from workbench.ui.fragments import counted
 from workbench.ui.scene_html import seconds_a_step, write_scene_html

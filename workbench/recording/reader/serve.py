@@ -29,7 +29,7 @@ from workbench.recording.reader.requests import (
     ToldRerun,
 )
 from workbench.recording.reader.wire import ArrayPacker, Closed, bytes_of, path_of, receive, send
-from workbench.recording.unreadable import UnreadableRecording
+from workbench.recording.sources import UnreadableRecording
 
 MOST_SHARED = 4
 """Groups of episodes whose shapes are remembered."""
