@@ -20,11 +20,13 @@ recording ends, and `problem` keeps it.
 from __future__ import annotations
 
 import logging
+import threading
 import warnings
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -33,13 +35,15 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
 from workbench.authoring.load import task_of_class
 from workbench.core import actions
+from workbench.core.pictures import Picture
 from workbench.core.seams import draws_its_own_seeds, last_observation, open_env, task_class
-from workbench.core.state_columns import read_state_columns
+from workbench.core.state_columns import StateReading, read_states
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request, step_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles
+from workbench.recording.journal import before_writing
 from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
 from workbench.session.episode_files import EpisodeFinisher
@@ -50,6 +54,22 @@ from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_pictures import recorded_pictures
 
 logger = logging.getLogger(__name__)
+_MOST_HELD = 2048
+"""Steps times envs that are taken apart together: 3 MB; fewer where half a second is over, or an episode begins."""
+
+
+class _Held(NamedTuple):
+    """A step that waits."""
+
+    step: StepResult
+    reset_mask: np.ndarray
+    pictures: list[Picture]
+    seeds: np.ndarray | None
+    states: StateReading
+
+    def stepped(self) -> Stepped:
+        columns = self.states.columns()
+        return Stepped(self.step, self.reset_mask, tuple(self.pictures), self.seeds, columns=columns)
 
 
 class Recorder(gym.Wrapper):
@@ -98,9 +118,17 @@ class Recorder(gym.Wrapper):
         self._made: list[Future[EpisodeFiles | str]] = []
         """Episodes that are over, and not known to have their files."""
         self._gatherer: EpisodeGatherer | None = None
+        self._held: deque[_Held] = deque()
+        """What the gatherer does not have yet: taken apart one by one, while the env waits and with the processor's caches
+        full of physics, steps cost twice as much."""
+        self._gathering = threading.Lock()
+        self._failure: Exception | None = None
+        """Of gathering; it may be another thread's."""
+        before_writing(self._gather)
         self._scene: Any = None
         self._description: TaskDescription | None = None
         self._seeds = np.full(base.num_envs, NO_SEED, np.int64)
+        self._elapsed = np.zeros(base.num_envs, np.int32)
         self._finished = False
         self.problem: str | None = None
         """Why the recording ended, if it did."""
@@ -117,10 +145,11 @@ class Recorder(gym.Wrapper):
         mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
         self._seeds[mask] = self._seeds_of_reset(seed)[mask]
         self._task.obs, none = last_observation(self._task.env), np.zeros(count, bool)
-        step = self._task.result(info, np.zeros(count), None, none, none)
+        step = self._task.result(info, np.zeros(count), None, none, none, look=False)
         if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
         if self._gatherer is not None:
+            self._gather()  # with the options of the resets before
             kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
             self._gatherer.reset_options = kept
         self._take(step, mask)
@@ -149,7 +178,7 @@ class Recorder(gym.Wrapper):
             if made is None:
                 made = np.zeros((task.num_envs, 0), np.float32)
             task.obs = last_observation(task.env)
-            step = task.result(info, reward, made, terminated, truncated)
+            step = task.result(info, reward, made, terminated, truncated, look=False)
             self._take(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
 
@@ -187,13 +216,24 @@ class Recorder(gym.Wrapper):
         if gatherer is None or self._description is None:
             return
         wanted = self._wanted()
-        pictures = [picture for env in self._envs for picture in step_pictures(task, env, wanted)]
-        columns = read_state_columns(task)
-        try:
-            gatherer.take(Stepped(step, reset_mask, tuple(pictures), self._seeds.copy(), columns=columns))
-        except (RecordingError, ValueError) as error:
-            self._give_up(error)
+        pictures = step_pictures(task, self._envs, wanted)
+        seeds = self._seeds.copy() if reset_mask.any() else None
+        self._held.append(_Held(step, reset_mask, pictures, seeds, read_states(task)))
+        follows = np.array_equal(step.elapsed_steps, self._elapsed + 1)
+        self._elapsed = step.elapsed_steps
+        # What does not follow is said at its own step.
+        if not follows or pictures or len(self._held) * len(reset_mask) > _MOST_HELD:
+            self._gather()
         self._say_what_failed()
+
+    def _gather(self) -> None:
+        with self._gathering:
+            try:
+                while self._held and self._gatherer is not None:
+                    self._gatherer.take(self._held.popleft().stepped())
+            except Exception as error:  # whoever steps has to hear of it, and this may be another thread
+                self._held.clear()
+                self._failure = error
 
     def _wanted(self) -> Sequence[Request]:
         if not self._pictures or self._description is None:
@@ -212,12 +252,20 @@ class Recorder(gym.Wrapper):
         self._made.append(self._finisher.finish(episode))
 
     def _end(self) -> None:
+        self._gather()
         gatherer, self._gatherer = self._gatherer, None
         if gatherer is not None:
             gatherer.finish()
 
     def _say_what_failed(self) -> None:
+        failure, self._failure = self._failure, None
+        if isinstance(failure, (RecordingError, ValueError)):
+            self._give_up(failure)
+        elif failure is not None:
+            raise failure
         done = [future for future in self._made if future.done()]
+        if not done:
+            return
         self._made = [future for future in self._made if future not in done]
         problems = [result for future in done if isinstance(result := future.result(), str)]
         if problems and self.problem is None:

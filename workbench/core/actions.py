@@ -112,7 +112,7 @@ def to_flat_action(
         robots = dict.fromkeys(p.robot for p in parts)
         action = np.concatenate([_numpy(action[robot]) for robot in robots], axis=-1)
     flat = _numpy(action)
-    expected = (env.num_envs, len(bounds(parts)[0]))
+    expected = (env.num_envs, sum([len(part.names) for part in parts]))
     if flat.shape == expected[1:]:
         flat = np.broadcast_to(flat, expected)
     if flat.shape != expected:
@@ -136,7 +136,7 @@ def _wrong_shape(whose: str, shape: tuple[int, ...], expected: tuple[int, int], 
 
 
 def _numpy(values: Any) -> NDArray[np.float32]:
-    values = values.detach().cpu() if isinstance(values, torch.Tensor) else values
+    values = values.numpy(force=True) if isinstance(values, torch.Tensor) else values
     return np.asarray(values, dtype=np.float32)
 
 

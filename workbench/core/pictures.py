@@ -64,7 +64,8 @@ class Picture:
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
     """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation is
-    this in whole millimetres as int16, which ends at 32.767 m; here there is no such end."""
+    this in whole millimetres as int16, which ends at 32.767 m: what `step_pictures` takes from there is left so. Else
+    there is no such end."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import sapien
@@ -64,8 +64,8 @@ class SceneIndex:
     in the flattened (N * B) array of bodies, -1 for one that is not there."""
     fixed: NDArray[np.float32]
     """(N, B, 7) poses of static bodies; NaN elsewhere. Only used with `rows`."""
-    rows: torch.Tensor | None
-    """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``; None on a stock CPU env."""
+    rows: Any
+    """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``, for `rows_of`; None on a stock CPU env."""
     slots: NDArray[np.int64]
     """(K,) where each of `rows` goes."""
     slot_of: dict[int, int]
@@ -137,7 +137,9 @@ def scene_index(env: Any) -> SceneIndex:
             for actor in actors.values()
         ),
         fixed=fixed,
-        rows=_joined(rows, scene.device) if scene.gpu_sim_enabled else None,
+        rows=row_index(torch.cat([torch.zeros(0, dtype=torch.int64, device=scene.device), *rows]))
+        if scene.gpu_sim_enabled
+        else None,
         slots=np.concatenate([np.zeros(0, np.int64), *slots]),
         slot_of=slot_of,
     )
@@ -158,7 +160,8 @@ def read_poses(env: Any) -> NDArray[np.float32]:
                 flat[slot] = [*entity.pose.p, *entity.pose.q]
         return poses
     # Gathered on the tensor's own device: one small copy to the host, not the whole buffer.
-    flat[index.slots] = env.scene.px.cuda_rigid_body_data.torch()[index.rows, :7].cpu().numpy()
+    moved = rows_of(env.scene.px.cuda_rigid_body_data, index.rows)[:, :7]
+    flat[index.slots] = moved if isinstance(moved, np.ndarray) else moved.cpu().numpy()
     for slots, kept in hidden_poses(env):
         flat[slots[slots >= 0]] = kept[slots >= 0]
     return poses
@@ -170,8 +173,7 @@ def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float
     On the CPU the poses are what ManiSkill keeps of them, to be written to, and no copy.
     """
     for actor, slots in scene_index(env).actors:
-        kept = seams.pose_before_hiding(actor)
-        if kept is not None:
+        if actor.hidden and (kept := seams.pose_before_hiding(actor)) is not None:
             yield slots, kept.cpu().numpy()
 
 
@@ -180,24 +182,50 @@ def present_states(env: Any) -> dict[str, Any]:
 
     Of a batched env. Tensors, or on the CPU arrays; copies of the simulation's own.
     """
+    return state_rows(env).states()
+
+
+class StateRows(NamedTuple):
+    """What the states of a moment are made of: copies, in as few calls as there are tensors."""
+
+    still: list[int]
+    places: dict[str, tuple[Any, int | None, Any, int]]
+    data: Any
+    """(N, B, 13)"""
+    qpos: Any
+    qvel: Any
+    asked: dict[str, Any]
+    """States that are in none of these."""
+
+    def states(self) -> dict[str, Any]:
+        """As `present_states`."""
+        data = self.data
+        if self.still:
+            data[:, self.still, 7:] = 0.0
+        join: Any = np.hstack if isinstance(data, np.ndarray) else torch.hstack
+        states: dict[str, Any] = {}
+        for name, (_, column, joints, dof) in self.places.items():
+            if name in self.asked:
+                states[name] = self.asked[name]
+            elif joints is None:
+                states[name] = data[:, column]
+            else:
+                states[name] = join([data[:, column], self.qpos[joints, :dof], self.qvel[joints, :dof]])
+        return states
+
+
+def state_rows(env: Any) -> StateRows:
+    """Of the present moment, for who has time for `present_states` later."""
     rows, still, places = _places_of_states(env)
     px = env.scene.px
-    arrays = px.cuda_rigid_body_data, px.cuda_articulation_qpos, px.cuda_articulation_qvel
-    # numpy's calls on a few hundred numbers take a quarter of torch's.
-    data, qpos, qvel = (t.numpy() if t.device.type == "cpu" else t for t in (a.torch() for a in arrays))
-    data = data[rows]
-    if still:
-        data[:, still, 7:] = 0.0
-    join: Any = np.hstack if isinstance(data, np.ndarray) else torch.hstack
-    states: dict[str, Any] = {}
-    for name, (struct, column, joints, dof) in places.items():
-        if column is None or (joints is None and struct.hidden):
-            states[name] = in_every_env(env, struct, struct.get_state())
-        elif joints is None:
-            states[name] = data[:, column]
-        else:
-            states[name] = join([data[:, column], qpos[joints, :dof], qvel[joints, :dof]])
-    return states
+    asked = {
+        name: in_every_env(env, struct, struct.get_state())
+        for name, (struct, column, joints, _) in places.items()
+        if column is None or (joints is None and struct.hidden)
+    }
+    qpos, qvel = px.cuda_articulation_qpos.torch(), px.cuda_articulation_qvel.torch()
+    qpos, qvel = (q.numpy().copy() if q.is_cpu else q.clone() for q in (qpos, qvel))
+    return StateRows(still, places, rows_of(px.cuda_rigid_body_data, rows), qpos, qvel, asked)
 
 
 @once_a_scene
@@ -215,15 +243,11 @@ def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, in
                 still.append(len(rows))
             places[name], body = (struct, len(rows), None, 0), struct
         else:
-            joints = _index(seams.data_rows_of_articulation(struct))
+            joints = row_index(seams.data_rows_of_articulation(struct))
             places[name], body = (struct, len(rows), joints, int(struct.max_dof)), struct.root
         rows.append(seams.data_rows_of(body).long())
     none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
-    return _index(torch.stack(rows, dim=1) if rows else none), still, places
-
-
-def _index(rows: torch.Tensor) -> Any:
-    return rows.long().numpy() if rows.device.type == "cpu" else rows.long()
+    return row_index(torch.stack(rows, dim=1) if rows else none), still, places
 
 
 def in_every_env(env: Any, struct: Any, value: Any) -> Any:
@@ -238,8 +262,16 @@ def in_every_env(env: Any, struct: Any, value: Any) -> Any:
     return whole
 
 
-def _joined(rows: list[torch.Tensor], device: torch.device) -> torch.Tensor:
-    return torch.cat([torch.zeros(0, dtype=torch.int64, device=device), *(row.long() for row in rows)])
+def row_index(rows: torch.Tensor) -> Any:
+    """(K,) rows of a tensor of the simulation, as `rows_of` takes them: on its own device, on the CPU an array."""
+    return rows.long().numpy() if rows.is_cpu else rows.long()
+
+
+def rows_of(tensor: Any, rows: Any) -> Any:
+    """(K, D) of a tensor of the simulation, copied; an array on the CPU, where numpy's calls on a few hundred numbers
+    take a quarter of torch's."""
+    data = tensor.torch()
+    return data.numpy().take(rows, axis=0) if data.is_cpu else data[rows]
 
 
 def _named_structs(scene: Any) -> Iterator[tuple[str, str, list[Any]]]:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.recorded_run import OBS, STATE
-from workbench.core.scene_index import in_every_env, present_states, scene_index
+from workbench.core.scene_index import StateRows, in_every_env, scene_index, state_rows
 from workbench.core.snapshot import remembering
 from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
@@ -43,17 +44,45 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     Raises:
         Exception: whatever a ``get_state_dict`` of the author's own raises.
     """
-    count = task.num_envs
-    values: dict[str, Any] = {STATE + name: value for name, value in env_states(task.env).items()}
+    return read_states(task).columns()
+
+
+@dataclass(frozen=True)
+class StateReading:
+    """What one moment's columns are made of; copies."""
+
+    rows: StateRows | None
+    asked: dict[str, Any]
+    """Further columns, and flattened observations."""
+    flat: dict[str, Any]
+    """What each flattened observation consists of."""
+    num_envs: int
+    device: torch.device
+
+    def columns(self) -> dict[str, NDArray]:
+        """As `read_state_columns`."""
+        states = {} if self.rows is None else self.rows.states()
+        values = {**{STATE + name: value for name, value in states.items()}, **self.asked}
+        columns: dict[str, NDArray] = {}
+        for name, column in _fetched(values, self.num_envs, self.device).items():
+            parts = self.flat.get(name)
+            if parts is None:
+                columns[name] = column
+            else:
+                columns.update({OBS + part: numbers for part, numbers, _ in apart(parts, column)})
+        return columns
+
+
+def read_states(task: TaskEnv) -> StateReading:
+    """Of the present moment, for who has time for `read_state_columns` later. Raises as it does."""
+    rows, asked = _read(task.env)
+    values: dict[str, Any] = {STATE + name: value for name, value in asked.items()}
     values.update(_observed(task))
-    columns: dict[str, NDArray] = {}
-    for name, column in _fetched(values, count, task.env.device).items():
-        parts = names_of_flat(task, values[name]) if name in (OBS, OBS + "state") else None
-        if parts is None:
-            columns[name] = column
-        else:
-            columns.update({OBS + part: numbers for part, numbers, _ in apart(parts, column)})
-    return columns
+    flat = {name: names_of_flat(task, values[name]) for name in (OBS, OBS + "state") if name in values}
+    for name, value in values.items():
+        if isinstance(value, torch.Tensor):
+            values[name] = to_numpy(value) if value.is_cpu else value.clone()
+    return StateReading(rows, values, flat, task.num_envs, task.env.device)
 
 
 def env_states(env: BaseEnv) -> dict[str, Any]:
@@ -62,15 +91,18 @@ def env_states(env: BaseEnv) -> dict[str, Any]:
     Tensors, or on the CPU arrays; copies of the simulation's own. ManiSkill asks every actor and articulation in turn for
     pose and velocities, 75 us for the four of PickCube; the numbers are those of its ``get_state_dict``, to the last bit
     (tested). A task that has one of its own is asked itself."""
+    rows, asked = _read(env)
+    return asked if rows is None else {**rows.states(), **asked}
+
+
+def _read(env: BaseEnv) -> tuple[StateRows | None, dict[str, Any]]:
+    """What `env_states` is made of: rows of the simulation, and what was asked for."""
     if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
         whole: Any = env.get_state_dict()
         known = scene_index(env).states
-        return {name: in_every_env(env, known.get(name), value) for name, value in flat_entries(whole)}
-    states = present_states(env)
-    if env.agent is not None:
-        controllers: Any = env.agent.get_controller_state()
-        states.update(flat_entries(controllers, "controller/"))
-    return states
+        return None, {n: in_every_env(env, known.get(n), value) for n, value in flat_entries(whole)}
+    controllers: Any = {} if env.agent is None else env.agent.get_controller_state()
+    return state_rows(env), dict(flat_entries(controllers, "controller/"))
 
 
 def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:

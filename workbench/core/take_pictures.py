@@ -308,45 +308,56 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
 # --- of a step ---------------------------------------------------------------------------------------
 
 
-def step_pictures(task: TaskEnv, env_index: int, requests: Sequence[Request]) -> tuple[Picture, ...]:
-    """Pictures of the cameras that are asked for, of the state that was observed last. Raises as `take_pictures`."""
-    found = {i: _observed(task, env_index, request) for i, request in enumerate(requests)}
-    drawn = [i for i, picture in found.items() if picture is None]
-    made = take_pictures(task.env, env_index, [requests[i] for i in drawn]) if drawn else ()
-    found.update(zip(drawn, made, strict=True))
-    return tuple(picture for picture in found.values() if picture is not None)
+def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:
+    """Pictures of the cameras that are asked for, of the state that was observed last, env by env.
+
+    Depth and segmentation that were observed are as ManiSkill has them: int16, whole millimetres and ids. Raises as
+    `take_pictures`.
+    """
+    if not requests:
+        return []
+    seen = [_observed(task, env_idx, request) for request in requests]
+    drawn = [request for request, found in zip(requests, seen, strict=True) if found is None]
+    pictures: list[Picture] = []
+    for at, env in enumerate(env_idx):
+        made = iter(take_pictures(task.env, env, drawn) if drawn else ())
+        pictures += [next(made) if found is None else found[at] for found in seen]
+    return pictures
 
 
-def _observed(task: TaskEnv, env_index: int, request: Request) -> Picture | None:
+def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[Picture] | None:
+    """Of each env; None where they have to be drawn."""
     name, kind, modalities = request
     seen: Any = task.obs.get("sensor_data", {}) if isinstance(task.obs, Mapping) else {}
     images = seen.get(name) if kind == "sensor" else None
     if not isinstance(images, Mapping) or not modalities or not set(modalities) <= set(images):
         return None
-    camera = cameras_of(task.env).get(("sensor", name))
-    if camera is None or camera.config.shader_config.shader_pack != "minimal":
+    camera: Any = seams.cameras(task.env).get(("sensor", name))
+    if camera is None or not (components := seams.camera_components(camera)):
         return None
-    rows = {modality: _row(images[modality], env_index) for modality in modalities}
-    depth = rows.get("depth")
+    if camera.config.shader_config.shader_pack != "minimal":
+        return None
+    rows = {modality: images[modality][list(env_idx)].numpy(force=True) for modality in modalities}
+    depth, segmentation = rows.get("depth"), rows.get("segmentation")
     if depth is not None and (depth.dtype != np.int16 or depth.min() < 0):
         return None
     scene: Any = task.env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
     px = seams.batched_system(scene)
-    elsewhere = {} if px is None else px.elsewhere([env_index])
-    pose = camera_pose(seams.camera_components(camera)[env_index], elsewhere.get(env_index, NOWHERE_ELSE))
-    segmentation = rows.get("segmentation")
-    return Picture(
-        camera=name,
-        kind="sensor",
-        env=env_index,
-        pose=np.array([*pose.p, *pose.q], dtype=np.float32),
-        rgb=rows.get("rgb"),
-        depth=None if depth is None else depth[..., 0].astype(np.float32) / np.float32(1000.0),
-        segmentation=None if segmentation is None else segmentation[..., 0].astype(np.int32),
-    )
-
-
-def _row(images: torch.Tensor, env_index: int) -> NDArray:
-    return np.ascontiguousarray(images[env_index].cpu().numpy()).copy()
+    elsewhere = {} if px is None else px.elsewhere(env_idx)
+    found = []
+    for at, env in enumerate(env_idx):
+        pose = camera_pose(components[env], elsewhere.get(env, NOWHERE_ELSE))
+        found.append(
+            Picture(
+                camera=name,
+                kind="sensor",
+                env=env,
+                pose=np.array([*pose.p, *pose.q], dtype=np.float32),
+                rgb=None if "rgb" not in rows else rows["rgb"][at],
+                depth=None if depth is None else depth[at, ..., 0],
+                segmentation=None if segmentation is None else segmentation[at, ..., 0],
+            )
+        )
+    return found

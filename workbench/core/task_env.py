@@ -288,29 +288,30 @@ class TaskEnv:
         action: NDArray[np.float32] | None,
         terminated: Any = None,
         truncated: Any = None,
+        look: bool = True,
     ) -> StepResult:
-        """What a step or a reset (no action) gave, also one that went past this object.
+        """What a step or a reset (no action) gave, also one that went past this object; `look` for `StepResult.sound_obs`.
 
         Where it is not said which episodes ended, `info` and the time limit say it.
         """
         count = self.num_envs
-        elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
+        elapsed = _column(self.env.elapsed_steps, np.int32, count)
         if terminated is None:
-            flags = [_batch(to_numpy(info[key]).astype(bool), count) for key in FLAGS if key in info]
+            flags = [_column(info[key], bool, count) for key in FLAGS if key in info]
             terminated = np.logical_or.reduce(flags) if flags else False
         if truncated is None:
             truncated = self.max_episode_steps is not None and elapsed >= self.max_episode_steps
         evaluate, others = split_entries(info, count)
         return StepResult(
             elapsed_steps=elapsed,
-            reward=_batch(to_numpy(reward).astype(np.float32), count),
-            terminated=_batch(to_numpy(terminated).astype(bool), count),
-            truncated=_batch(to_numpy(truncated).astype(bool), count),
+            reward=_column(reward, np.float32, count),
+            terminated=_column(terminated, bool, count),
+            truncated=_column(truncated, bool, count),
             evaluate=evaluate,
             others=others,
             poses=read_poses(self.env),
             action=None if action is None else np.array(action, dtype=np.float32),
-            sound_obs=_sound(self.obs, count),
+            sound_obs=_sound(self.obs, count) if look else None,
         )
 
 
@@ -345,10 +346,11 @@ def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
             yield f"{prefix}{key}", value
 
 
-def _batch(value: NDArray[Any], num_envs: int) -> NDArray[Any]:
-    """(N, ...): one value for all envs, as of a task that is written for one env, is repeated for each."""
-    batched = value.ndim > 0 and value.shape[0] == num_envs
-    return value if batched else np.broadcast_to(value, (num_envs, *value.shape)).copy()
+def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
+    """(N, ...), a copy: one value for all envs, as of a task that is written for one env, is repeated for each."""
+    array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
+    batched = array.ndim > 0 and len(array) == num_envs
+    return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()
 
 
 def to_numpy(value: Any) -> NDArray[Any]:

@@ -38,7 +38,7 @@ SCENE_SUFFIX = ".scene"
 NO_OTHERS: Mapping[str, OtherEntry] = MappingProxyType({})
 _PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
     "rgb": ((3,), "u", "(H, W, 3) of uint8"),
-    "depth": ((), "f", "(H, W) of floats"),
+    "depth": ((), "fi", "(H, W) of numbers"),
     "segmentation": ((), "iu", "(H, W) of integers"),
 }
 """Shape of a pixel, kinds of numbers, and both in words."""

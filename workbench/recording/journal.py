@@ -226,6 +226,7 @@ class _Keeper:
         self._journals: set[Journal] = set()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
+        self.before: list[weakref.WeakMethod[Callable[[], None]]] = []
 
     def watch(self, journal: Journal) -> None:
         with self._changed:
@@ -239,6 +240,12 @@ class _Keeper:
             self._journals.discard(journal)
             self._changed.notify()
 
+    def flush(self) -> None:
+        self.before = [held for held in self.before if held() is not None]
+        for held in self.before:
+            if flush := held():
+                flush()
+
     def _run(self) -> None:
         while True:
             with self._changed:
@@ -248,6 +255,8 @@ class _Keeper:
                 if not self._journals:
                     self._thread = None
                     return
+            self.flush()
+            with self._changed:
                 journals = list(self._journals)
             for journal in journals:
                 journal.write()  # all of them before the first fsync, which may take its time
@@ -256,6 +265,14 @@ class _Keeper:
 
 
 _keeper = _Keeper()
+
+
+def before_writing(flush: Callable[[], None]) -> None:
+    """Have the bound method `flush` called before journals are written, while its object lives: for who holds rows back.
+
+    On the thread of the journals, so it must not raise.
+    """
+    _keeper.before.append(weakref.WeakMethod(flush))
 
 
 def read_journal(path: Path) -> Iterator[list[Entry]]:

@@ -208,13 +208,14 @@ class EpisodeGatherer:
         if successes is not None:
             # One value an env, or several.
             success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
-        captured, others = stepped.captured, step.others
+        captured, others, acted_by = stepped.captured, step.others, stepped.acted_by
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
             env = episode.env
             if elapsed[env] != episode.steps + 1:
                 raise _lost(env, episode.steps + 1, elapsed[env])
-            episode.acts(stepped.acted_by)
+            if acted_by != episode.acted_by:
+                episode.acts(acted_by)
             episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
             episode.steps += 1
             episode.total_reward += reward[env]

@@ -18,7 +18,6 @@ import torch
 
 from workbench.authoring.reference import named_file
 from workbench.core.broken_rule import warn_of
-from workbench.core.pictures import Picture
 from workbench.core.recorded_run import states_of
 from workbench.core.recorded_state import apart, write_states
 from workbench.core.rules import Finding
@@ -381,9 +380,7 @@ class _Episodes:
 
     def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
         task = self._opened.env
-        pictures: tuple[Picture, ...] = ()
-        for env in pictured:
-            pictures += step_pictures(task, env, self._wanted)
+        pictures = tuple(step_pictures(task, pictured, self._wanted))
         with blamed("step", self._opened.loaded, task):
             columns = read_state_columns(task)
         return Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns)

@@ -75,8 +75,7 @@ class StepEvents:
         if self.pictures_due(step, reset_mask):
             columns = self._state_columns(opened)
             wanted = recorded_pictures(opened.description.cameras)
-            for env in sorted(self._captured):
-                captured += step_pictures(opened.env, env, wanted)
+            captured = tuple(step_pictures(opened.env, sorted(self._captured), wanted))
         packed = self._packed_snapshot(opened)
         return Stepped(
             step,

@@ -104,7 +104,7 @@ class WorkerCameras:
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
-        drawn = [picture for env in request.env_idx for picture in step_pictures(opened.env, env, wanted)]
+        drawn = step_pictures(opened.env, request.env_idx, wanted)
         return Captured(columns, tuple(drawn))
 
     # --- what the worker does to the scene -----------------------------------------------------------
