@@ -28,7 +28,7 @@ from workbench.core.visibility import judge_camera
 # That they are set and not applied is what these tests are about.
 pytestmark = [
     pytest.mark.usefixtures("renderer"),
-    pytest.mark.filterwarnings("ignore::workbench.core.strict.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
 ]
 MODE = "rgb+segmentation"
 N = 2

@@ -23,7 +23,7 @@ N = 2
 MODE = "rgb+depth+segmentation"
 SENSOR = ("base_camera", "sensor", ("rgb", "depth", "segmentation"))
 
-pytestmark = pytest.mark.filterwarnings("ignore::workbench.core.strict.RuleWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
 
 
 @pytest.fixture(scope="module")
