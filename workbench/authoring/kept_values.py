@@ -12,7 +12,7 @@ import ast
 from collections.abc import Collection, Iterable, Iterator
 from typing import Literal
 
-from workbench.authoring.remembers import MUTATES, root_name
+from workbench.authoring.remembers import changes_in_place, root_name
 from workbench.authoring.symbols import Symbol
 
 _Nature = Literal["fixed", "filled", "object"]
@@ -63,8 +63,7 @@ def written_attributes(symbol: Symbol | None) -> set[str]:
             target = target.value
         written = isinstance(getattr(node, "ctx", None), ast.Store)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            in_place = node.func.attr in MUTATES or node.func.attr.endswith("_")
-            target, written = node.func.value, in_place
+            target, written = node.func.value, changes_in_place(node.func)
         if written and isinstance(target, ast.Attribute):
             found.add(target.attr)
     return found
@@ -139,10 +138,7 @@ def _may_change(
             return True
         above = parents.get(id(parent))
         if isinstance(parent, ast.Attribute) and isinstance(above, ast.Call) and above.func is parent:
-            in_place = parent.attr in MUTATES or (
-                parent.attr.endswith("_") and not parent.attr.endswith("__")
-            )
-            return nature == "object" or (nature == "filled" and in_place)
+            return nature == "object" or (nature == "filled" and changes_in_place(parent))
         here, parent = parent, above
     if nature == "fixed":
         return False
@@ -171,8 +167,7 @@ def _is_written(local: str, nodes: Iterable[ast.AST]) -> bool:
         elif isinstance(node, ast.AugAssign):
             written = node.target
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            in_place = node.func.attr in MUTATES or node.func.attr.endswith("_")
-            written = node.func if in_place else node
+            written = node.func if changes_in_place(node.func) else node
         else:
             continue
         if root_name(written) == local:

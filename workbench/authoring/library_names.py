@@ -26,13 +26,14 @@ from types import ModuleType
 from workbench.machine import DISTRIBUTION
 
 _LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
-_LIBRARY_ROOTS = tuple(
+_INSTALLED = tuple(
     {
         os.path.realpath(sysconfig.get_paths()[name]) + os.sep
         for name in ("stdlib", "platstdlib", "purelib", "platlib")
     }
 )
-_WORKBENCH = str(Path(__file__).resolve().parents[1]) + os.sep
+LIBRARY_ROOTS = (str(Path(__file__).resolve().parents[1]) + os.sep, *_INSTALLED)
+"""Folders of nobody's own files: the workbench's, and those that Python installs into."""
 _IMPORTED_BY_NOBODY = {"docs", "example", "examples", "scripts", "test", "tests", "utils"}
 """Packages install such folders by mistake (sapien 3.0.3 an ``example``); authors have their own."""
 
@@ -49,7 +50,7 @@ def is_own_file(path: str, folder: Path) -> bool:
     itself where it is installed from its repository. Those are nobody's helpers.
     """
     root = str(folder) + os.sep
-    if not path.startswith(root) or path.startswith((_WORKBENCH, *_LIBRARY_ROOTS)):
+    if not path.startswith(root) or path.startswith(LIBRARY_ROOTS):
         return False
     return not any(
         part in _LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep)

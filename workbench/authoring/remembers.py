@@ -21,7 +21,7 @@ from collections.abc import Collection, Iterator
 MUTATES = frozenset(
     (
         "append appendleft extend insert add update put push pop popitem clear remove discard set sort reverse "
-        "register_buffer setdefault __setitem__ __setattr__"
+        "register_buffer setdefault __setitem__ __delitem__ __setattr__ __delattr__ __iadd__ __ior__ __imul__"
     ).split()
 )
 _ASKS = {"hasattr", "setattr", "delattr", "vars"}
@@ -117,9 +117,13 @@ def _call_keeps(call: ast.Call, conditional: bool, fresh: set[str], imported: Co
         return False
     if function.attr in ("setdefault", "__missing__"):
         return True
-    in_place = function.attr.endswith("_") and not function.attr.endswith("__")
-    writes = function.attr in MUTATES or in_place or any(word.arg == "out" for word in call.keywords)
+    writes = changes_in_place(function) or any(word.arg == "out" for word in call.keywords)
     return conditional and writes and _is_old(function.value, fresh, imported)
+
+
+def changes_in_place(method: ast.Attribute) -> bool:
+    """``append``, ``update``, torch's ``add_``."""
+    return method.attr in MUTATES or (method.attr.endswith("_") and not method.attr.endswith("__"))
 
 
 def _outlives(target: ast.expr, fresh: set[str], imported: Collection[str]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import subprocess
 import sys
 from textwrap import dedent
@@ -255,6 +256,59 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
     assert isinstance(plan, SourceEdit) and plan.file == FILE
     assert "sapien.Pose([0.5, 0, 0.75])" in plan.new_text
     assert any("more.py" in note for note in plan.notes)
+
+
+def test_a_change_that_would_not_be_seen_in_what_is_written_is_refused() -> None:
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    after = dataclasses.replace(before, position=(0.5, 0.0, 0.50003))
+    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, after, run_class)
+    assert isinstance(plan, Refusal) and "smaller than what is written" in plan.reason
+
+
+SHARED = dedent(
+    """\
+    X = 1 / 3
+    POSE = sapien.Pose([X, 0, 0.5])
+
+
+    class Task(Base):
+        OWN = sapien.Pose([1 / 3, 0, 0.5])
+
+        @property
+        def _default_sensor_configs(self):
+            return [CameraConfig("cam", POSE, 64, 64, 1.0), CameraConfig("own", self.OWN, 64, 64, 1.0)]
+
+        @property
+        def _default_human_render_camera_configs(self):
+            return [CameraConfig("cam", POSE, 64, 64, 1.0), CameraConfig("own", self.OWN, 64, 64, 1.0)]
+    """
+)
+
+
+@pytest.mark.parametrize(
+    ("uid", "new"), [("cam", "sapien.Pose([X, 0, 0.75])"), ("own", "sapien.Pose([0.3333333, 0, 0.75])")]
+)
+def test_of_a_shared_pose_only_names_that_are_seen_there_go_into_the_camera(uid: str, new: str) -> None:
+    source = HEADER + SHARED
+    before = real_settings({FILE: source}, uid, "_default_sensor_configs")
+    after = dataclasses.replace(before, position=(*before.position[:2], 0.75))
+    plan = plan_edit({FILE: source}, ("sensor", uid), before, after, run_class)
+    assert isinstance(plan, SourceEdit), plan
+    assert f'CameraConfig("{uid}", {new}, 64, 64, 1.0)' in plan.new_text
+
+
+def test_an_angle_of_another_file_that_others_read_comes_in_radians_and_as_finely_as_it_was_written() -> None:
+    places = PLACES + "FOV = 60 * np.pi / 180\n"
+    sources = {
+        FILE: IMPORTING.replace("64, 1.0", "64, places.FOV"),
+        "/author/places.py": places,
+        "/author/more.py": "import places\nx = places.FOV\n",
+    }
+    before = real_settings(sources, "cam")
+    after = dataclasses.replace(before, fov=math.radians(50.123))
+    plan = plan_edit(sources, ("sensor", "cam"), before, after, run_class)
+    assert isinstance(plan, SourceEdit) and plan.file == FILE, plan
+    assert "64, 0.874759)" in plan.new_text, "50.12 degrees"
 
 
 def test_a_change_of_two_files_is_one_plan_with_both() -> None:

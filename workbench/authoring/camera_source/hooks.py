@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Sequence
-from typing import Literal
 
-from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.camera_source.cameras import HOOKS, Ran
 from workbench.authoring.camera_source.snippet import repr_text
 from workbench.authoring.source.names import Binding, Project
 from workbench.authoring.source.text import Function, Refused, Replacement, SourceFile, walk
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind
 
-Hook = Literal["_default_sensor_configs", "_default_human_render_camera_configs"]
-HOOK_OF: dict[CameraKind, Hook] = {
-    "sensor": "_default_sensor_configs",
-    "human": "_default_human_render_camera_configs",
-}
+HOOK_OF: dict[CameraKind, str] = {kind: hook for hook, kind in HOOKS.items() if hook.startswith("_default")}
 _CONFIG = "from mani_skill.sensors.camera import CameraConfig\n"
 
 
@@ -103,7 +98,7 @@ def appended(file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], s
 
 
 def new_hook(
-    project: Project, ran: Ran, file: SourceFile, cls: ast.ClassDef, hook: Hook, text: Callable[[str], str]
+    project: Project, ran: Ran, file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
 ) -> list[Replacement]:
     """The hook, which returns the one camera that `text(indent)` is."""
     owner, where = ran.owners.get(hook, ("", ""))
@@ -133,7 +128,7 @@ def class_named(file: SourceFile, name: str) -> ast.ClassDef:
 
 
 def at_end_of_class(
-    file: SourceFile, cls: ast.ClassDef, hook: Hook, text: Callable[[str], str]
+    file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
 ) -> Replacement:
     """`text(indent)`, the whole hook, as the last of the class."""
     first = file.inner_span(cls.body[0])[0]

@@ -13,9 +13,7 @@ import math
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import number_text
 from workbench.authoring.source.text import Replacement, SourceFile, arguments
-from workbench.authoring.source.trace import Part, Place
-
-DEGREE = math.pi / 180
+from workbench.authoring.source.trace import DEGREE, Part, Place
 
 
 class Changes:

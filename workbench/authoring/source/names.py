@@ -40,6 +40,7 @@ class Project:
     def __init__(self, texts: Mapping[str, str]) -> None:
         self.texts = texts
         self._files: dict[str, SourceFile] = {}
+        self._words: dict[str, frozenset[str]] = {}
         self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
 
     def file(self, path: str) -> SourceFile:
@@ -57,9 +58,10 @@ class Project:
 
     def mentioning(self, word: str) -> Iterator[SourceFile]:
         """The files in which `word` stands as a word."""
-        pattern = re.compile(rf"\b{re.escape(word)}\b")
         for path, text in self.texts.items():
-            if pattern.search(text):
+            if path not in self._words:
+                self._words[path] = frozenset(re.findall(r"\w+", text))
+            if word in self._words[path]:
                 yield self.file(path)
 
     def bindings(self, file: SourceFile, scope: Scope) -> dict[str, list[Binding]]:

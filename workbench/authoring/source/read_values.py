@@ -24,9 +24,8 @@ import numpy as np
 from workbench.authoring.source.library import Known, known_functions, plain
 from workbench.authoring.source.names import Binding, Project, reaching
 from workbench.authoring.source.text import FUNCTIONS, Scope, SourceFile, arguments, is_starred
-from workbench.authoring.source.trace import Part, Place, Plain, Read, Trace
+from workbench.authoring.source.trace import DEGREE, Part, Place, Plain, Read, Trace
 
-DEGREE = math.pi / 180
 _DEPTH = 40
 """Names defined by names: beyond this they go in a circle."""
 _TESTS = (

@@ -45,7 +45,7 @@ def look_at(
     seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
     forward, upward = np.subtract(*seen), np.asarray(up, float)
     left = np.cross(upward, forward)
-    if np.linalg.norm(left) < 1e-6 * max(1e-6, float(np.linalg.norm(forward) * np.linalg.norm(upward))):
+    if np.linalg.norm(left) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(upward):
         return None
     columns = (forward, left, np.cross(forward, left))
     return unit(mat2quat(np.stack([column / np.linalg.norm(column) for column in columns], axis=-1)).tolist())

@@ -105,9 +105,7 @@ class SourceFile:
             node, outer = outer, self.parents[outer]
         if isinstance(outer, ast.Call) and node is not outer.func:
             return self.inside(outer)
-        return (
-            self.inner_span(outer) if hasattr(outer, "lineno") and outer is not None else (0, len(self.text))
-        )
+        return self.inner_span(outer) if isinstance(outer, (ast.expr, ast.stmt)) else (0, len(self.text))
 
     @cached_property
     def _tokens(self) -> list[tuple[int, int, str]]:
