@@ -122,12 +122,12 @@ def _registered_ids(tree: ast.Module) -> Iterator[ast.Constant]:
         for call in node.decorator_list:
             if not isinstance(call, ast.Call) or not ast.unparse(call.func).endswith("register_env"):
                 continue
-            given = [*call.args[:1], *(word.value for word in call.keywords if word.arg == "uid")]
-            if not given or not isinstance(given[0], ast.Constant) or not isinstance(given[0].value, str):
+            given = (*call.args, *(word.value for word in call.keywords if word.arg == "uid"), None)[0]
+            if not isinstance(given, ast.Constant) or not isinstance(given.value, str):
                 raise NoCopy(
                     f"line {call.lineno} registers an id that is computed, so its copy would take the id of the original"
                 )
-            yield given[0]
+            yield given
 
 
 def _new_id(env_id: str, number: int) -> str:

@@ -15,6 +15,7 @@ from workbench.authoring.camera_source.run_hooks import run_hooks
 from workbench.authoring.load import LoadedTask, load_task, take_back
 from workbench.authoring.reference import class_beside
 from workbench.authoring.source.names import Project
+from workbench.authoring.source.read_values import module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import seams
 from workbench.core.camera_report import CameraReport, OfferedPlacement
@@ -203,9 +204,7 @@ def _set_otherwise(before: Mapping[str, str], after: Mapping[str, str], owner: A
         if len(was) != 1 or len(stores) != 1 or was[0].value is None or stores[0].value is None:
             continue
         if ast.dump(was[0].value) != ast.dump(stores[0].value):
-            module = next(
-                m for m in list(sys.modules.values()) if getattr(m, "__file__", None) == stores[0].file.path
-            )
-            code = compile(ast.Expression(stores[0].value), stores[0].file.path, "eval")
-            found[name] = eval(code, vars(module), {"self": owner})
+            path = stores[0].file.path
+            code = compile(ast.Expression(stores[0].value), path, "eval")
+            found[name] = eval(code, vars(module_of(path)), {"self": owner})
     return found

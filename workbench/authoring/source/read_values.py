@@ -144,7 +144,7 @@ class ValueReader:
     def _namespace(self, file: SourceFile, scope: Scope) -> tuple[dict[str, Any], Mapping[str, Any]]:
         """Globals and locals of code in a scope, as they are now."""
         running = self._frame
-        names = running.f_globals if file.path == running.f_code.co_filename else vars(_module(file.path))
+        names = running.f_globals if file.path == running.f_code.co_filename else vars(module_of(file.path))
         if scope in self._around and isinstance(scope, FUNCTIONS):
             return names, running.f_locals
         if isinstance(scope, ast.ClassDef):
@@ -463,7 +463,8 @@ def _put(node: ast.AST, leaf: ast.AST, value: float) -> Any:
     return made
 
 
-def _module(path: str) -> ModuleType:
+def module_of(path: str) -> ModuleType:
+    """The one that was made of a file. Raises LookupError."""
     for module in list(sys.modules.values()):
         if getattr(module, "__dict__", {}).get("__file__") == path:
             return module
