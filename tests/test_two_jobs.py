@@ -23,7 +23,7 @@ from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.recording.sources import sources_among
 from workbench.session.clearance import Clearances
-from workbench.session.rescorer import Rescorer
+from workbench.session.rescore import Rescorer
 from workbench.ui.make_shared import Wanted
 from workbench.ui.making import Making
 

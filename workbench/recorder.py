@@ -46,8 +46,7 @@ from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.journal import before_writing
 from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
-from workbench.session.episode_files import EpisodeFinisher
-from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
+from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.open_task import describe
 from workbench.session.record_live import recovered_in_words

@@ -15,6 +15,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from workbench.core.backends import gpu_left_alone
+from workbench.machine.atomic_files import replace_file
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
 from workbench.recording.sources import Source
@@ -65,7 +66,7 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:
             with here.again():
-                words.write_table(path, text(verdicts))
+                replace_file(path, text(verdicts).encode())
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):
         warn(note)

@@ -10,7 +10,7 @@ from tests.drive.waiting import until
 from workbench.session.judging import JudgedView
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions
-from workbench.session.rescorer import Rescorer
+from workbench.session.rescore import Rescorer
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from tests.drive.episodes import appended, made
 from workbench.recording.episode_writer import EpisodeFiles
-from workbench.session.episode_files import EpisodeFinisher
-from workbench.session.episodes import GatheredEpisode
+from workbench.session.episodes import EpisodeFinisher, GatheredEpisode
 
 
 def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) -> None:

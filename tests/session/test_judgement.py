@@ -150,6 +150,20 @@ def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> 
     assert judgement.steps == 6
 
 
+def test_a_snapshot_that_many_runs_begin_with_goes_to_the_worker_once() -> None:
+    old, new, _ = drawn(0, 6, 64)
+    jumped = np.zeros((6, 64), bool)
+    jumped[0], jumped[4, :2] = True, True
+    judgement = Judgement(recorded(old, jumped))
+    (rows,) = judgement.runs()
+    sent = {row: judgement.to_judge(row) for row in rows}
+    assert {row: one.env_idx for row, one in sent.items() if one.snapshot} == {0: tuple(range(64)), 4: (0, 1)}
+    for row in rows:
+        judgement.add(row, new[row])
+    begins = [int(verdict.of.serials[0]) for verdict in judgement.verdicts()]
+    assert begins.count(0) == 64 and begins.count(4) == 2
+
+
 def test_a_record_that_begins_in_the_middle_of_an_episode_begins_with_its_first_moment() -> None:
     old, _, _ = drawn(1, 5, 2)
     judgement = Judgement(recorded(old, np.zeros((5, 2), bool)))

@@ -31,8 +31,8 @@ from workbench.session.messages import TaskOptions
 from workbench.session.questions import MakeScene
 from workbench.session.record import RecordOptions, record
 from workbench.session.recorded_scene import SceneProcess
+from workbench.session.rescore import Rescorer
 from workbench.session.rescore_all import RescoreOptions, rescore_all
-from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
 from workbench.terminal import Exit
 from workbench.ui.judged_panel import status_html

@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, live_session, wait_until
-from workbench.session.env_table import Outcome
+from workbench.session.env_table import Kind, Outcome
 from workbench.session.history import NOT_A_NUMBER
-from workbench.session.outliers import Kind
 from workbench.session.session import Session
 
 BROKEN = '''

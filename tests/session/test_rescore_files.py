@@ -30,8 +30,8 @@ from workbench.session.given_actions import read_given
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.session.relive import arrive
+from workbench.session.rescore import Rescorer
 from workbench.session.rescore_all import RescoreOptions, rescore_all
-from workbench.session.rescorer import Rescorer
 from workbench.session.step_back import run_of
 from workbench.share_command import export_in_terminal
 
@@ -176,13 +176,13 @@ def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
 
 
 def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
-    write(tmp_path, made(6, seed=1), pictures=False)
-    dataset = author / "recordings" / "set"
-    assert export_in_terminal([tmp_path], dataset, ExportOptions()) == 0
-    assert {source.kind for source in sources_among([author / "recordings"])} == {"ours", "lerobot"}
+    write(tmp_path / "made", made(6, seed=1), pictures=False)
+    dataset = tmp_path / "set"
+    assert export_in_terminal([tmp_path / "made"], dataset, ExportOptions()) == 0
+    assert {source.kind for source in sources_among([dataset])} == {"lerobot"}
     with pytest.raises(UnreadableRecording, match="LeRobot dataset cannot be judged again"):
         rescore_all(RescoreOptions((dataset,)))
-    verdicts, _ = rescore_all(RescoreOptions((author / "recordings",)))
+    verdicts, _ = rescore_all(RescoreOptions((dataset, author / "recordings")))
     assert len(verdicts) == EPISODES and not any(verdict.why_not for verdict in verdicts)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from tests.drive.panels import Panels
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import EMPTY, problem, running
-from workbench.session.outliers import Kind, Outlier
+from workbench.session.env_table import Kind, Outlier
 from workbench.ui.fragments import render
 from workbench.ui.status_line import StatusLine, flagged_text, status_values
 

@@ -32,7 +32,7 @@ from workbench.session.preview import IN_A_QUICK_LOOK, Preview, Sight
 from workbench.session.studio_cameras import StudioCameras, exported, imported
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioCamera, StudioView, Wish
-from workbench.session.time_travel import TimeTravel
+from workbench.session.timeline import TimeTravel
 from workbench.session.versions import Versions
 
 MOST_SEEDS = 1000

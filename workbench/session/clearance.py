@@ -22,7 +22,7 @@ from workbench.authoring.trust import TrustStore
 from workbench.machine.terminal_text import short_line
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import MadeHere, made_here
-from workbench.session.recorded_text import NoText, below_one_folder
+from workbench.session.step_back import NoText, below_one_folder
 
 SHORT_HASH = 12
 LONGEST = 400

@@ -1,4 +1,5 @@
-"""The worker's part in going back to a moment of the past: lived up to again where that can be, put there otherwise.
+"""The worker's part in the past: a moment is gone back to, lived up to again where that can be, put there otherwise;
+and moments are judged again by the code that it has.
 
 A state that is put into an env lacks what PhysX keeps to itself, its contacts above all, so the run goes on otherwise
 than it did wherever bodies press on each other (`core.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an
@@ -29,7 +30,8 @@ from workbench.core.snapshot import (
 )
 from workbench.core.step import StepResult
 from workbench.session.messages import Restore, Restored
-from workbench.session.open_task import OpenedTask, blamed, step_checked
+from workbench.session.open_task import OpenedTask, blamed, restore_checked, step_checked
+from workbench.session.questions import Judged, JudgeMoments
 
 MOST_SECONDS = 8.0
 """A way back that takes longer is given up, and the moment put there."""
@@ -141,3 +143,25 @@ def _how(request: Restore, lived: int, put: int, steps: int) -> str:
 def going_back(done: int, total: int) -> str:
     """For the status line, while it takes long."""
     return f"going back: step {done} of {total}"
+
+
+def judge_moments(opened: OpenedTask, request: JudgeMoments) -> Judged:
+    """Live through the moments of `request`, in order; stops at the first that raises, which is then told."""
+    steps: list[StepResult] = []
+    missed: dict[str, str] = {}
+    for moment in request.moments:
+        try:
+            if moment.snapshot is None:
+                steps.append(step_checked(opened.env, opened.loaded, moment.action))
+                continue
+            snapshot = pickle.loads(moment.snapshot)
+            step, report = restore_checked(
+                opened.env, opened.loaded, snapshot, moment.env_idx, moment.env_idx
+            )
+        except TaskError as error:
+            return Judged(tuple(steps), missed, error.problem)
+        steps.append(step)
+        if len(moment.env_idx) == opened.env.num_envs:
+            # With some of the envs what holds for the whole batch is never put back: neither was it in the record.
+            missed |= report.not_carried
+    return Judged(tuple(steps), missed)

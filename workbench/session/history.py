@@ -355,42 +355,42 @@ class History:
 
         Each control step and, at the end, the reset that it began with, as far as they are kept.
         """
-        moment = self.at(serial)
-        while moment is not None:
-            at = moment.serial - 1
-            if not moment.jumped.any():
-                yield moment, env
-            elif moment.jumped[env]:
-                if moment.restored is None:
-                    yield moment, env
-                    return
-                at = moment.restored.origin
-                env = moment.restored.source[moment.restored.env_idx.index(env)]
-            moment = self.at(at)
+        for moment, at in self._back(env, serial):
+            jumped = moment.jumped.any()
+            if not jumped or moment.restored is None:
+                yield moment, at
+            if jumped and moment.restored is None:
+                return
 
     def way_to(self, env: int, serial: int, most: int) -> WayBack | None:
         """How this env came to a moment from the last exact point, by at most so many steps; None if it is not known.
 
         Exact points are resets and moments that were put there: from them on the same actions give the same bits.
         """
-        moment = self.at(serial)
         rows: list[NDArray[np.float32]] = []
-        while moment is not None and len(rows) <= most:
-            at, jump = moment.serial - 1, moment.restored
+        for moment, at in self._back(env, serial):
+            jump = moment.restored
             if not moment.jumped.any():
-                if moment.step.action is None:
+                if moment.step.action is None or len(rows) == most:
                     return None
-                rows.append(moment.step.action[env])
-            elif moment.jumped[env]:
-                if jump is None or (env not in jump.lived_through and jump.origin != NO_MOMENT):
-                    if not moment.snapshot or not rows:
-                        return None
-                    return WayBack(moment.serial, env, np.stack(rows[::-1]).astype(np.float32))
-                if jump.origin == NO_MOMENT:
+                rows.append(moment.step.action[at])
+            elif jump is None or (at not in jump.lived_through and jump.origin != NO_MOMENT):
+                if not moment.snapshot or not rows:
                     return None
-                at, env = jump.origin, jump.source[jump.env_idx.index(env)]
-            moment = self.at(at)
+                return WayBack(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
         return None
+
+    def _back(self, env: int, serial: int) -> Iterator[Lived]:
+        """The moments that led this env to one, newest first: its control steps and its own jumps, whose origin is
+        gone on from; as far as they are kept."""
+        while (moment := self.at(serial)) is not None:
+            jump, serial = moment.restored, moment.serial - 1
+            if not moment.jumped.any():
+                yield moment, env
+            elif moment.jumped[env]:
+                yield moment, env
+                if jump is not None:
+                    serial, env = jump.origin, jump.source[jump.env_idx.index(env)]
 
     def last_jump(self, env: int) -> Moment | None:
         """The jump that brought this env where it is, if it can be taken back.

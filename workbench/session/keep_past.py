@@ -1,5 +1,10 @@
 """Keep what I just saw: an episode of the past becomes a recording after the fact.
 
+An episode is what an env lived through from a reset on, through the moments that it was put back to, until it
+terminated, was truncated, or was reset or left. That is what the Record button gathers while it happens; here it is
+found afterwards, and only where its beginning is still in memory, since an episode without its reset could not be
+made again.
+
 Nobody presses Record before the run that is worth keeping. But the history has it all: of every moment the poses, the
 action, the reward and what ``evaluate`` returned, as they were said then; and a snapshot. What a recording holds
 beyond that (env states, observations, pictures of every camera) is read off the envs when they are put back to
@@ -13,22 +18,110 @@ rest is as it was said then.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.recording.columns import BatchPacker
 from workbench.recording.landing import RecordingError
 from workbench.session.askers import Background
-from workbench.session.episode_files import EpisodeFinisher
-from workbench.session.episodes import GatheredEpisode
+from workbench.session.episodes import EpisodeFinisher, GatheredEpisode
+from workbench.session.history import History, Lived, Moment
 from workbench.session.lane import Job, JobFailed, Lane
-from workbench.session.messages import Reset
-from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
+from workbench.session.messages import Load, PlaceCamera, Reset, TaskDescription
 from workbench.session.questions import CaptureMoment
 from workbench.session.view import KeepStatus
+
+
+@dataclass(frozen=True)
+class PastEpisode:
+    """The moments of one env's episode, oldest first; the first is its reset."""
+
+    env: int
+    moments: tuple[Lived, ...]
+    seed: int
+    """Below 0 where it is not known."""
+
+    @property
+    def steps(self) -> int:
+        return len(self.moments) - 1
+
+    @property
+    def ended(self) -> bool:
+        """Whether the task ended it; else it runs, or was reset before."""
+        moment, env = self.moments[-1]
+        step = moment.as_recorded
+        return bool(step.terminated[env] or step.truncated[env])
+
+
+@dataclass(frozen=True)
+class WhatToKeep:
+    """Everything that the work needs; it goes on while the history moves on."""
+
+    task: TaskDescription
+    load: Load
+    """How another worker gets the version that runs."""
+    placed: tuple[PlaceCamera, ...]
+    """Cameras that stand elsewhere than the file says."""
+    episodes: tuple[PastEpisode, ...]
+    snapshots: dict[int, WholeSnapshot]
+    """Of their moments, by serial."""
+
+
+def episode_round(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
+    """The episode of this env round a moment, to where it ended; or in a sentence why there is none to keep.
+
+    Args:
+        serial: None for what was just seen: the episode that runs, or the one before if that has no step yet.
+        before: the one before that.
+    """
+    if not len(history):
+        return "nothing was seen yet"
+    found = _of(history, env, history.last if serial is None else serial)
+    if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
+        found = _before(history, env, found) or found
+    if before and isinstance(found, PastEpisode):
+        found = _before(history, env, found) or "there is no episode before it in memory"
+    if isinstance(found, PastEpisode) and found.steps == 0:
+        return "its episode has no step yet"
+    return found
+
+
+def _before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
+    """The one before; None where that is not in memory any more."""
+    begin = episode.moments[0][0].serial
+    return _of(history, env, begin - 1) if begin > history.first else None
+
+
+def _of(history: History, env: int, serial: int) -> PastEpisode | str:
+    lived = history.episode(env, serial)
+    if not lived:
+        return "nothing was seen yet"
+    first, of = lived[0]
+    if not first.jumped[of] or first.step.elapsed_steps[of] != 0:
+        return "its beginning is no longer in memory"
+    if any(not moment.snapshot for moment, _ in lived):
+        return "the state of this task cannot be kept, so what was seen cannot be put back"
+    for count, (moment, at) in enumerate(lived):
+        step = moment.as_recorded
+        if count > 0 and (step.terminated[at] or step.truncated[at]):
+            lived = lived[: count + 1]
+            break
+    seed = -1 if first.seeds is None else int(first.seeds[of])
+    return PastEpisode(env, lived, seed)
+
+
+def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, list[PastEpisode]]]]:
+    """All their moments once, oldest first; and of each, by env, the episodes that it is a moment of."""
+    found: dict[int, tuple[Moment, dict[int, list[PastEpisode]]]] = {}
+    for episode in episodes:
+        for moment, env in episode.moments:
+            found.setdefault(moment.serial, (moment, {}))[1].setdefault(env, []).append(episode)
+    return [found[serial] for serial in sorted(found)]
+
 
 _SAME_START = 1e-6
 """Metres and quaternion components."""
@@ -116,24 +209,19 @@ class PastKeeper:
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         moments, packer = moments_of(what.episodes), BatchPacker()
-        rows: dict[int, dict[int, list[tuple[PastEpisode, bool]]]] = {}
-        for episode in what.episodes:
-            for index, (moment, env) in enumerate(episode.moments):
-                rows.setdefault(moment.serial, {}).setdefault(env, []).append((episode, index == 0))
-        for done, (moment, envs) in enumerate(moments):
+        for done, (moment, rows) in enumerate(moments):
             job.tell(done, len(moments), "drawing it again")
             snapshot = pickle.dumps(what.snapshots[moment.serial])
-            captured = self._process.ask(job.check, CaptureMoment(snapshot, envs, what.task.can_render))
-            columns, pictures, step = captured.columns, captured.pictures, moment.as_recorded
-            for env in envs:
-                for episode, is_first in rows[moment.serial][env]:
-                    if is_first:
-                        writers[episode.env] = GatheredEpisode.of(
-                            self._folder, what.task, episode.env, episode.seed
-                        )
+            question = CaptureMoment(snapshot, tuple(rows), what.task.can_render)
+            captured = self._process.ask(job.check, question)
+            for row, episodes in rows.items():
+                for episode in episodes:
+                    if (writer := writers.get(episode.env)) is not None:
+                        writer.acts(moment.acted_by)
                     else:
-                        writers[episode.env].acts(moment.acted_by)
-                    writers[episode.env].take(packer, step, env, columns, pictures)
+                        writer = GatheredEpisode.of(self._folder, what.task, episode.env, episode.seed)
+                        writers[episode.env] = writer
+                    writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
         why, problem = str(failure), failure.problem

@@ -17,9 +17,9 @@ from typing import Any
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import RecordedTask, TaskName, class_beside, followed_folder, named_file
 from workbench.core.inspection import Inspection
-from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.env_table import EnvTable
+from workbench.session.keep_past import PastEpisode, WhatToKeep, episode_round, moments_of
 from workbench.session.kept_worker import Death
 from workbench.session.last_words import death_problem, own_files_of
 from workbench.session.messages import (
@@ -42,7 +42,6 @@ from workbench.session.messages import (
     TaskDescription,
     TaskOptions,
 )
-from workbench.session.past_episodes import PastEpisode, WhatToKeep, episode_round, moments_of
 from workbench.session.recovery import Wanted
 from workbench.session.timeline import Timeline
 from workbench.session.view import SessionView
@@ -356,11 +355,8 @@ class LiveState:
         if not episodes:
             env, why = next(iter(found.items()))
             return f"nothing was kept of env {env}: {why}"
-        snapshots: dict[int, WholeSnapshot] = {}
-        for moment, _ in moments_of(episodes):
-            whole = history.whole_at(moment.serial)
-            assert whole is not None, "an episode of the past has a snapshot of every moment"
-            snapshots[moment.serial] = whole
+        serials = [moment.serial for moment, _ in moments_of(episodes)]
+        snapshots = {at: whole for at in serials if (whole := history.whole_at(at)) is not None}
         return WhatToKeep(self.now.task, load, placed, episodes, snapshots)
 
     def view(self, **known: Any) -> SessionView:

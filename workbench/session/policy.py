@@ -1,4 +1,4 @@
-"""A policy that the author names: ``module:function`` or ``file.py:function``, obs to action.
+"""A policy that the author names: ``module:function`` or ``file.py:function``, obs to action; and its file, followed.
 
 The function is called with the task's observation (as its ``obs_mode`` gives it, batched) and returns
 an action for all envs: an array or tensor (N, A), one action (A,) for all, or a dict for several
@@ -26,6 +26,7 @@ from workbench.authoring.library_names import (
 )
 from workbench.authoring.modules import MOST_SOURCE_BYTES
 from workbench.authoring.problem import Problem, definition_line, problem_from_exception
+from workbench.authoring.watch import SourceWatcher
 from workbench.machine.regular_file import read_regular_file
 
 Policy = Callable[[Any], Any]
@@ -165,3 +166,35 @@ def _find(name: str, beside: Path | None) -> Path:
             f"there is no {name} in {Path.cwd()}, where the command was started, nor beside the task in {beside}"
         )
     return there
+
+
+class PolicyFile:
+    """Follows the file of the policy that acts, as the task's is followed: a save has it imported anew. Used from any thread."""
+
+    def __init__(self, on_save: Callable[[], None]) -> None:
+        """`on_save` is called on a thread of this object's own."""
+        self._on_save = on_save
+        self._watcher: SourceWatcher | None = None
+        self._files: list[Path] = []
+
+    def follow(self, reference: str | None, beside: Path | None) -> None:
+        """The file of a ``file.py:function`` from now on, wherever it may lie; of anything else, none.
+
+        Args:
+            beside: a folder in which a relative file is looked for when it is not in the current one.
+        """
+        name = (reference or "").rpartition(":")[0]
+        files: list[Path] = []
+        if name.endswith(".py"):
+            path = Path(name).expanduser()
+            files = [path, *([] if beside is None else [beside / path])]
+        if files == self._files:
+            return
+        self._files = files
+        if self._watcher is None:
+            self._watcher = SourceWatcher(lambda changed: self._on_save())
+        self._watcher.follow(files)
+
+    def close(self) -> None:
+        if self._watcher is not None:
+            self._watcher.stop()

@@ -28,14 +28,12 @@ from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, sh
 from workbench.machine.current_folder import CurrentFolder
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
-from workbench.session.acting import Acting
-from workbench.session.episode_files import EpisodeFinisher
-from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
+from workbench.session.acting import Acting, RecordActing
+from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.session.given_actions import SUFFIXES, GivenEpisode, GivenEpisodes, read_given
 from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 from workbench.session.policy import find_policy
-from workbench.session.record_acting import RecordActing
 from workbench.session.record_options import RecordArguments
 from workbench.session.recorded_pictures import recorded_pictures
 from workbench.session.reload import open_task

@@ -1,15 +1,19 @@
-"""Which recorded episodes are judged again, and in which env each is.
+"""Which recorded episodes are judged again, in which env each is, and a page's judging of them in the background.
 
-The envs that live through them are in `rescore_run`, and the process that does it for a page is kept by `rescorer`.
+The envs that live through them are in `rescore_run`. For a page a process loads one task after the other and judges its
+episodes. To stop is to end the process: what is known by then stays. It ends with the job: the code of recordings is not
+to stay.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
@@ -20,11 +24,20 @@ from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import made_here
 from workbench.recording.side_files import side_files_in_words
 from workbench.recording.sources import Source, UnreadableRecording
-from workbench.session.clearance import NotCleared, Wanted, recorded_content
-from workbench.session.lane import JobFailed
-from workbench.session.messages import TaskOptions
-from workbench.session.recorded_text import NoText
-from workbench.session.step_back import CannotStepIn, class_in, options_of, recorded_source, reference_of
+from workbench.session.askers import Background
+from workbench.session.clearance import Clearances, NotCleared, Wanted, recorded_content
+from workbench.session.judging import JudgedView, Judging
+from workbench.session.lane import Job, JobFailed
+from workbench.session.messages import Load, TaskOptions
+from workbench.session.rescore_messages import Rescore, Rescored
+from workbench.session.step_back import (
+    CannotStepIn,
+    NoText,
+    class_in,
+    options_of,
+    recorded_source,
+    reference_of,
+)
 from workbench.session.verdict import Verdict
 
 
@@ -103,9 +116,15 @@ def judge_each(
     groups: Sequence[Group],
     cleared: Sequence[TaskName | NotCleared],
     judge: Callable[[Group, TaskName], None],
-    failed: Callable[[Group, JobFailed | TaskError | CannotStepIn], None],
+    known: Callable[[], Iterable[Verdict[Source]]],
+    not_judged: Callable[[list[Verdict[Source]]], None],
 ) -> None:
     """Judge each of these with what was cleared for it, or with its recorded text; one that fails leaves the others.
+
+    Args:
+        known: all verdicts so far.
+        not_judged: gets those of episodes that have none because theirs failed: a folder holds recordings of many
+            tasks, and one of them may be gone.
 
     Raises:
         JobFailed, TaskError, CannotStepIn: of the first, where all fail.
@@ -120,16 +139,14 @@ def judge_each(
                 judge(group, opened)
         except (JobFailed, TaskError, CannotStepIn) as error:
             failures.append(error)
-            failed(group, error)
+            why = str(error)
+            if isinstance(error, JobFailed) and error.problem is not None:
+                why += f": {error.problem.message}"
+            judged = {verdict.of.id for verdict in known()}
+            missing = [file for file in group.files if file.id not in judged]
+            not_judged([Verdict(file, task=group.info.task, why_not=why) for file in missing])
     if failures and len(failures) == len(groups):
         raise failures[0]
-
-
-def not_judged(group: Group, verdicts: Iterable[Verdict[Source]], why_not: str) -> list[Verdict[Source]]:
-    """Of those of the group that have no verdict: a folder holds recordings of many tasks, and one of them may be gone."""
-    judged = {verdict.of.id for verdict in verdicts}
-    missing = [file for file in group.files if file.id not in judged]
-    return [Verdict(file, task=group.info.task, why_not=why_not) for file in missing]
 
 
 def judging_options(options: TaskOptions) -> tuple[TaskOptions, str]:
@@ -154,3 +171,107 @@ def _info_of(source: Source) -> EpisodeInfo:
         return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
         return source.read().info
+
+
+MOST_AT_ONCE = 16
+"""Envs."""
+MOST_NAMED = 3
+"""Of the versions that are judged with, where there are many."""
+
+
+class Rescorer:
+    """Judges recordings."""
+
+    def __init__(self, clearances: Clearances | None = None, base: TaskOptions | None = None) -> None:
+        """
+        Args:
+            clearances: says what of the code that recordings name may run; None asks nobody.
+            base: what is the same for all that is opened.
+        """
+        self.judging = Judging("rescore")
+        self._process = Background()
+        self._clearances = clearances or Clearances()
+        self._base = base or TaskOptions()
+
+    def start(
+        self,
+        files: Sequence[Source],
+        *,
+        file: Path | None = None,
+        recorded_source: bool = False,
+        use_env_states: bool = False,
+    ) -> None:
+        """Judge these; see `group_episodes` for the arguments."""
+        if not files:
+            return
+
+        def work(job: Job) -> None:
+            groups, unread = group_episodes(
+                files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
+            )
+            notes = [f"with {_judged_with(group)}" for group in groups[:MOST_NAMED]]
+            notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
+            notes += dict.fromkeys(g.note for g in groups if g.note)
+            self._tell(job, unread, state="asking", notes=tuple(notes))
+            try:
+                self._judge_all(job, groups, use_env_states)
+            except CannotStepIn as error:
+                raise JobFailed(str(error)) from error
+            finally:
+                self._process.end()  # with the code that the recordings named
+
+        self.judging.begin(JudgedView("loading", total=len(files), unit="episodes"), work)
+
+    # --- on the lane ---------------------------------------------------------------------------------
+
+    def _judge_all(self, job: Job, groups: list[Group], use_env_states: bool) -> None:
+        cleared = self._clearances.clear_all([group.wanted for group in groups], lambda: job.stopped)
+        job.check()
+
+        judge_each(
+            groups,
+            cleared,
+            lambda group, task: self._judge(job, group, task, use_env_states),
+            lambda: self.judging.view.verdicts,
+            lambda verdicts: self._tell(job, verdicts),
+        )
+
+    def _judge(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
+        process = self._process
+        warnings = tuple(dict.fromkeys((*self.judging.view.warnings, *hidden_in_words(reference))))
+        self._tell(job, state="loading", task=_judged_with(group), warnings=warnings)
+        # Never patched into what the last episodes were judged in.
+        load = Load(reference, group.options, level="rebuilt")
+        try:
+            process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
+        except JobFailed as failure:
+            if failure.problem is None:
+                raise
+            raise JobFailed(
+                f"{group.info.task} could not be opened to judge with", failure.problem
+            ) from failure
+        self._tell(job, state="judging")
+        began, before, steps = time.monotonic(), self.judging.view.seconds, self.judging.view.steps
+
+        def told(now: Rescored) -> None:
+            seconds = before + time.monotonic() - began
+            self._tell(job, now.verdicts, steps=steps + now.steps, seconds=seconds)
+
+        question = Rescore(group.files, use_env_states)
+        last = process.ask(job.check, question, lambda done, total, now: told(now))
+        told(last)
+        if last.problem is not None:
+            raise JobFailed(f"the code of {group.info.task} raised", last.problem)
+
+    def _tell(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
+        """What is new, and these verdicts besides those that are known."""
+        known = (*self.judging.view.verdicts, *verdicts)
+        self.judging.tell(job, verdicts=known, done=len(known), **values)
+
+
+def _judged_with(group: Group) -> str:
+    """What is opened, in words."""
+    if group.recorded_source:
+        return f"{group.info.task} as it was recorded"
+    file = named_file(group.reference)
+    return f"{group.info.task} as it is installed" if file is None else f"{group.info.task} of {file}"

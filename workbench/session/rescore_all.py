@@ -23,7 +23,6 @@ from workbench.session.rescore import (
     group_episodes,
     hidden_in_words,
     judge_each,
-    not_judged,
     with_renderer,
 )
 from workbench.session.rescore_run import rescore
@@ -110,10 +109,7 @@ def rescore_all(
         finally:
             opened.env.close()
 
-    def failed(group: Group, error: Exception) -> None:
-        verdicts.extend(not_judged(group, verdicts, str(error)))
-
-    judge_each(groups, cleared, judge, failed)
+    judge_each(groups, cleared, judge, lambda: verdicts, verdicts.extend)
     place = {file.id: number for number, file in enumerate(files)}
     verdicts.sort(key=lambda verdict: place[verdict.of.id])
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))

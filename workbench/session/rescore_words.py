@@ -7,12 +7,10 @@ import io
 import json
 import math
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from workbench.machine.atomic_files import replace_file
 from workbench.recording.sources import Source
 from workbench.session.number_text import length, mean_text, number_text
 from workbench.session.verdict import FLAGS, Verdict
@@ -184,15 +182,6 @@ def as_json(verdicts: Sequence[Verdict[Source]]) -> str:
     """With ``NaN`` and infinities as null, which JSON has not."""
     rows = [{key: _finite(value) for key, value in row.items()} for row in as_rows(verdicts)]
     return json.dumps(rows, indent=1) + "\n"
-
-
-def write_table(path: Path, text: str) -> None:
-    """Whole or not at all, in place of what was there.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    replace_file(path, text.encode())
 
 
 def counted(number: int, what: str) -> str:

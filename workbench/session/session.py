@@ -53,10 +53,10 @@ from workbench.session.messages import (
     TaskOptions,
     WarmUp,
 )
-from workbench.session.policy_file import PolicyFile
+from workbench.session.policy import PolicyFile
 from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
-from workbench.session.time_travel import TimeTravel
+from workbench.session.timeline import TimeTravel
 from workbench.session.versions import Versions
 from workbench.session.view import SessionView
 

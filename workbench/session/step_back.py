@@ -5,6 +5,10 @@ is a choice: today's code of it, that a person is about to try on an old situati
 what happened. The text is written into a folder of its own, which goes when whoever opened it is done; so it can be
 looked at, even edited, and nobody's file is touched. What lay beside the file and is no Python (meshes, say) is
 not in a recording, but named there: where it still lies beside the task it is linked into that folder, as it is today.
+
+Whoever goes live from a recording, or has it judged again, wants to know what of the task is another now, by name:
+``CUBE_HALF_SIZE, evaluate``. Lines would say too much (comments, layout, what was moved); so both texts are compared
+symbol by symbol, as a save is, and what changed is named as its author calls it.
 """
 
 from __future__ import annotations
@@ -12,22 +16,134 @@ from __future__ import annotations
 import ast
 import shutil
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
+from workbench.authoring.modules import read_source
 from workbench.authoring.reference import RecordedTask
-from workbench.authoring.task_content import CannotRead, read_text
+from workbench.authoring.task_content import CannotRead, read_text, source_hash
+from workbench.authoring.two_versions import TwoVersions
 from workbench.core.env_kwargs import HOW_IT_IS_RUN
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.side_files import folder_of, place_of
 from workbench.session.messages import TaskDescription, TaskOptions
-from workbench.session.recorded_text import NoText, below_one_folder
+
+
+class NoText(ValueError):
+    """The text of the task's own file is not among them."""
+
+
+def below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The name of the task's own file, and all texts by name. None of the names leads out of the folder: a recording is
+    somebody else's file.
+
+    Raises:
+        NoText
+    """
+    names = {path: PurePath(path) for path in source}
+    # As it was recorded every path is absolute; as it is read, as seen from the main file's folder.
+    folder = PurePath(main).parent
+    found: dict[str, str] = {}
+    chosen = ""
+    for path, pure in names.items():
+        relative = pure.relative_to(folder) if pure.is_absolute() and pure.is_relative_to(folder) else pure
+        if relative.is_absolute() or ".." in relative.parts or not relative.parts:
+            relative = PurePath(pure.name)
+        found[str(relative)] = source[path]
+        if path == main or (pure.name == PurePath(main).name and not chosen):
+            chosen = str(relative)
+    if not chosen:
+        raise NoText("this recording does not hold the text of its task's own file")
+    return chosen, found
+
+
+def version_of(info: EpisodeInfo) -> str:
+    """`source_hash` of the text that a recording holds, and not what it says of it; empty where it holds none."""
+    try:
+        _, texts = below_one_folder(info.source_file or "", info.source)
+    except NoText:
+        return ""
+    return source_hash(texts, Path())
+
+
+MOST_NAMED = 4
+LOOK_EVERY = 2.0
+"""Seconds between two looks at the files."""
+
+
+def changed_since(
+    then_file: str | None, then: Mapping[str, str], now_file: str | None, now: Mapping[str, str]
+) -> str:
+    """The symbols that differ; empty where none does, or where that cannot be said.
+
+    Args:
+        then_file, now_file: of the task.
+        then, now: texts by path, of that file and the modules beside it.
+    """
+    if then_file is None or now_file is None:
+        return ""
+    try:
+        (old_main, old), (new_main, new) = below_one_folder(then_file, then), below_one_folder(now_file, now)
+    except NoText:
+        return ""
+    # It may be called otherwise now, a copy say; it is the task all the same.
+    old = {new_main if name == old_main else name: text for name, text in old.items()}
+    if old == new:
+        return ""
+    try:
+        changed = TwoVersions(old, new).changed
+    except (SyntaxError, ValueError, RecursionError):
+        return ""
+    names = list(dict.fromkeys(_called(path, name, new_main) for path, name in changed))
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more
+
+
+def changed_on_disk(info: EpisodeInfo) -> str:
+    """The same of the file that a recording names, as it is now, and of those beside it that it was recorded with."""
+    file = None if info.source_file is None else Path(info.source_file)
+    if file is None or not file.is_absolute() or not file.is_file():
+        return ""
+    try:
+        _, then = below_one_folder(info.source_file or "", info.source)
+    except NoText:
+        return ""
+    now = {}
+    for name in then:
+        path = file.parent / name
+        if path.is_file():
+            try:
+                now[str(path)] = read_source(path)
+            except (OSError, SyntaxError):
+                return ""
+    return changed_since(info.source_file, info.source, str(file), now)
+
+
+class ChangesOnDisk:
+    """`changed_on_disk` for who asks many times a second."""
+
+    def __init__(self, look_every: float = LOOK_EVERY) -> None:
+        self._look_every = look_every
+        self._known: tuple[str, float, str] | None = None
+
+    def of(self, info: EpisodeInfo) -> str:
+        now = time.monotonic()
+        if self._known is None or self._known[0] != info.id or now - self._known[1] > self._look_every:
+            self._known = info.id, now, changed_on_disk(info)
+        return self._known[2]
+
+
+def _called(path: str, name: str, main: str) -> str:
+    short = name.rpartition(".")[2].strip("()")
+    return short if path == main else f"{short} of {PurePath(path).name}"
+
 
 _IMPORTED = (".py", ".pyc", ".pyo", ".so", ".pyd", ".pth", ".zip", ".egg")
 """Ends of the names of files that Python imports or reads at an import."""

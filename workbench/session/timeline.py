@@ -1,4 +1,4 @@
-"""What of the past is shown, and where one may go from there.
+"""What of the past is shown, and where one may go from there; and how a page asks for it.
 
 Live is the newest moment. Whoever moves the slider pins another one, and all that the page draws of the batch
 (poses, numbers, pictures) comes from it, out of the server's own memory: the worker hears nothing of it and goes
@@ -8,16 +8,29 @@ stands still at a moment that has no pictures, to draw it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraKind, Picture
+from workbench.session.camera_judging import ShownMoment
 from workbench.session.env_table import EnvTable
-from workbench.session.history import History, Moment
-from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pictures, Restore, Stepped
+from workbench.session.history import History, Lived, Moment
+from workbench.session.messages import (
+    CameraRequest,
+    DrawPast,
+    PastPictures,
+    Pictures,
+    Request,
+    Restore,
+    Stepped,
+)
+
+if TYPE_CHECKING:
+    from workbench.session.live_state import SharedState
 
 Scope = Literal["this", "all", "into all"]
 """Who goes back: the selected env; every env, each to its own; or every env to the selected env's moment."""
@@ -267,3 +280,114 @@ def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
     if len(envs) == num_envs:
         return f"{what} of all"
     return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
+
+
+class TimeTravel:
+    """What the batch lived through. All methods are thread-safe and return at once."""
+
+    def __init__(
+        self, shared: SharedState, send: Callable[[Request], None], pause: Callable[[], None]
+    ) -> None:
+        """
+        Args:
+            shared: what the session knows.
+            send: tells the worker.
+            pause: stops playing.
+        """
+        self._state, self._lock, self._note = shared.state, shared.lock, shared.note
+        self._send, self._pause = send, pause
+
+    # --- looked at -------------------------------------------------------------------------------
+
+    def seek(self, serial: int | None) -> None:
+        """Show a moment of the past, by its number (see `TimelineView`); None shows what is live."""
+        self._seek(lambda timeline: timeline.seek(serial))
+
+    def seek_by(self, steps: int) -> None:
+        """Show a moment before (negative) or after the one that is shown."""
+        self._seek(lambda timeline: timeline.seek_by(steps))
+
+    def seek_step(self, env: int, step: int) -> None:
+        """Show the moment at which this env was at that step of its present episode."""
+        self._seek(lambda timeline: timeline.seek_step(env, step))
+
+    def seek_event(self, direction: int) -> None:
+        """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
+        env = self._env
+        self._seek(lambda timeline: timeline.seek_event(env, direction))
+
+    def draw(self) -> None:
+        """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
+        with self._lock:
+            s = self._state
+            request = None if s.timeline is None else s.timeline.draw(self._env, s.now.settings.cameras)
+        if request is not None:
+            self._send(request)
+
+    # --- gone back to ----------------------------------------------------------------------------
+
+    def go_on(self, scope: Scope) -> None:
+        """Put envs back to the shown moment; the simulation goes on from there (see `timeline.Scope`)."""
+        self._travel(lambda timeline, env: timeline.go_on(env, scope))
+
+    def undo(self) -> None:
+        """Take back the selected env's last reset or going back, and pause there."""
+        self._pause()
+        self._travel(lambda timeline, env: timeline.undo(env))
+
+    # --- read ------------------------------------------------------------------------------------
+
+    def strip(self, low: int, high: int) -> Strip | None:
+        """The selected env's past between two moments; None before a task is loaded."""
+        with self._lock:
+            s = self._state
+            return None if s.timeline is None else s.timeline.strip(self._env, low, high)
+
+    def stretch(self) -> tuple[int, int] | None:
+        """First and last moment of what the selected env lived through round the shown moment, without a jump."""
+        with self._lock:
+            timeline = self._state.timeline
+            if timeline is None or not len(timeline.history):
+                return None
+            return timeline.history.stretch_at(self._env, timeline.at)
+
+    def shown_moment(self) -> ShownMoment:
+        """Which env is looked at, and where its bodies are if that is not live."""
+        with self._lock:
+            s = self._state
+            shown = None if s.timeline is None else s.timeline.shown
+            count = 0 if s.now.task is None else s.now.task.num_envs
+            return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
+
+    def episode_moments(self, most: int) -> tuple[Lived, ...]:
+        """Moments, at the most so many, of the selected env's episode round the one that is shown."""
+        with self._lock:
+            s = self._state
+            if s.timeline is None or not len(s.timeline.history):
+                return ()
+            return s.timeline.history.episode(self._env, s.timeline.at, most)
+
+    @property
+    def _env(self) -> int:
+        return self._state.now.settings.selected_env
+
+    def _seek(self, seek: Callable[[Timeline], None]) -> None:
+        with self._lock:
+            timeline = self._state.timeline
+            if timeline is None:
+                return
+            before = timeline.shown
+            seek(timeline)
+            if timeline.shown is before:
+                return
+            self._state.new_pictures()
+        self._note()
+
+    def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
+        with self._lock:
+            timeline = self._state.timeline
+            request = None if timeline is None else ask(timeline, self._env)
+            self._state.new_pictures()
+        if request is not None:
+            self._send(request)
+        self._note()

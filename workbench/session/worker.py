@@ -36,10 +36,9 @@ from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
 from workbench.session.calls import Answer, Cancel, CannotAnswer, Progress, Question
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
-from workbench.session.go_back import go_back, going_back
+from workbench.session.go_back import go_back, going_back, judge_moments
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
-from workbench.session.judge_moments import judge_moments
 from workbench.session.make_scene import SceneEnv
 from workbench.session.messages import (
     SCENE_KEPT,
@@ -71,10 +70,10 @@ from workbench.session.open_task import OpenedTask, Opening, reset_checked, step
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.questions import CameraQuestion, CaptureMoment, JudgeMoments, MakeScene, RunCameras
+from workbench.session.relive import going_there, step_back
 from workbench.session.reload import Running, load_version
 from workbench.session.rescore_messages import Rescore
 from workbench.session.server_line import ServerLine
-from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
 from workbench.session.worker_cameras import WorkerCameras
@@ -117,8 +116,8 @@ class Worker:
             ReadPolicyAgain: self._read_policy_again,
             PlaceCamera: self._cameras.place,
             SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
-            Restore: lambda request: self._held.guarded(partial(self._restore_envs, request)),
-            StepBack: lambda request: self._held.guarded(partial(self._into_recording, request)),
+            Restore: lambda request: self._held.guarded(partial(self._go, request)),
+            StepBack: lambda request: self._held.guarded(partial(self._go, request)),
             DrawPast: self._cameras.draw_past,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
@@ -401,26 +400,21 @@ class Worker:
         assert step is not None
         return step
 
-    def _restore_envs(self, request: Restore, opened: OpenedTask) -> None:
+    def _go(self, request: Restore | StepBack, opened: OpenedTask) -> None:
         self._cameras.settle()  # the envs get new scenes, with the same entities, and may make steps
-        self._arrived(opened, *go_back(opened, request, self._tell_now_and_then(going_back)))
-
-    def _arrived(self, opened: OpenedTask, step: StepResult, restored: Restored) -> None:
-        self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
-        self._send_status(None)
-
-    def _into_recording(self, request: StepBack, opened: OpenedTask) -> None:
-        self._cameras.settle()
         try:
-            step, restored = step_back(
-                opened, request, self._tell_now_and_then(partial(going_there, request))
-            )
+            if isinstance(request, Restore):
+                step, restored = go_back(opened, request, self._tell_now_and_then(going_back))
+            else:
+                tell = self._tell_now_and_then(partial(going_there, request))
+                step, restored = step_back(opened, request, tell)
         except TaskError:
             self._held.back_to_the_moment()
             raise
         finally:
             self._cameras.put_back()
-        self._arrived(opened, step, restored)
+        self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
+        self._send_status(None)
 
     def _tell_now_and_then(self, words: Callable[..., str]) -> Callable[..., None]:
         """What tells how far a long way is, in `words` of its arguments."""

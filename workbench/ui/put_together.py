@@ -19,7 +19,7 @@ from workbench.session.clearance import Clearances
 from workbench.session.messages import TaskOptions
 from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
-from workbench.session.rescorer import Rescorer
+from workbench.session.rescore import Rescorer
 from workbench.session.review import Review
 from workbench.session.session import Session
 from workbench.ui.commands import Command

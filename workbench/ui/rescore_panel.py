@@ -20,11 +20,10 @@ from workbench.recording.library import Library
 from workbench.recording.sources import Source
 from workbench.session import rescore_words as words
 from workbench.session.judging import RUNNING
-from workbench.session.recorded_text import version_of
-from workbench.session.rescorer import Rescorer
+from workbench.session.rescore import Rescorer
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
-from workbench.session.step_back import class_in, reference_of
+from workbench.session.step_back import class_in, reference_of, version_of
 from workbench.session.verdict import Verdict, in_order
 from workbench.ui.controls import tell_all
 from workbench.ui.fragments import counted, render

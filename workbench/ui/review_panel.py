@@ -14,11 +14,10 @@ from functools import partial
 import viser
 
 from workbench.recording.episode import acted_by_in_words
-from workbench.session.changed_since import ChangesOnDisk
-from workbench.session.recorded_text import version_of
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
+from workbench.session.step_back import ChangesOnDisk, version_of
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render, short_text
 from workbench.ui.parts import PagePart
