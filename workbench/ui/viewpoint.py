@@ -158,18 +158,22 @@ class Framing:
                 self._point(client, frame)
 
     def frame_untouched(self, frame: Frame) -> None:
-        """Frame anew each page that nobody has moved and that has another shape than it was framed for."""
+        """Frame anew each page that nobody has moved and that looks, or is shaped, otherwise than it was framed."""
         for number, client in self._server.get_clients().items():
-            _, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
+            position, aspect = self._pointed.get(number, (self._server.initial_camera.position, USUAL_ASPECT))
+            as_framed = _is_at(client, position) and abs(aspect_of(client) / aspect - 1) <= 0.05
             # If it looks from somewhere else, it lost its connection and came back, or the person was quicker.
-            if self._is_untouched(client) and abs(aspect_of(client) / aspect - 1) > 0.05:
+            if not as_framed and self._is_untouched(client):
                 self._point(client, frame)
 
     def _is_untouched(self, client: viser.ClientHandle) -> bool:
-        """True while the page looks from where it was last pointed."""
-        pointed = self._pointed.get(client.client_id)
-        usual = self._server.initial_camera.position if pointed is None else pointed[0]
-        return np.allclose(client.camera.position, usual, atol=0.02)
+        """True while the page looks from where it was last pointed, or from where every page begins.
+
+        What a page that is just coming is told may reach it before where pages begin, which then is where it looks from.
+        """
+        position, _ = self._pointed.get(client.client_id, (None, None))
+        begins = self._server.initial_camera.position
+        return _is_at(client, begins) or (position is not None and _is_at(client, position))
 
     def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
         viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
@@ -177,6 +181,10 @@ class Framing:
         client.camera.look_at = viewpoint.look_at
         # After it is: who waits for it may close the page, and viser warns of what is written to a page that has gone.
         self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
+
+
+def _is_at(client: viser.ClientHandle, position: NDArray[np.float64]) -> bool:
+    return np.allclose(client.camera.position, position, atol=0.02)
 
 
 def aspect_of(client: viser.ClientHandle) -> float:
