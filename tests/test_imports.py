@@ -13,9 +13,9 @@ PACKAGE = Path(__file__).parents[1] / "workbench"
 BELOW = {
     "ui": {"session", "jobs", "authoring", "recording", "core", "machine"},
     "session": {"jobs", "authoring", "recording", "core", "machine"},
-    "jobs": {"authoring", "recording", "core", "machine"},
+    "jobs": {"authoring", "core", "machine"},
     "authoring": {"core", "machine"},
-    "recording": {"core", "machine"},
+    "recording": {"jobs", "core", "machine"},
     "core": {"machine"},
     "machine": set(),
 }

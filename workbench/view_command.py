@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from workbench.recording.viewer import has_screen, open_window, recordings_among
+from workbench.recording.rerun_viewer import has_screen, open_window, recordings_among, web_viewer_folder
 from workbench.terminal import refuse, say, say_addresses, warn
 
 
@@ -31,7 +31,6 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
 
 
 def _in_page(files: Sequence[Path], host: str, port: int) -> int:
-    from workbench.recording.web_viewer import web_viewer_folder
     from workbench.ui.door import DoorOptions, open_door
     from workbench.ui.file_reply import Offers
     from workbench.ui.rerun_view import RerunPages

@@ -17,7 +17,7 @@ from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
 from workbench.recording.journal import Journal
-from workbench.recording.scene_file import read_scene
+from workbench.recording.scene_file import read_visuals
 from workbench.recording.survey import Header, read_header
 
 BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
@@ -86,7 +86,7 @@ def journal_of(writer: EpisodeWriter) -> Journal:
 
 def header_of(journal: Path) -> Header:
     """As `recover` reads it, of a journal that has one."""
-    header = read_header(journal, read_scene(journal.with_suffix(SCENE_SUFFIX)))
+    header = read_header(journal, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
     assert header is not None
     return header
 

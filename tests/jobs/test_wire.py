@@ -202,6 +202,13 @@ def test_arrays_can_be_written_to_and_one_that_is_named_twice_is_sent_once() -> 
     assert got["a"][1] == 2.0 and array[1] == 1.0
 
 
+def test_any_byte_of_a_truth_is_a_truth() -> None:
+    raw = pack(np.array([True, False, True]))
+    truths = Unpacker().unpack(raw[:-1] + b"\x7f", np.ndarray)
+    assert truths.dtype == np.bool_ and truths.tolist() == [True, False, True]
+    assert truths.view(np.uint8).tolist() == [1, 0, 1] and truths.sum() == 2
+
+
 def test_half_a_character_is_sent_so_that_it_can_be_written() -> None:
     message = Finding("r", "warn", "a\ud800b", None, None, "", "", 1, 0)
     assert Unpacker().unpack(pack(message), Finding).message == "a\\ud800b"

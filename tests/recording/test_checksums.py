@@ -13,8 +13,7 @@ import xxhash
 
 from tests.drive.episodes import Made
 from workbench.recording.annotations import write_into_description
-from workbench.recording.checksums import check, checksum
-from workbench.recording.document import Checksum
+from workbench.recording.document import Checksum, check, checksum
 from workbench.recording.library_read import read_found
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import UnreadableRecording, read_episode

@@ -15,8 +15,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workbench.recording.camera_pictures import camera_of, cameras_by_name, enlarged, frames
-from workbench.recording.contact_sheet import chosen_states, contact_sheet
+from workbench.recording.camera_pictures import (
+    camera_of,
+    cameras_by_name,
+    chosen_states,
+    contact_sheet,
+    enlarged,
+    frames,
+)
 from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.recording.episode import Episode
 from workbench.recording.mp4 import Encoding, write_mp4

@@ -19,6 +19,7 @@ from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.read_episode import UnreadableRecording, read_episode
+from workbench.recording.sources import sources_among
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -195,6 +196,17 @@ def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
     (folder / "meta/info.json").write_text("{")
     with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
         lerobot_rows(folder)
+
+
+def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Path) -> None:
+    for name in ("broken", "whole"):
+        export(tmp_path / name, episode)
+    (tmp_path / "broken/meta/info.json").write_text("{")
+    broken, whole = sources_among([tmp_path])
+    assert (broken.name, whole.name) == ("broken#0", "whole#0")
+    with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+        broken.read()
+    np.testing.assert_array_equal(whole.read().action, episode.action)
 
 
 def test_a_dataset_is_in_the_library_an_episode_a_row(

@@ -114,7 +114,7 @@ def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path)
     thread.join()
     assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
     assert found["b"].problem == (
-        "b (.json) ended the process that reads recordings (SIGSEGV), and is left alone until it changes."
+        "b (.json) ended the process that reads recordings (it was killed by SIGSEGV), and is left alone until it changes."
     )
 
 

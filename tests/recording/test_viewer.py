@@ -16,8 +16,15 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from tests.recording.verify_rrd import verify_rrd
-from workbench.recording.rerun_process import await_port, end, free_port, quiet_environment, rerun_command
-from workbench.recording.viewer import has_screen, open_window
+from workbench.recording.rerun_viewer import (
+    await_port,
+    end,
+    free_port,
+    has_screen,
+    open_window,
+    quiet_environment,
+    rerun_command,
+)
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -18,7 +18,7 @@ from tests.drive.page import page_at
 from tests.drive.waiting import until
 from workbench.recording.blueprint_in_file import add_blueprint, blueprint_stream, encode_blueprint
 from workbench.recording.rerun_chunks import static_chunk
-from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
+from workbench.recording.rerun_viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.door import Door
 from workbench.ui.file_reply import Offers
 from workbench.ui.gate import cookie_name

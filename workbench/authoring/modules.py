@@ -39,10 +39,8 @@ from workbench.authoring.library_names import (
     is_own_file,
 )
 from workbench.authoring.source.text import plain_line_ends
-from workbench.machine.regular_file import read_regular_file
+from workbench.machine.regular_file import MOST_SOURCE_BYTES, read_regular_file
 
-MOST_SOURCE_BYTES = 16 * 2**20
-"""Of one Python file; the largest of the standard library has a fiftieth of this."""
 _MODULE_PREFIX = "workbench_task_"
 
 

@@ -24,8 +24,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import cycle, islice
 from pathlib import Path
 
-from workbench.authoring.modules import MOST_SOURCE_BYTES, decode
-from workbench.machine.regular_file import read_regular_file
+from workbench.authoring.modules import decode
+from workbench.machine.regular_file import MOST_SOURCE_BYTES, read_regular_file
 from workbench.machine.watched_thread import say_failure, watched_thread
 
 LOOK_S = 0.04

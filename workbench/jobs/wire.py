@@ -180,6 +180,8 @@ class _Read:
             raise ValueError("an array is longer than what came")
         # A copy: who keeps one array must not keep the whole message.
         array = np.zeros(0, dtype) if size == 0 else np.frombuffer(self._rest[:size], dtype).copy()
+        if dtype.kind == "b":  # any byte may stand there, and numpy takes one but 0 and 1 for what it likes
+            array = array.view(np.uint8) != 0
         array = array.reshape(shape)
         self._rest = self._rest[size:]
         self._taken.append(array)

@@ -20,11 +20,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from workbench.machine.apt import AptFailed, PackageVersion, apt_get, available_versions
+from workbench.machine.user_folder import cache_folder
 
 
 def private_mesa_folder() -> Path:
     """Where the packages are unpacked: a folder of the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "workbench" / "mesa"
+    return cache_folder() / "mesa"
 
 
 def private_mesa_env() -> dict[str, str] | None:

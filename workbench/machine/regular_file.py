@@ -7,6 +7,8 @@ import os
 import stat
 from typing import BinaryIO
 
+MOST_SOURCE_BYTES = 16 << 20
+"""Of one Python file; the largest of the standard library has a fiftieth of this."""
 _PIECE = 1 << 20
 _KINDS = (
     (stat.S_ISDIR, "folder"),

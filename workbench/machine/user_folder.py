@@ -36,6 +36,11 @@ def user_folder() -> Path:
     return folder
 
 
+def cache_folder() -> Path:
+    """Where files of ours lie that can be had again, such as ``~/.cache/workbench``; it may be missing."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "workbench"
+
+
 def read_private(name: str) -> bytes | None:
     """The content of a file of the folder; None where there is none.
 

@@ -29,8 +29,7 @@ import rerun_bindings
 import xxhash
 from rerun.chunk import RrdReader
 
-from workbench.recording.protobuf import Field, read_fields, write_fields
-from workbench.recording.rerun_seam import index_of
+from workbench.recording.rerun_seam import Field, index_of, read_fields, write_fields
 
 _HEADER = 12
 _MESSAGE = struct.Struct("<QQ")

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from workbench.recording.checksums import checksum
 from workbench.recording.columns import BATCH
-from workbench.recording.document import SHARED, CameraWords, ColumnWords, Description, SceneWords
+from workbench.recording.document import SHARED, CameraWords, ColumnWords, Description, SceneWords, checksum
+from workbench.recording.encoded_pictures import small_jpeg
 from workbench.recording.entry_texts import tracks_words
 from workbench.recording.made_here import seal
 from workbench.recording.survey import Survey
@@ -67,11 +67,7 @@ def thumbnail(picture: bytes | None) -> str | None:
     if picture is None:
         return None
     with Image.open(io.BytesIO(picture)) as image:
-        small = image.convert("RGB")
-    small.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH))
-    buffer = io.BytesIO()
-    small.save(buffer, format="JPEG", quality=80)
-    return base64.b64encode(buffer.getvalue()).decode()
+        return base64.b64encode(small_jpeg(image, THUMBNAIL_WIDTH)).decode()
 
 
 def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnWords]:

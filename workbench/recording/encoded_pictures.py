@@ -22,7 +22,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,18 @@ class EncodedPictures:
         return decode(self.modality, self.blobs[index])
 
 
+class LazyPictures(Sequence[bytes]):
+    """Encoded pictures of which each is had when it is asked for; slices are lists."""
+
+    def one(self, number: int) -> bytes:
+        """The picture of this number, which is one of them."""
+        raise NotImplementedError
+
+    def __getitem__(self, index: Any) -> Any:
+        numbers = range(len(self))[index]
+        return self.one(numbers) if isinstance(numbers, int) else [self.one(number) for number in numbers]
+
+
 def encode(modality: Modality, picture: NDArray) -> bytes:
     """`picture` as in ``EncodedPictures.__getitem__``; depth may be whole millimetres, none of them below 0."""
     if modality == "rgb":
@@ -106,6 +118,15 @@ def encode_jpeg(image: NDArray[np.uint8]) -> bytes:
     """(H, W, 3) as JPEG, colour at full resolution (the edges of small pictures blur otherwise)."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return buffer.getvalue()
+
+
+def small_jpeg(image: Image.Image, longest: int) -> bytes:
+    """`image`, no side of it longer than so many pixels."""
+    small = image.convert("RGB")
+    small.thumbnail((longest, longest))
+    buffer = io.BytesIO()
+    small.save(buffer, format="JPEG", quality=80)
     return buffer.getvalue()
 
 

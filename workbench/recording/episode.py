@@ -151,6 +151,10 @@ class Episode:
         """T, the number of control steps."""
         return len(self.reward)
 
+    def flag(self, name: str) -> NDArray[np.bool_] | None:
+        """(T + 1,) of an entry of ``evaluate()`` that is one truth a state; None where it is another, or not there."""
+        return flag_of(self.evaluate.get(name))
+
     def others_at(self, state: int) -> dict[str, OtherEntry]:
         """What ``evaluate()`` returned in this state besides `evaluate`."""
         found: dict[str, OtherEntry] = {}

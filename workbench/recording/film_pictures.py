@@ -12,16 +12,16 @@ import os
 import resource
 import subprocess
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, overload
+from typing import BinaryIO
 
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.regular_file import open_regular_file
-from workbench.recording.encoded_pictures import MOST_PIXELS, encode_jpeg
+from workbench.recording.encoded_pictures import MOST_PIXELS, LazyPictures, encode_jpeg
 from workbench.recording.sources import UnreadableRecording
 
 MOST_FRAMES = 100_000
@@ -31,7 +31,7 @@ MOST_SECONDS = 60.0
 """Of ffmpeg, for one part."""
 
 
-class FilmPictures(Sequence[bytes]):
+class FilmPictures(LazyPictures):
     """The frames of a part of a film as JPEG; all of the part is taken out when one is first asked for."""
 
     def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
@@ -45,18 +45,12 @@ class FilmPictures(Sequence[bytes]):
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, index: int) -> bytes: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[bytes]: ...
-
-    def __getitem__(self, index: int | slice) -> bytes | Sequence[bytes]:
+    def one(self, number: int) -> bytes:
         """Raises UnreadableRecording where the film cannot be read."""
         with self._taking:
             if self._blobs is None:
                 self._blobs = self._take_out()
-        return self._blobs[index]
+        return self._blobs[number]
 
     def _take_out(self) -> list[bytes]:
         blobs: list[bytes] = []

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from workbench.recording import lerobot_format as form
-from workbench.recording.episode import Episode, flag_of
+from workbench.recording.episode import Episode
 from workbench.recording.lerobot_frames import Choice, Frames, feature_name, frames_of
 from workbench.recording.mp4 import Encoding, FilmWriter
 
@@ -134,7 +134,9 @@ class _Films:
         begin = 0 if self._film is None else len(self._film)
         for index, picture in enumerate(frames.pictures(camera)):
             if self._film is None:
-                name = form.VIDEO.format(key=self._key, chunk=self._chunk, file=self._file)
+                name = form.VIDEO_PATH.format(
+                    video_key=self._key, chunk_index=self._chunk, file_index=self._file
+                )
                 self._path = self._folder / name
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 self._film = FilmWriter(self._path, picture.shape, self._fps, ENCODING)
@@ -271,7 +273,7 @@ class _Writer:
             self._rows.close()
             self._rows, (self._chunk, self._file) = None, form.next_file(self._chunk, self._file)
         if self._rows is None:
-            self._path = self._folder / form.DATA.format(chunk=self._chunk, file=self._file)
+            self._path = self._folder / form.DATA_PATH.format(chunk_index=self._chunk, file_index=self._file)
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._rows = self._stack.enter_context(
                 pq.ParquetWriter(self._path, table.schema, compression="snappy")
@@ -293,7 +295,7 @@ class _Writer:
             films.close()
         for entry in self._episodes:
             entry["meta/episodes/chunk_index"] = entry["meta/episodes/file_index"] = 0
-        episodes = self._folder / form.EPISODES.format(chunk=0, file=0)
+        episodes = self._folder / form.EPISODES
         episodes.parent.mkdir(parents=True)
         pq.write_table(pa.Table.from_pylist(self._episodes), episodes, compression="snappy")
         tasks = pa.table(
@@ -351,7 +353,7 @@ def _arrow(values: np.ndarray) -> pa.Array:
 
 
 def _succeeds(episode: Episode) -> bool:
-    flag = flag_of(episode.evaluate.get("success"))
+    flag = episode.flag("success")
     return flag is not None and bool(flag.any())
 
 

@@ -18,9 +18,7 @@ VERSION = "v3.0"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
-EPISODES = "meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
-DATA = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
-VIDEO = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 OURS = "meta/workbench.json"
@@ -35,11 +33,8 @@ IMAGES = "observation.images."
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 OF_EVERY_FRAME = {
-    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    "frame_index": {"dtype": "int64", "shape": [1], "names": None},
-    "episode_index": {"dtype": "int64", "shape": [1], "names": None},
-    "index": {"dtype": "int64", "shape": [1], "names": None},
-    "task_index": {"dtype": "int64", "shape": [1], "names": None},
+    name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
+    for name in ("timestamp", "frame_index", "episode_index", "index", "task_index")
 }
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 MOST_SAMPLED = 100
@@ -105,24 +100,18 @@ def together(parts: list[Stats]) -> Stats:
 
 def tasks_metadata() -> dict[bytes, bytes]:
     """What pandas needs to take the tasks' words for the index of the table, as lerobot's reader does."""
+
+    def column(name: str | None, field: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:
+        types = {"pandas_type": pandas_type, "numpy_type": numpy_type}
+        return {"name": name, "field_name": field, **types, "metadata": None}
+
+    index = "__index_level_0__"
     described = {
-        "index_columns": ["__index_level_0__"],
+        "index_columns": [index],
         "column_indexes": [],
         "columns": [
-            {
-                "name": "task_index",
-                "field_name": "task_index",
-                "pandas_type": "int64",
-                "numpy_type": "int64",
-                "metadata": None,
-            },
-            {
-                "name": None,
-                "field_name": "__index_level_0__",
-                "pandas_type": "unicode",
-                "numpy_type": "object",
-                "metadata": None,
-            },
+            column("task_index", "task_index", "int64", "int64"),
+            column(None, index, "unicode", "object"),
         ],
         "creator": {"library": "pyarrow", "version": "18.0.0"},
         "pandas_version": "2.2.0",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.recording.camera_pictures import cameras_by_name, picture_index
-from workbench.recording.episode import Episode, flag_of
+from workbench.recording.episode import Episode
 from workbench.recording.lerobot_format import ACTION, DONE, ENVIRONMENT, IMAGES, REWARD, STATE, SUCCESS
 
 
@@ -96,7 +96,7 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     names[ACTION] = [str(name).replace("/", ".") for name in episode.action_names]
     columns[REWARD] = rewards[:, None]
     columns[DONE] = done[:, None]
-    if (succeeded := flag_of(episode.evaluate.get("success"))) is not None:
+    if (succeeded := episode.flag("success")) is not None:
         columns[SUCCESS] = np.logical_or.reduceat(succeeded[1:], states)[:, None]
     there = tuple(cameras_by_name(episode))
     cameras = there if choice.cameras is None else choice.cameras

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from workbench.core.camera_frames import intrinsic_from_fov
 from workbench.core.pictures import CameraInfo
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording import lerobot_format as form
@@ -28,6 +28,7 @@ from workbench.recording.document import read_json
 from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.recording.film_pictures import FilmPictures
+from workbench.recording.library_row import Facts, text, whole
 from workbench.recording.sources import UnreadableRecording
 
 USUAL_FOVY = math.radians(60)
@@ -41,25 +42,12 @@ _PLACE = re.compile(r"\{(?P<name>chunk_index|file_index|video_key)(:0?(?P<width>
 _NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
-@dataclass(frozen=True)
-class LeRobotRow:
-    """What a table says of an episode."""
-
-    index: int
-    task: str
-    length: int
-    total_reward: float | None
-    success: bool | None
-    """At some step; None where the dataset does not say."""
-    seed: int | None
-
-
 def is_lerobot(folder: Path) -> bool:
     return (Path(folder) / form.INFO).is_file()
 
 
-def lerobot_rows(folder: Path) -> tuple[LeRobotRow, ...]:
-    """The episodes of the dataset in this folder.
+def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
+    """The episodes of the dataset in this folder; each a success that is one at some frame.
 
     Raises:
         UnreadableRecording: it is none of version 3, or broken; the message says what is wrong.
@@ -72,16 +60,16 @@ def lerobot_rows(folder: Path) -> tuple[LeRobotRow, ...]:
         for entry in _entries(folder):
             index = int(entry["episode_index"])
             seed = ours[index].get("seed") if 0 <= index < len(ours) else None
-            rows.append(
-                LeRobotRow(
-                    index,
-                    _task(entry),
-                    int(entry["length"]),
-                    None if totals is None else totals.get(index, 0.0),
-                    None if successes is None else successes.get(index, 0.0) > 0,
-                    seed if isinstance(seed, int) else None,
-                )
+            facts = Facts(
+                "lerobot",
+                task=text(_task(entry)),
+                trajectory=str(index),
+                seed=whole(seed),
+                length=int(entry["length"]),
+                total_reward=None if totals is None else totals.get(index, 0.0),
+                success=None if successes is None else successes.get(index, 0.0) > 0,
             )
+            rows.append(facts)
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise _broken(folder, error) from error
     return tuple(rows)
@@ -196,7 +184,6 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
     height, width = info["features"][key]["shape"][:2]
     if info["features"][key]["names"][0] == "channels":  # (3, H, W), as some datasets say it
         height, width = info["features"][key]["shape"][1:]
-    focal = height / 2 / math.tan(USUAL_FOVY / 2)
     if not 0 < width * height <= MOST_PIXELS:
         raise ValueError(f"{key} is said to have pictures of {width} x {height}")
     where = {
@@ -215,7 +202,7 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
             fovy=USUAL_FOVY,
             near=0.01,
             far=100.0,
-            intrinsic=np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32),
+            intrinsic=intrinsic_from_fov(USUAL_FOVY, width, height).astype(np.float32),
             mount=None,
             modalities=("rgb",),
         ),

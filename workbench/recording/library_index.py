@@ -25,6 +25,7 @@ from pathlib import Path
 
 import msgspec
 
+from workbench.machine.user_folder import cache_folder
 from workbench.recording.library_row import Entry, Facts, clean_facts
 from workbench.recording.library_scan import found_of
 
@@ -163,9 +164,8 @@ def _is_text(key: str) -> bool:
 
 def index_path(folder: Path) -> Path:
     """Where the index of a folder lies."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
-    return cache / "workbench" / "libraries" / f"{name}.sqlite"
+    return cache_folder() / "libraries" / f"{name}.sqlite"
 
 
 def _open(path: Path) -> sqlite3.Connection | None:

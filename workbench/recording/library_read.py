@@ -11,7 +11,6 @@ than find nothing. A ``.json`` that is something else (a folder of recordings ma
 from __future__ import annotations
 
 import base64
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,8 @@ from PIL import Image
 
 from workbench.machine.regular_file import NotARegularFile, open_regular_file
 from workbench.recording.annotations import read_notes
-from workbench.recording.checksums import wrong_size
-from workbench.recording.document import Document, EpisodeWords, WrongDocument, read_document
-from workbench.recording.encoded_pictures import open_picture
+from workbench.recording.document import Document, EpisodeWords, WrongDocument, read_document, wrong_size
+from workbench.recording.encoded_pictures import open_picture, small_jpeg
 from workbench.recording.episode import acted_by_from, acted_by_in_words
 from workbench.recording.library_row import (
     Entry,
@@ -163,17 +161,9 @@ def _thumbnail(encoded: object) -> bytes | None:
             if image.format == "JPEG" and max(image.size) <= 2 * THUMBNAIL_PIXELS:
                 if len(content) <= THUMBNAIL_BYTES:
                     return content
-            return _small_jpeg(image.convert("RGB"))
+            return small_jpeg(image, THUMBNAIL_PIXELS)
     except (ValueError, OSError):
         return None
-
-
-def _small_jpeg(small: Image.Image) -> bytes:
-    """`small` itself is made small."""
-    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS))
-    written = io.BytesIO()
-    small.save(written, "JPEG", quality=80)
-    return written.getvalue()
 
 
 def _maniskills(folder: Path, found: Found, document: Document) -> list[Entry]:
@@ -242,22 +232,7 @@ def _lerobots(folder: Path, found: Found) -> list[Entry]:
         rows = lerobot_rows(found.path(folder, ".json").parents[1])
     except UnreadableRecording as error:
         return [(Facts("lerobot", written=written, problem=text(str(error), 500)), None)]
-    return [
-        (
-            Facts(
-                "lerobot",
-                task=text(row.task),
-                trajectory=str(row.index),
-                written=written,
-                seed=row.seed,
-                length=row.length,
-                total_reward=row.total_reward,
-                success=row.success,
-            ),
-            None,
-        )
-        for row in rows
-    ]
+    return [(replace(facts, written=written), None) for facts in rows]
 
 
 def _look_into(
@@ -296,7 +271,7 @@ def _last_picture(group: H5Group) -> bytes | None:
         rgb = None if camera is None else camera.get("rgb")
         if isinstance(rgb, H5Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
             if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _LARGEST_PICTURE:
-                return _small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)))
+                return small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)), THUMBNAIL_PIXELS)
     return None
 
 

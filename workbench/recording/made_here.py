@@ -2,7 +2,7 @@
 
 A keyed hash (HMAC-SHA256) with a key that is made once, at random, and that only this user can read. It covers what
 decides which code runs when the recording is judged or gone into (task, text, keywords), and what its files hash to
-(`checksums`). Tags and notes may change; a moved recording keeps it. Where the task's file lay has a hash of its own: a
+(`document.checksum`). Tags and notes may change; a moved recording keeps it. Where the task's file lay has a hash of its own: a
 recording that comes back from elsewhere with another file beside it must not pass for the one that was open here.
 """
 

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry, SharedShapes
-from workbench.recording.checksums import check
 from workbench.recording.document import (
     CameraWords,
     ColumnWords,
     Description,
     WrongDocument,
+    check,
     description_in,
     read_document,
     task_file,

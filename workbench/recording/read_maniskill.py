@@ -10,7 +10,6 @@ from __future__ import annotations
 import datetime
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from workbench.recording.encoded_pictures import (
     MODALITIES,
     MOST_PIXELS,
     EncodedPictures,
+    LazyPictures,
     Modality,
     encode,
 )
@@ -168,7 +168,7 @@ def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str,
 # --- cameras --------------------------------------------------------------------------------------
 
 
-class _H5Pictures(Sequence[bytes]):
+class _H5Pictures(LazyPictures):
     """Pictures of a dataset (P, H, W, C), read and encoded when they are asked for."""
 
     def __init__(self, path: Path, dataset: str, count: int, modality: Modality) -> None:
@@ -180,10 +180,7 @@ class _H5Pictures(Sequence[bytes]):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(self._count))]
-        number = range(self._count)[index]
+    def one(self, number: int) -> bytes:
         with open_h5(self._path) as file:
             dataset = file[self._dataset]
             if not isinstance(dataset, H5Dataset):

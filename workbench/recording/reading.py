@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from workbench.core.geometry import SharedShapes
 from workbench.recording.document import task_file
@@ -21,16 +22,8 @@ from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode
 from workbench.recording.library_row import Entry, Facts, clean_facts, text
 from workbench.recording.library_scan import NOTES, Found
-from workbench.recording.reader.episode_wire import KnownShapes, unpacked
-from workbench.recording.reader.processes import (
-    Answered,
-    How,
-    NotThere,
-    Reader,
-    ReaderEnded,
-    end_nursery,
-    start_nursery,
-)
+from workbench.recording.reader.episode_wire import Garbled, KnownShapes, unpacked
+from workbench.recording.reader.processes import Answered, NotThere, Reader, ReaderEnded, nursery
 from workbench.recording.reader.requests import (
     EpisodeRead,
     Failed,
@@ -44,7 +37,6 @@ from workbench.recording.reader.requests import (
     SourcesFound,
     ToldRerun,
 )
-from workbench.recording.reader.wire import ArrayReader, Garbled, bytes_of, path_of
 from workbench.recording.sources import Kind, Source, UnreadableRecording
 
 ROW_SECONDS = 30.0
@@ -58,6 +50,7 @@ LARGEST_THUMBNAIL = 64 << 10
 _AT_ONCE = 8
 """Rows that are asked for together: the reader goes on while the last ones are put into the table."""
 _JPEG = b"\xff\xd8\xff"
+T = TypeVar("T")
 
 _lock = threading.Lock()
 _readers: OrderedDict[tuple[Path, bool], Reader] = OrderedDict()
@@ -66,7 +59,7 @@ _shapes = KnownShapes()
 
 def start_reading() -> None:
     """Begin to start what reads recordings, before one is wanted. Returns at once; raises OSError."""
-    start_nursery()
+    nursery.start()
 
 
 def stop_reading() -> None:
@@ -76,7 +69,7 @@ def stop_reading() -> None:
         _readers.clear()
     for reader in readers:
         reader.close()
-    end_nursery()
+    nursery.end()
 
 
 def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
@@ -88,12 +81,10 @@ def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, li
     wanted = list(wanted)
     reader = _reader(folder, episodes=False)
     reader.allow(_beyond(path for found in wanted for path in found.paths(folder)))
-    where = bytes_of(folder)
     for begin in range(0, len(wanted), _AT_ONCE):
         some = wanted[begin : begin + _AT_ONCE]
-        answers = reader.ask_all(
-            [Rows(where, bytes_of(found.key), found.signature) for found in some], ROW_SECONDS
-        )
+        asked = [Rows(Path(folder), os.fsencode(found.key), found.signature) for found in some]
+        answers = reader.ask_all(asked, ROW_SECONDS)
         for found, answer in zip(some, answers, strict=True):
             yield found, _entries(found, answer)
 
@@ -119,11 +110,11 @@ def read_recording(
     reader.allow(_beyond(beside))
     shapes = SharedShapes() if shapes is None else shapes
     sharing, known = _shapes.of(shapes)
-    wanted = Open(kind, bytes_of(path), part, sharing)
-    read, answered = _open(reader, wanted, path.name)
-    opened = _Opened(reader, wanted, answered.process, read.opened, path.name)
+    wanted = Open(kind, path, part, sharing)
+    read, process = _asked(reader, wanted, EpisodeRead, path.name)
+    opened = _Opened(reader, wanted, process, read.opened, path.name)
     try:
-        episode = unpacked(read, answered.arrays, opened.picture, answered.process, shapes, known)
+        episode = unpacked(read, opened.picture, process, shapes, known)
     except Garbled as error:
         raise UnreadableRecording(f"{path.name} is a recording, but a broken one: {error}.") from error
     if kind == "ours":
@@ -148,23 +139,16 @@ def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
     path = Path(path).absolute()
     reader = _reader(path.parent, episodes=True)
     reader.allow(_beyond([path]))
-    answer = _asked(reader, ForRerun(bytes_of(path)), path.name).answer
-    if not isinstance(answer, ToldRerun):
-        raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
-    return answer.store, answer.blueprint
+    told, _ = _asked(reader, ForRerun(path), ToldRerun, path.name)
+    return told.store, told.blueprint
 
 
 def _found(path: Path, trajectories: bool) -> list[Source]:
     path = Path(path).absolute()
     reader = _reader(path if path.is_dir() else path.parent, episodes=True)
     reader.allow(_beyond([path]))
-    answer = _asked(reader, Sources(bytes_of(path), trajectories), path.name).answer
-    if not isinstance(answer, SourcesFound):
-        raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
-    return [
-        Source(path_of(found), part, text(id, 8192), text(name, 400))
-        for found, part, id, name in answer.sources
-    ]
+    found, _ = _asked(reader, Sources(path, trajectories), SourcesFound, path.name)
+    return [replace(one, id=text(one.id, 8192), name=text(one.name, 400)) for one in found.sources]
 
 
 def _reader(folder: Path, episodes: bool) -> Reader:
@@ -211,23 +195,20 @@ def _thumbnail(jpeg: bytes | None) -> bytes | None:
     return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= LARGEST_THUMBNAIL else None
 
 
-def _asked(reader: Reader, request: Open | Sources | ForRerun, name: str) -> Answered:
+def _asked(reader: Reader, request: Open | Sources | ForRerun, kind: type[T], name: str) -> tuple[T, int]:
+    """The answer, and the number of the process that gave it."""
     try:
         answered = reader.ask(request, OPEN_SECONDS)
     except ReaderEnded as error:
         raise UnreadableRecording(f"{name} {error}.") from error
-    if isinstance(answered.answer, Failed):
-        if answered.answer.why == "system":
-            raise OSError(answered.answer.words)
-        raise UnreadableRecording(answered.answer.words)
-    return answered
-
-
-def _open(reader: Reader, wanted: Open, name: str) -> tuple[EpisodeRead, Answered]:
-    answered = _asked(reader, wanted, name)
-    if not isinstance(answered.answer, EpisodeRead):
-        raise UnreadableRecording(f"{name} gave {type(answered.answer).__name__}.")
-    return answered.answer, answered
+    answer = answered.answer
+    if isinstance(answer, Failed):
+        if answer.why == "system":
+            raise OSError(answer.words)
+        raise UnreadableRecording(answer.words)
+    if not isinstance(answer, kind):
+        raise UnreadableRecording(f"{name} gave {type(answer).__name__}.")
+    return answer, answered.process
 
 
 class _Opened:
@@ -239,22 +220,19 @@ class _Opened:
         self._failed: OSError | None = None
         self._is_open_in(process, opened)
 
-    def picture(
-        self, camera: int, modality: Modality, index: int, encoded: bool
-    ) -> tuple[PictureRead, ArrayReader]:
+    def picture(self, camera: int, modality: Modality, index: int, encoded: bool) -> PictureRead:
         """Raises OSError; ReaderBusy while another recording is being opened."""
         with self._lock:
             if self._failed is not None:
                 raise self._failed
             try:
-                answered = self._ask(camera, modality, index, encoded)
+                answer = self._ask(camera, modality, index, encoded).answer
             except ReaderEnded as error:
                 # It would end the next one too, thirty times a second.
                 self._failed = OSError(f"{self._name} {error}")
                 raise self._failed from error
-        answer = answered.answer
         if isinstance(answer, PictureRead):
-            return answer, answered.arrays
+            return answer
         raise OSError(answer.words if isinstance(answer, Failed) else "the reader gave no picture")
 
     def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
@@ -264,9 +242,9 @@ class _Opened:
                 return self._reader.ask(wanted, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
             except NotThere:
                 # Something else has ended the process since.
-                read, answered = _open(self._reader, self._wanted, self._name)
-                self._is_open_in(answered.process, read.opened)
-        raise ReaderEnded(How.DIED, "ended the process that reads recordings")
+                read, process = _asked(self._reader, self._wanted, EpisodeRead, self._name)
+                self._is_open_in(process, read.opened)
+        raise ReaderEnded("ended the process that reads recordings")
 
     def _is_open_in(self, process: int, opened: int) -> None:
         self._process, self._number = process, opened

@@ -23,7 +23,7 @@ from workbench.recording.make_files import (
     make_files,
     temporary_files,
 )
-from workbench.recording.scene_file import read_scene
+from workbench.recording.scene_file import read_visuals
 from workbench.recording.survey import read_header, read_survey, recovered
 
 
@@ -68,7 +68,7 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
     if descriptor is None:
         return None
     try:
-        header = read_header(journal, read_scene(journal.with_suffix(SCENE_SUFFIX)))
+        header = read_header(journal, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
         files = None
         if header is not None and not _already_made(header.info, journal, folder):
             header = recovered(header)

@@ -15,14 +15,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from workbench.machine.regular_file import open_regular_file
-from workbench.recording.encoded_pictures import Modality, encode
+from workbench.recording.encoded_pictures import LazyPictures, Modality, encode
 from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_seam import IndexedChunk, decode_chunk
 
@@ -93,8 +92,8 @@ class _Kept:
 _kept = _Kept()
 
 
-class PicturesInFile(Sequence[bytes]):
-    """One modality of one camera, encoded; slices are lists."""
+class PicturesInFile(LazyPictures):
+    """One modality of one camera, encoded."""
 
     def __init__(self, file: OpenFile, places: Sequence[IndexedChunk], modality: Modality) -> None:
         """
@@ -120,16 +119,13 @@ class PicturesInFile(Sequence[bytes]):
     def __len__(self) -> int:
         return int(self._ends[-1])
 
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        number = range(len(self))[index]
+    def one(self, number: int) -> bytes:
         part = int(np.searchsorted(self._ends, number, side="right"))
         rows = _kept.rows(self._file, self._places[part], self._component)
         return rows[number - int(self._ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
 
 
-class IdsInFile(Sequence[bytes]):
+class IdsInFile(LazyPictures):
     """Plain ids as the PNG that they were, or would have been."""
 
     def __init__(self, pictures: PicturesInFile, height: int, width: int) -> None:
@@ -139,10 +135,8 @@ class IdsInFile(Sequence[bytes]):
     def __len__(self) -> int:
         return len(self._pictures)
 
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        content = self._pictures[index]
+    def one(self, number: int) -> bytes:
+        content = self._pictures.one(number)
         wide = len(content) == 4 * self._shape[0] * self._shape[1]
         ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(self._shape)
         return encode("segmentation", ids.astype(np.int32))

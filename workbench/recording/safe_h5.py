@@ -198,7 +198,7 @@ class H5Dataset:
         """All of it. Raises RefusedH5."""
         self._check_numbers()
         self._budget.take_bytes(self._short, self._size(self.shape))
-        return np.asarray(self._dataset[()])
+        return _native(self._dataset[()])
 
     def row(self, number: int) -> NDArray:
         """One of its rows. Raises RefusedH5, and IndexError where there is none."""
@@ -207,7 +207,7 @@ class H5Dataset:
             raise RefusedH5(f"has one number where rows are looked for (at {self._short})")
         index = range(len(self))[number]
         self._budget.take_bytes(self._short, self._size(self.shape[1:]))
-        return np.asarray(self._dataset[index])
+        return _native(self._dataset[index])
 
     def _check_numbers(self) -> None:
         if not self.is_numbers:
@@ -235,3 +235,9 @@ class H5Dataset:
     @property
     def _short(self) -> str:
         return self.name.strip("/")
+
+
+def _native(numbers: NDArray) -> NDArray:
+    """With the bytes of each number in this machine's order, which torch asks for."""
+    array = np.asarray(numbers)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)

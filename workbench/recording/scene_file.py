@@ -12,6 +12,7 @@ import json
 import os
 import threading
 import weakref
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -41,13 +42,13 @@ def keep_scene(geometry: SceneGeometry, path: Path) -> None:
         _last = (weakref.ref(geometry), path)
 
 
-def read_scene(path: Path) -> SceneGeometry | None:
-    """What `keep_scene` kept; None where the file is missing or broken."""
+def read_visuals(path: Path) -> tuple[Visual, ...]:
+    """The visuals of what `keep_scene` kept; none where the file is missing or broken."""
     try:
         with open_regular_file(path) as file, np.load(file, allow_pickle=False) as archive:
-            return _geometry(archive)
+            return tuple(_visuals(archive))
     except (OSError, BadZipFile, KeyError, ValueError, TypeError, EOFError):
-        return None
+        return ()
 
 
 def _write(geometry: SceneGeometry, path: Path) -> None:
@@ -59,14 +60,7 @@ def _write(geometry: SceneGeometry, path: Path) -> None:
         arrays |= {f"{index}/{name}": array for name, array in held.items() if array is not None}
         material = visual.material
         visuals.append([visual.name, material.base_color, material.metallic, material.roughness])
-    scene = {
-        "num_envs": geometry.num_envs,
-        "body_names": geometry.body_names,
-        "body_kinds": geometry.body_kinds,
-        "body_hidden": geometry.body_hidden,
-        "visuals": visuals,
-    }
-    arrays["scene"] = np.frombuffer(json.dumps(scene).encode(), dtype=np.uint8)
+    arrays["scene"] = np.frombuffer(json.dumps({"visuals": visuals}).encode(), dtype=np.uint8)
     try:
         with path.open("xb") as file:
             np.savez(file, **arrays)
@@ -75,9 +69,8 @@ def _write(geometry: SceneGeometry, path: Path) -> None:
         raise
 
 
-def _geometry(archive: Any) -> SceneGeometry:
+def _visuals(archive: Any) -> Iterator[Visual]:
     scene = json.loads(bytes(archive["scene"]))
-    visuals = []
     for index, (name, base_color, metallic, roughness) in enumerate(scene["visuals"]):
         held: dict[str, Any] = {
             key: archive[f"{index}/{key}"] if f"{index}/{key}" in archive else None
@@ -86,11 +79,4 @@ def _geometry(archive: Any) -> SceneGeometry:
         r, g, b, a = base_color
         material = Material((r, g, b, a), metallic, roughness, held["texture"])
         mesh = Mesh(**{key: held[key] for key in _MESH})
-        visuals.append(Visual(name, mesh, material, held["envs"], held["bodies"]))
-    return SceneGeometry(
-        num_envs=scene["num_envs"],
-        body_names=tuple(scene["body_names"]),
-        body_kinds=tuple(scene["body_kinds"]),
-        body_hidden=tuple(scene["body_hidden"]),
-        visuals=tuple(visuals),
-    )
+        yield Visual(name, mesh, material, held["envs"], held["bodies"])

@@ -47,11 +47,11 @@ def _in_file(path: Path) -> Iterator[Source]:
 
 def _in_dataset(folder: Path) -> Iterator[Source]:
     try:
-        numbers = [row.index for row in lerobot_rows(folder)]
+        numbers = [facts.trajectory for facts in lerobot_rows(folder)]
     except UnreadableRecording:
-        numbers = [0]  # whoever reads it is told why
+        numbers = ["0"]  # whoever reads it is told why
     for number in numbers:
-        yield Source(folder, str(number), f"{folder.resolve()}#{number}", f"{folder.name}#{number}")
+        yield Source(folder, number, f"{folder.resolve()}#{number}", f"{folder.name}#{number}")
 
 
 def _document(path: Path) -> Document:

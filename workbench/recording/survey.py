@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
+from workbench.core.geometry import SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, assemble, layout_type
 from workbench.recording.document import CameraWords, json_text
@@ -68,17 +68,15 @@ def header_text(header: Header) -> str:
     )
 
 
-def header_from(text: str, geometry: SceneGeometry | None) -> Header:
-    """The inverse of `header_text`; where the meshes were lost there are none. Raises ValueError, KeyError or TypeError."""
+def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
+    """The inverse of `header_text`; the meshes lie beside it. Raises ValueError, KeyError or TypeError."""
     said = json.loads(text)
-    if geometry is None:
-        num_envs, names, kinds, hidden = said["bodies"]
-        geometry = SceneGeometry(num_envs, tuple(names), tuple(kinds), tuple(hidden), ())
+    num_envs, names, kinds, hidden = said["bodies"]
     # A journal of an earlier version holds it as an object, without a seal.
     info = said["info"] if isinstance(said["info"], str) else json.dumps(said["info"])
     return Header(
         info=_info_from(json.loads(info)),
-        geometry=geometry,
+        geometry=SceneGeometry(num_envs, tuple(names), tuple(kinds), tuple(hidden), visuals),
         segmentation={int(key): name for key, name in said["segmentation"].items()},
         action_names=tuple(said["action_names"]),
         cameras=tuple(words.info() for words in msgspec.convert(said["cameras"], list[CameraWords])),
@@ -189,7 +187,7 @@ class Pictures:
     """Encoded."""
 
 
-def read_header(journal: Path, geometry: SceneGeometry | None) -> Header | None:
+def read_header(journal: Path, visuals: tuple[Visual, ...]) -> Header | None:
     """None where the journal ends before its header.
 
     Raises:
@@ -198,7 +196,7 @@ def read_header(journal: Path, geometry: SceneGeometry | None) -> Header | None:
     """
     for entries in read_journal(journal):
         try:
-            return header_from(entries[0].value.decode(), geometry)
+            return header_from(entries[0].value.decode(), visuals)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             why = (
                 f"{journal.name} is no recording that this version can read; a later one may, else remove it"

@@ -24,10 +24,9 @@ from workbench.authoring.library_names import (
     named_like_library,
     searched_first,
 )
-from workbench.authoring.modules import MOST_SOURCE_BYTES
 from workbench.authoring.problem import Problem, definition_line, problem_from_exception
 from workbench.authoring.watch import SourceWatcher
-from workbench.machine.regular_file import read_regular_file
+from workbench.machine.regular_file import MOST_SOURCE_BYTES, read_regular_file
 
 Policy = Callable[[Any], Any]
 

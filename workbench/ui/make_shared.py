@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.atomic_files import new_file
-from workbench.recording.camera_pictures import camera_of, cameras_by_name, enlarged, frames
-from workbench.recording.contact_sheet import contact_sheet
+from workbench.recording.camera_pictures import camera_of, cameras_by_name, contact_sheet, enlarged, frames
 from workbench.recording.episode import Episode
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
 from workbench.recording.mp4 import write_mp4

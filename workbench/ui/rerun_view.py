@@ -30,7 +30,7 @@ from types import MappingProxyType
 import viser
 
 from workbench.recording.reading import told_rerun
-from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
+from workbench.recording.rerun_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
 from workbench.ui.door import Door
 from workbench.ui.file_reply import FileReply, Offers
 from workbench.ui.fragments import render

@@ -13,13 +13,12 @@ import os
 import signal
 import socket
 import sys
+from multiprocessing.connection import Connection
 
-import msgspec
-
+from workbench.jobs.wire import Unpacker, pack
 from workbench.machine.confinement import confine, end_with_parent
-from workbench.recording.reader.nursery_messages import Ended, NewReader
+from workbench.recording.reader.requests import Ended, NewReader
 from workbench.recording.reader.serve import serve, warm_up
-from workbench.recording.reader.wire import path_of
 
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
@@ -35,31 +34,31 @@ def main() -> None:
         message, fds, _, _ = socket.recv_fds(control, LONGEST, 1)
         if not message:
             return
-        wanted = msgspec.msgpack.decode(message, type=NewReader | Ended)
+        wanted = Unpacker().unpack(message, NewReader | Ended)
         if isinstance(wanted, Ended):
             _, status = os.waitpid(wanted.pid, 0)
-            control.send(msgspec.msgpack.encode(os.waitstatus_to_exitcode(status)))
+            control.send(pack(os.waitstatus_to_exitcode(status)))
             continue
         nursery = os.getpid()
         pid = os.fork()
         if pid == 0:
             control.close()
-            _be_a_reader(socket.socket(fileno=fds[0]), wanted, nursery)
+            _be_a_reader(Connection(fds[0]), wanted, nursery)
         os.close(fds[0])
         try:
             os.setpgid(pid, pid)  # whoever ends it ends its group, perhaps before it has come to this itself
         except OSError:
             pass  # it has, or it is gone
-        control.send(msgspec.msgpack.encode(pid))
+        control.send(pack(pid))
 
 
-def _be_a_reader(connection: socket.socket, wanted: NewReader, nursery: int) -> None:
+def _be_a_reader(connection: Connection, wanted: NewReader, nursery: int) -> None:
     try:
         end_with_parent(nursery)
         os.setpgid(0, 0)
         if wanted.episodes:
             warm_up()
-        confine([path_of(path) for path in wanted.paths], MOST_MEMORY)
+        confine(wanted.paths, MOST_MEMORY)
         serve(connection)
     finally:
         os._exit(0)

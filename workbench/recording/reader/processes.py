@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import enum
 import itertools
 import os
-import select
 import signal
 import socket
 import subprocess
 import threading
-import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import get_args
 
-import msgspec
-
+from workbench.jobs.message_reader import MessageReader
+from workbench.jobs.wire import Unpacker, Unreadable, pack, pack_message
 from workbench.machine.child_python import child_environment, python_command
-from workbench.recording.reader.nursery_messages import Ended, NewReader
-from workbench.recording.reader.requests import ANSWERS, Answer, Forget, Request
-from workbench.recording.reader.wire import (
-    ArrayReader,
-    Closed,
-    Garbled,
-    TookTooLong,
-    bytes_of,
-    receive,
-    send,
-)
+from workbench.machine.family import describe_exit
+from workbench.recording.reader.requests import Answer, Ended, Forget, NewReader, Request
 
 START_SECONDS = 60.0
 """For a nursery to be there; it imports for half a second."""
@@ -47,20 +37,8 @@ FOR_READING = {
 }
 
 
-class How(enum.Enum):
-    """How the reading of something ended that did not end well."""
-
-    LATE = "late"
-    DIED = "died"
-    GARBLED = "garbled"
-
-
 class ReaderEnded(OSError):
     """What was asked for last ended the reader; the message goes on from the name of what was read."""
-
-    def __init__(self, how: How, words: str) -> None:
-        super().__init__(words)
-        self.how = how
 
 
 class ReaderBusy(OSError):
@@ -74,7 +52,6 @@ class NotThere(Exception):
 @dataclass(frozen=True)
 class Answered:
     answer: Answer
-    arrays: ArrayReader
     process: int
     """The number of the process that it came from."""
 
@@ -92,17 +69,17 @@ class _Nursery:
         with self._lock:
             self._start()
 
-    def new_reader(self, paths: Sequence[Path], episodes: bool) -> tuple[int, socket.socket]:
-        """Its process id and its socket. Raises OSError."""
+    def new_reader(self, paths: Sequence[Path], episodes: bool) -> tuple[int, Connection]:
+        """Its process id and the line to it. Raises OSError."""
         ours, theirs = socket.socketpair()
-        message = msgspec.msgpack.encode(NewReader([bytes_of(path) for path in paths], episodes))
+        message = pack(NewReader(list(paths), episodes))
         with theirs, self._lock:
             for _ in range(2):
                 control = self._start()
                 try:
                     socket.send_fds(control, [message], [theirs.fileno()])
-                    return msgspec.msgpack.decode(self._answer(control), type=int), ours
-                except (OSError, msgspec.MsgspecError):
+                    return self._answer(control), Connection(ours.detach())
+                except (OSError, Unreadable):
                     self._end()  # somebody ended it: once more, with another
         ours.close()
         raise OSError("the process that reads recordings cannot be started")
@@ -113,9 +90,9 @@ class _Nursery:
             if self._control is None:
                 return None
             try:
-                self._control.send(msgspec.msgpack.encode(Ended(pid)))
-                return msgspec.msgpack.decode(self._answer(self._control), type=int)
-            except (OSError, msgspec.MsgspecError):
+                self._control.send(pack(Ended(pid)))
+                return self._answer(self._control)
+            except (OSError, Unreadable):
                 self._end()
                 return None
 
@@ -142,10 +119,9 @@ class _Nursery:
         return self._control
 
     @staticmethod
-    def _answer(control: socket.socket) -> bytes:
-        if not (answer := control.recv(64)):
-            raise OSError("it has ended")
-        return answer
+    def _answer(control: socket.socket) -> int:
+        """Raises Unreadable where it has ended."""
+        return Unpacker().unpack(control.recv(64), int)
 
     def _end(self) -> None:
         if self._control is not None:
@@ -156,17 +132,7 @@ class _Nursery:
         self._control = self._process = None
 
 
-_nursery = _Nursery()
-
-
-def start_nursery() -> None:
-    """Have a nursery started while something else is done. Returns at once; raises OSError."""
-    _nursery.start()
-
-
-def end_nursery() -> None:
-    """End it, and the readers that it made with it."""
-    _nursery.end()
+nursery = _Nursery()
 
 
 class Reader:
@@ -187,7 +153,7 @@ class Reader:
         """Further files: what links in the folder lead to."""
         self._turns = _Turns()
         self._pid = 0
-        self._connection: socket.socket | None = None
+        self._connection: Connection | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
         """What those and the folder were when the present process began."""
         self._forgotten: deque[tuple[int, int]] = deque()
@@ -240,13 +206,15 @@ class Reader:
                 try:
                     self._send_forgotten(connection)
                     for request in requests[begun:]:
-                        send(connection, request)
+                        connection.send_bytes(pack_message(request))
                     for _ in requests[begun:]:
-                        answer, arrays = receive(connection, ANSWERS, time.monotonic() + seconds)
-                        answers.append(Answered(answer, arrays, self.process))
-                except (Closed, TookTooLong, Garbled) as error:
+                        if (answer := self._answers.receive(seconds)) is None:
+                            raise TimeoutError
+                        answers.append(Answered(answer, self.process))
+                except (OSError, EOFError) as error:
                     ended = self._ended(error, seconds)
-                    if isinstance(error, Closed) and again != len(answers):
+                    by_itself = not isinstance(error, (TimeoutError, Unreadable))
+                    if by_itself and again != len(answers):
                         again = len(answers)
                     else:
                         answers.append(ended)
@@ -268,38 +236,39 @@ class Reader:
         with self._turns.turn(None):
             self._kill()
 
-    def _started(self) -> socket.socket:
+    def _started(self) -> Connection:
         paths = (self._folder, *sorted(self._allowed))
         # It may read what was there when it began: a folder that was made anew is another one.
         there = tuple(map(_identity, paths))
         if self._connection is not None and (
             there != self._there
             # Nothing is asked, so this is its end: nobody's fault but of who ended it.
-            or select.select([self._connection], [], [], 0)[0]
+            or self._connection.poll()
         ):
             self._kill()
         if self._connection is None:
-            self._pid, self._connection = _nursery.new_reader(paths, self._episodes)
+            self._pid, self._connection = nursery.new_reader(paths, self._episodes)
+            self._answers = MessageReader(self._connection.fileno(), get_args(Answer))
             self.process, self._there = next(self._numbers), there
         return self._connection
 
-    def _send_forgotten(self, connection: socket.socket) -> None:
+    def _send_forgotten(self, connection: Connection) -> None:
         gone = []
         while self._forgotten:
             process, opened = self._forgotten.popleft()
             if process == self.process:
                 gone.append(opened)
         if gone:
-            send(connection, Forget(gone))
+            connection.send_bytes(pack_message(Forget(gone)))
 
     def _ended(self, error: Exception, seconds: float) -> ReaderEnded:
         status = self._kill()
-        if isinstance(error, TookTooLong):
-            return ReaderEnded(How.LATE, f"takes longer to read than {seconds:.0f} s")
-        if isinstance(error, Garbled):
-            return ReaderEnded(How.GARBLED, f"is not what it should be: {error}")
-        with_what = "" if status is None else f" ({_in_words(status)})"
-        return ReaderEnded(How.DIED, f"ended the process that reads recordings{with_what}")
+        if isinstance(error, TimeoutError):
+            return ReaderEnded(f"takes longer to read than {seconds:.0f} s")
+        if isinstance(error, Unreadable):
+            return ReaderEnded(f"is not what it should be: {error}")
+        with_what = "" if status is None else f" (it {describe_exit(status)})"
+        return ReaderEnded(f"ended the process that reads recordings{with_what}")
 
     def _kill(self) -> int | None:
         """Its exit status, where it had ended by itself or is known."""
@@ -310,7 +279,7 @@ class Reader:
         # With what it started. Its number is its own until the nursery was told.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
-        return _nursery.ended(self._pid)
+        return nursery.ended(self._pid)
 
 
 class _Turns:
@@ -343,12 +312,3 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_dev, found.st_ino
-
-
-def _in_words(status: int) -> str:
-    if status >= 0:
-        return f"exit code {status}"
-    try:
-        return signal.Signals(-status).name
-    except ValueError:
-        return f"signal {-status}"

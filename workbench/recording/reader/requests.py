@@ -1,41 +1,55 @@
-"""What a reader is asked for, and what it answers."""
+"""What a reader is asked for, and what it answers; and what the nursery that makes readers is asked for."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import msgspec
+from numpy.typing import NDArray
 
-from workbench.recording.document import CameraWords, SceneWords, TracksWords
+from workbench.core.geometry import Material, Mesh
+from workbench.recording.document import CameraWords
 from workbench.recording.encoded_pictures import Modality
-from workbench.recording.episode import EpisodeInfo, Unread
+from workbench.recording.episode import Episode
 from workbench.recording.library_row import Facts
-from workbench.recording.reader.wire import ArrayRef
-from workbench.recording.sources import Kind
-
-PathBytes = bytes
-"""A path as the system has it, which need not be text."""
+from workbench.recording.sources import Kind, Source
 
 
-class Rows(msgspec.Struct, frozen=True, tag=True):
+class NewReader(msgspec.Struct, tag=True):
+    """Fork one that reads below these paths; its socket comes along. Answered by its process id."""
+
+    paths: list[Path]
+    episodes: bool
+    """It will read whole episodes: import what that needs at once."""
+
+
+class Ended(msgspec.Struct, tag=True):
+    """That reader was ended, or has ended. Answered by its exit status as `os.waitstatus_to_exitcode` gives it."""
+
+    pid: int
+
+
+class Rows(msgspec.Struct, frozen=True):
     """The rows of the files of one name; answered by `RowsRead`."""
 
-    folder: PathBytes
-    key: PathBytes
+    folder: Path
+    key: bytes
+    """As the system has it, which need not be text."""
     signature: str
 
 
-class Open(msgspec.Struct, frozen=True, tag=True):
+class Open(msgspec.Struct, frozen=True):
     """An episode; answered by `EpisodeRead`. Its files stay open until `Forget`."""
 
     kind: Kind
-    path: PathBytes
+    path: Path
     part: str
     sharing: int
     """Episodes that are asked for with the same number share their shapes: each is sent once."""
 
 
-class PictureAt(msgspec.Struct, frozen=True, tag=True):
+class PictureAt(msgspec.Struct, frozen=True):
     """A picture of an episode that is open; answered by `PictureRead`."""
 
     opened: int
@@ -46,39 +60,38 @@ class PictureAt(msgspec.Struct, frozen=True, tag=True):
     """As it is kept, not decoded."""
 
 
-class Forget(msgspec.Struct, frozen=True, tag=True):
+class Forget(msgspec.Struct, frozen=True):
     """Episodes that are of no use any more. Not answered."""
 
     opened: list[int]
 
 
-class Sources(msgspec.Struct, frozen=True, tag=True):
+class Sources(msgspec.Struct, frozen=True):
     """Which recordings a file is, or a folder holds; answered by `SourcesFound`."""
 
-    path: PathBytes
+    path: Path
     trajectories: bool = False
     """It is an ``.h5`` and is read as ManiSkill's, whatever lies beside it."""
 
 
-class ForRerun(msgspec.Struct, frozen=True, tag=True):
+class ForRerun(msgspec.Struct, frozen=True):
     """What rerun's viewer is told of an ``.rrd``; answered by `ToldRerun`."""
 
-    path: PathBytes
+    path: Path
 
 
 Request = Rows | Open | PictureAt | Forget | Sources | ForRerun
-REQUESTS: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
 
 
-class RowsRead(msgspec.Struct, frozen=True, tag=True):
+class RowsRead(msgspec.Struct, frozen=True):
     facts: list[Facts]
     thumbnails: list[bytes | None]
 
 
 class CameraRead(msgspec.Struct, frozen=True):
     camera: CameraWords
-    frame: ArrayRef
-    pose: ArrayRef
+    frame: NDArray
+    pose: NDArray
     pictures: dict[Modality, int]
     """How many of each there are."""
 
@@ -87,67 +100,43 @@ class ShapeRead(msgspec.Struct, frozen=True):
     """A mesh and a material that were not sent before."""
 
     number: int
-    vertices: ArrayRef
-    faces: ArrayRef
-    normals: ArrayRef | None
-    uvs: ArrayRef | None
-    base_color: tuple[float, float, float, float]
-    metallic: float
-    roughness: float
-    texture: ArrayRef | None
+    mesh: Mesh
+    material: Material
 
 
 class VisualRead(msgspec.Struct, frozen=True):
     name: str
     shape: int
-    bodies: ArrayRef
+    bodies: NDArray
 
 
-class GeometryRead(msgspec.Struct, frozen=True):
-    scene: SceneWords
+class EpisodeRead(msgspec.Struct, frozen=True):
+    opened: int
+    source_path: str | None
+    """Where the task's own file may be, as the recording says."""
+    episode: Episode
+    """Without its cameras, and without the visuals of its scene."""
+    cameras: list[CameraRead]
     shapes: list[ShapeRead]
     visuals: list[VisualRead]
 
 
-class EpisodeRead(msgspec.Struct, frozen=True, tag=True):
-    opened: int
-    info: EpisodeInfo
-    source_path: str | None
-    """Where the task's own file may be, as the recording says."""
-    geometry: GeometryRead | None
-    segmentation: dict[int, str]
-    poses: ArrayRef | None
-    action: ArrayRef
-    action_names: list[str]
-    reward: ArrayRef
-    terminated: ArrayRef
-    truncated: ArrayRef
-    evaluate: dict[str, ArrayRef]
-    cameras: list[CameraRead]
-    env_states: dict[str, ArrayRef]
-    obs: dict[str, ArrayRef]
-    batch: dict[str, ArrayRef]
-    texts: TracksWords
-    unread: list[Unread]
+class PictureRead(msgspec.Struct, frozen=True):
+    array: NDArray | None = None
+    blob: bytes | None = None
 
 
-class PictureRead(msgspec.Struct, frozen=True, tag=True):
-    array: ArrayRef | None
-    blob: bytes | None
+class SourcesFound(msgspec.Struct, frozen=True):
+    sources: list[Source]
 
 
-class SourcesFound(msgspec.Struct, frozen=True, tag=True):
-    sources: list[tuple[PathBytes, str | None, str, str]]
-    """Path, part, id and name of each."""
-
-
-class ToldRerun(msgspec.Struct, frozen=True, tag=True):
+class ToldRerun(msgspec.Struct, frozen=True):
     store: str | None
     """What it calls the recording."""
     blueprint: bytes | None
 
 
-class Failed(msgspec.Struct, frozen=True, tag=True):
+class Failed(msgspec.Struct, frozen=True):
     """It cannot be had."""
 
     why: Literal["unreadable", "system", "gone"]
@@ -156,4 +145,3 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
 
 
 Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | ToldRerun | Failed
-ANSWERS: msgspec.msgpack.Decoder[Answer] = msgspec.msgpack.Decoder(Answer)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
-import socket
 from collections import OrderedDict
+from multiprocessing.connection import Connection
+from typing import Literal, get_args
 
-from workbench.recording.encoded_pictures import MODALITIES, EncodedPictures
-from workbench.recording.episode import CameraTrack, Episode
+from workbench.jobs.wire import Unpacker, pack_message
+from workbench.recording.encoded_pictures import EncodedPictures
+from workbench.recording.episode import CameraTrack
 from workbench.recording.library_read import read_found
 from workbench.recording.library_row import text
 from workbench.recording.library_scan import found_of
 from workbench.recording.reader.episode_wire import SentShapes, packed
 from workbench.recording.reader.requests import (
-    REQUESTS,
     Answer,
+    EpisodeRead,
     Failed,
     Forget,
     ForRerun,
@@ -28,8 +30,7 @@ from workbench.recording.reader.requests import (
     SourcesFound,
     ToldRerun,
 )
-from workbench.recording.reader.wire import ArrayPacker, Closed, bytes_of, path_of, receive, send
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.sources import Source, UnreadableRecording
 
 MOST_SHARED = 4
 """Groups of episodes whose shapes are remembered."""
@@ -43,17 +44,17 @@ def warm_up() -> None:
     import workbench.recording.read_episode  # noqa: F401
 
 
-def serve(connection: socket.socket) -> None:
+def serve(connection: Connection) -> None:
     """Answer one request after the other, until nobody asks any more."""
-    reader = _Reader()
+    reader, unpacker = _Reader(), Unpacker(get_args(Request))
     while True:
         try:
-            wanted, _ = receive(connection, REQUESTS)
+            wanted = unpacker.message(connection.recv_bytes())
             if isinstance(wanted, Forget):
                 reader.forget(wanted.opened)
                 continue
-            send(connection, *reader.answer(wanted))
-        except Closed:
+            connection.send_bytes(reader.answer(wanted))
+        except (EOFError, OSError):
             return
 
 
@@ -67,38 +68,40 @@ class _Reader:
         for number in opened:
             self._opened.pop(number, None)
 
-    def answer(self, wanted: Request) -> tuple[Answer, ArrayPacker | None]:
+    def answer(self, wanted: Request) -> bytes:
+        """Packed, which a reader may have no memory for either."""
         try:
-            return self._answer(wanted)
+            return pack_message(self._answer(wanted))
         except UnreadableRecording as error:
-            return _failed("unreadable", str(error)), None
+            failed = _failed("unreadable", str(error))
         except MemoryError:
-            return _failed("unreadable", "To read it takes more memory than a recording may take."), None
+            failed = _failed("unreadable", "To read it takes more memory than a recording may take.")
         except OSError as error:
-            return _failed("system", str(error)), None
+            failed = _failed("system", str(error))
         except Exception as error:
             # Files of strangers: what they can be wrong in has no end, and the next one is to be read too.
-            return _failed("unreadable", f"It cannot be read ({type(error).__name__}: {error})."), None
+            failed = _failed("unreadable", f"It cannot be read ({type(error).__name__}: {error}).")
         except BaseException as error:
             if type(error).__name__ != "PanicException":  # of rerun's reader, which is Rust
                 raise
-            return _failed("unreadable", f"It cannot be read (rerun's reader gave up: {error})."), None
+            failed = _failed("unreadable", f"It cannot be read (rerun's reader gave up: {error}).")
+        return pack_message(failed)
 
-    def _answer(self, wanted: Request) -> tuple[Answer, ArrayPacker | None]:
+    def _answer(self, wanted: Request) -> Answer:
         if isinstance(wanted, Rows):
             found = found_of(os.fsdecode(wanted.key), wanted.signature)
-            entries = read_found(path_of(wanted.folder), found)
-            return RowsRead([facts for facts, _ in entries], [thumbnail for _, thumbnail in entries]), None
+            entries = read_found(wanted.folder, found)
+            return RowsRead([facts for facts, _ in entries], [thumbnail for _, thumbnail in entries])
         if isinstance(wanted, Open):
             return self._open(wanted)
         if isinstance(wanted, PictureAt):
             return self._picture(wanted)
         if isinstance(wanted, Sources):
-            return _sources(wanted), None
+            return _sources(wanted)
         assert isinstance(wanted, ForRerun)
-        return _told_rerun(wanted), None
+        return _told_rerun(wanted)
 
-    def _open(self, wanted: Open) -> tuple[Answer, ArrayPacker | None]:
+    def _open(self, wanted: Open) -> EpisodeRead:
         from workbench.recording.lerobot_read import read_lerobot
         from workbench.recording.read_episode import read_inert, read_maniskill
 
@@ -106,59 +109,50 @@ class _Reader:
         self._shapes.move_to_end(wanted.sharing)
         while len(self._shapes) > MOST_SHARED:
             self._shapes.popitem(last=False)
-        path, source_path = path_of(wanted.path), None
-        episode: Episode
+        source_path = None
         if wanted.kind == "lerobot":
-            episode = read_lerobot(path, int(wanted.part))
+            episode = read_lerobot(wanted.path, int(wanted.part))
         elif wanted.kind == "maniskill":
-            episode = read_maniskill(path, wanted.part)
+            episode = read_maniskill(wanted.path, wanted.part)
         else:
-            episode, source_path = read_inert(path, shapes.shapes)
+            episode, source_path = read_inert(wanted.path, shapes.shapes)
         self._number += 1
-        answer = packed(episode, source_path, self._number, shapes)
         self._opened[self._number] = episode.cameras
-        return answer
+        return packed(episode, source_path, self._number, shapes)
 
-    def _picture(self, wanted: PictureAt) -> tuple[Answer, ArrayPacker | None]:
+    def _picture(self, wanted: PictureAt) -> PictureRead | Failed:
         cameras = self._opened.get(wanted.opened, [])
-        if not 0 <= wanted.camera < len(cameras) or wanted.modality not in MODALITIES:
-            return _failed("gone", "That recording is not open."), None
+        if not 0 <= wanted.camera < len(cameras):
+            return _failed("gone", "That recording is not open.")
         pictures: EncodedPictures | None = getattr(cameras[wanted.camera], wanted.modality)
         if pictures is None or not 0 <= wanted.index < len(pictures):
-            return _failed("unreadable", "There is no such picture."), None
+            return _failed("unreadable", "There is no such picture.")
         if wanted.encoded:
-            return PictureRead(None, pictures.blob(wanted.index)), None
-        arrays = ArrayPacker()
-        return PictureRead(arrays.ref(pictures[wanted.index]), None), arrays
+            return PictureRead(blob=pictures.blob(wanted.index))
+        return PictureRead(pictures[wanted.index])
 
 
 def _sources(wanted: Sources) -> SourcesFound:
     from workbench.recording.read_maniskill import trajectories
     from workbench.recording.source_files import sources_in
-    from workbench.recording.sources import Source
 
-    path = path_of(wanted.path)
     if wanted.trajectories:
-        found = (Source(path, name) for name in trajectories(path))
-    else:
-        found = sources_in(path)
-    return SourcesFound(
-        [(bytes_of(one.path), one.part, text(one.id, 8192), text(one.name, 400)) for one in found]
-    )
+        return SourcesFound([Source(wanted.path, name) for name in trajectories(wanted.path)])
+    return SourcesFound(list(sources_in(wanted.path)))
 
 
 def _told_rerun(wanted: ForRerun) -> ToldRerun:
     from workbench.recording.blueprint_in_file import blueprint_stream
     from workbench.recording.rerun_seam import store_id
 
-    path, found = path_of(wanted.path), []
+    found = []
     for ask in (store_id, blueprint_stream):
         try:
-            found.append(ask(path))
+            found.append(ask(wanted.path))
         except (ValueError, OSError, RuntimeError, AssertionError):
             found.append(None)  # rerun then shows it in an arrangement of its own, from its first moment on
     return ToldRerun(found[0], found[1])
 
 
-def _failed(why: str, words: str) -> Failed:
-    return Failed(why, text(words, LONGEST_WORDS))  # type: ignore[arg-type]
+def _failed(why: Literal["unreadable", "system", "gone"], words: str) -> Failed:
+    return Failed(why, text(words, LONGEST_WORDS))
