@@ -12,8 +12,8 @@ import pytest
 
 from tests.drive.envs import batched
 from workbench.core.camera_frames import axes_of
-from workbench.core.camera_report import CameraReport, join_reports
-from workbench.core.camera_search import SearchSpace, score_of, suggest_cameras
+from workbench.core.camera_report import CameraReport, SearchSpace, join_reports
+from workbench.core.camera_search import score_of, suggest_cameras
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.take_pictures import segmentation_names
 from workbench.core.visibility import Placement, judge_placement, objects_to_see
@@ -101,9 +101,9 @@ def test_what_cannot_be_searched_for_is_refused_by_name(env: Any, objects: Any, 
 
 def test_a_space_that_says_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="below its high"):
-        SearchSpace(("cube",), HIGH, LOW, LENS)
+        SearchSpace(("cube",), HIGH, LOW, LENS).check()
     with pytest.raises(ValueError, match="at least one object"):
-        SearchSpace((), LOW, HIGH, LENS)
+        SearchSpace((), LOW, HIGH, LENS).check()
 
 
 def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_its_picture_upright(

@@ -15,9 +15,11 @@ from tests.session.studio import BASE, camera, moved, said
 from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Run
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
-from workbench.session.camera_writing import CameraWriting, copy, not_as_written, plan
+from workbench.session.camera_writing import copy, not_as_written, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+from workbench.session.studio_cameras import StudioCameras
+from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import Wish, Writing
 from workbench.ui.camera_writing import writing_html
 
@@ -356,18 +358,20 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
         task_file.chmod(0o644)
 
 
-def test_what_was_not_done_is_said_until_something_else_happens() -> None:
+def test_what_was_not_done_is_said_until_something_else_happens(session: Session) -> None:
     key: CameraKey = ("sensor", "base_camera")
     edit = SourceEdit("/author/task.py", "a = 1\n", "a = 2\n", (), None)
     refused = Refusal("task.py was edited since the camera was written into it")
     for stage in ("written", "undone"):
-        writing = CameraWriting()
+        asker = session.studio.file._asker
+        writing = StudioFile(StudioCameras(), lambda: None, lambda *_: None, asker, lambda: None)
         message = f"Not done: {refused.reason}."
         writing.view = Writing(stage, Wish("edit", key, None), edit, refused, message, loading=True)
         writing.failed_to_load()
         assert "does not load" in writing.view.message and writing.view.refusal is None
         html = writing_html(writing.view, stale=False)
         assert "edited since" not in html and "does not load" in html
+        writing.close()
 
 
 def test_what_is_not_as_written_is_said_with_both_numbers() -> None:

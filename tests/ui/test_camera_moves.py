@@ -16,8 +16,8 @@ from workbench.core.camera_frames import (
     intrinsic_of,
     make_pose,
     normalised,
+    opencv_extrinsic,
     pose_from_look_at,
-    project,
     quaternion_from_rpy,
     rpy_of,
     with_pose,
@@ -143,9 +143,11 @@ def test_a_narrow_view_opens_until_the_whole_picture_is_in_it() -> None:
 @given(poses, st.floats(0.1, 2.5))
 def test_corners_of_the_picture_fall_on_its_corners(pose, fov: float) -> None:
     camera = replace(SETTINGS, fov=fov)
-    pixels, depth = project(picture_corners(camera, pose, 0.2), pose, intrinsic_of(camera))
-    np.testing.assert_allclose(pixels, [[0, 0], [64, 0], [64, 48], [0, 48]], atol=1e-6)
-    np.testing.assert_allclose(depth, 0.2)
+    extrinsic = opencv_extrinsic(pose)
+    seen = picture_corners(camera, pose, 0.2) @ extrinsic[:, :3].T + extrinsic[:, 3]
+    pixels = seen @ intrinsic_of(camera).T / seen[:, 2:]
+    np.testing.assert_allclose(pixels[:, :2], [[0, 0], [64, 0], [64, 48], [0, 48]], atol=1e-6)
+    np.testing.assert_allclose(seen[:, 2], 0.2)
 
 
 def test_typing_one_number_keeps_the_others_beyond_their_digits() -> None:

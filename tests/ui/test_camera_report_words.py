@@ -45,7 +45,7 @@ def depth_of(counts: dict[int, int], envs: int, farthest_object: float = 1.5) ->
         rows[:, place] = count
     share = np.full(envs, 0.25, np.float32)
     metres = np.full(envs, farthest_object, np.float32)
-    return DepthReport(rows, share, share, metres, metres + 9, metres)
+    return DepthReport(rows, share, share, metres, metres)
 
 
 def report_of(*objects: ObjectSeen) -> CameraReport:

@@ -26,22 +26,22 @@ def test_from_far_away_it_comes_near_along_the_direction_of_the_view_and_sees_mo
     middle = np.median(things, axis=0)
     (ex, ey, ez), (x, y, z) = (middle + 30 * side).tolist(), middle.tolist()
     seen_from = with_pose(NEW, pose_from_look_at(LookAt((ex, ey, ez), (x, y, z))))
-    found = first_place(seen_from, ("cube",), things)
-    assert found.settings.quaternion == seen_from.quaternion and "from your side at cube" in found.words
-    towards = middle - found.settings.position
-    forward = axes_of(found.settings.quaternion)[0]
+    found, words = first_place(seen_from, ("cube",), things)
+    assert found.quaternion == seen_from.quaternion and "from your side at cube" in words
+    towards = middle - found.position
+    forward = axes_of(found.quaternion)[0]
     assert 0.55 < np.linalg.norm(towards) < 5 and np.allclose(np.cross(forward, towards), 0, atol=1e-3)
     # All but the farthest tenth lie within the cone of its view.
-    away = things - found.settings.position
+    away = things - found.position
     angles = np.arccos(np.clip(away @ forward / np.linalg.norm(away, axis=1), -1, 1))
     assert np.quantile(angles, 0.9, method="lower") < 0.5 * 1.0  # half of its field of view
 
 
 def test_who_looks_from_about_there_is_taken_at_their_word() -> None:
     near = with_pose(NEW, pose_from_look_at(LookAt((0.5, 0.1, 0.4), (0.2, 0.3, 0.0))))
-    assert first_place(near, ("cube",), np.array([[0.0, 0.0, 0.02]])).settings == near
+    assert first_place(near, ("cube",), np.array([[0.0, 0.0, 0.02]]))[0] == near
     far = replace(near, position=(50.0, 0.0, 9.0))
-    assert first_place(far, (), np.zeros((0, 3))).settings == far, "a task without objects"
+    assert first_place(far, (), np.zeros((0, 3)))[0] == far, "a task without objects"
 
 
 def test_neither_robot_nor_what_is_hidden_counts_as_an_object_to_see() -> None:

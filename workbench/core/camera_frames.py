@@ -136,6 +136,13 @@ def axes_of(quaternion: ArrayLike) -> tuple[Floats, Floats, Floats]:
     return r[:, 0], r[:, 1], r[:, 2]
 
 
+def angle_between(a: ArrayLike, b: ArrayLike) -> float:
+    """Radians of the rotation from one orientation (4,) wxyz to the other; q and -q are the same one."""
+    # By the vector part, which keeps its digits where the angle is small.
+    w, *vector = qmult(normalised(a), qconjugate(normalised(b)))
+    return 2 * math.atan2(math.hypot(*vector), abs(w))
+
+
 def quaternion_from_axes(forward: ArrayLike, up: ArrayLike) -> Floats:
     """(4,) wxyz of the camera that looks along `forward` with its top towards `up`.
 
@@ -375,20 +382,6 @@ def matrix3(matrix: ArrayLike) -> Matrix3:
     """A (3, 3) array as `CameraSettings.intrinsic` has it."""
     rows = np.asarray(matrix, np.float64).reshape(3, 3)
     return triple(rows[0]), triple(rows[1]), triple(rows[2])
-
-
-def project(points: ArrayLike, pose: ArrayLike, intrinsic: ArrayLike) -> tuple[Floats, Floats]:
-    """Where points (..., 3) of the pose's frame fall in the picture: pixels (..., 2), and depth (...) in metres.
-
-    Pixels are meaningless, and NaN, where the depth is not positive.
-    """
-    p = _vector(pose, 7, "a pose")
-    r = rotation_matrix(p[3:]) @ _AXES["opencv"]
-    local = (np.asarray(points, np.float64) - p[:3]) @ r
-    depth = local[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = (local @ checked_intrinsic(intrinsic).T)[..., :2] / depth[..., None]
-    return np.where(depth[..., None] > 0, pixels, np.nan), depth
 
 
 # --- small parts -------------------------------------------------------------------------------------------------

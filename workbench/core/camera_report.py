@@ -15,7 +15,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_frames import intrinsic_of
+from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings
 from workbench.core.pictures import Picture
 
 DEPTH_EDGES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
@@ -84,16 +85,12 @@ class ObjectSeen:
     @property
     def hidden_share(self) -> NDArray[np.float32]:
         """(E,) how much of it the robot covers; NaN where it would not be seen without the robot either."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = 1 - self.pixels / self.unhindered
-        return np.where(self.unhindered > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
+        return _share_lost(self.pixels, self.unhindered)
 
     @property
     def covered_share(self) -> NDArray[np.float32]:
         """(E,) how much of it other things than the robot cover; NaN where it is out of the picture."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = 1 - self.unhindered / self.alone
-        return np.where(self.alone > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
+        return _share_lost(self.unhindered, self.alone)
 
     def marks(self) -> NDArray[np.float32]:
         """(E,) 0 where it is not seen, 1 where it is whole, in the open and large enough; NaN where it is absent.
@@ -135,8 +132,6 @@ class DepthReport:
     """(E,) share that lies farther away than everything that counts (robot and objects): far floor and walls."""
     nearest: NDArray[np.float32]
     """(E,) metres; NaN where the picture is all background."""
-    farthest: NDArray[np.float32]
-    """(E,) metres, of anything; NaN likewise."""
     farthest_object: NDArray[np.float32]
     """(E,) metres, of robot and objects that are no scenery; NaN where none of them is seen."""
 
@@ -200,6 +195,42 @@ class CameraReport:
             there = ", ".join(thing.name for thing in self.objects) or "none"
             raise ValueError(f"there is no object {', '.join(unknown)}; there are: {there}")
         return tuple(thing for thing in self.objects if thing.name in wanted)
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """What is looked for, and where."""
+
+    objects: tuple[str, ...]
+    """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
+    low: tuple[float, float, float]
+    """Of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
+    high: tuple[float, float, float]
+    lens: CameraSettings
+    """Everything of the camera but its pose; of that, where it is mounted, which way its picture is up."""
+    kind: CameraKind = "sensor"
+    candidates: int = 100
+    """Placements that the first round draws."""
+    best: int = 5
+    """Placements that are offered at most."""
+    apart: float | None = None
+    """Metres between the eyes of two that are offered; None for a seventh of the box's diagonal."""
+    seed: int = 0
+    mount: str | None = None
+    """Name of the body that the camera rides on."""
+
+    def check(self) -> None:
+        """Raises ValueError where nothing can be looked for like that."""
+        box = np.array([self.low, self.high], np.float64)
+        if not np.isfinite(box).all() or (box[0] > box[1]).any():
+            raise ValueError(
+                f"the box for the eye goes from {self.low} to {self.high}: each low must be below its high"
+            )
+        if not self.objects:
+            raise ValueError("name at least one object that must be seen")
+        if self.candidates < 1 or self.best < 1:
+            raise ValueError("a search draws at least one placement and offers at least one")
+        intrinsic_of(self.lens)
 
 
 @dataclass(frozen=True)
@@ -276,6 +307,12 @@ def in_words(report: CameraReport, objects: tuple[str, ...]) -> str:
             words += f", {all_envs.hidden:.0%} behind the robot"
         told.append(words)
     return "; ".join(told)
+
+
+def _share_lost(left: NDArray[np.float32], whole: NDArray[np.float32]) -> NDArray[np.float32]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = 1 - left / whole
+    return np.where(whole > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
 
 
 def _least(values: NDArray[np.float32]) -> float | None:

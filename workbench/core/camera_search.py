@@ -15,7 +15,7 @@ since five neighbours are one suggestion. For a seed the search is the same ever
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,15 +25,14 @@ from workbench.core.camera_frames import (
     LookAt,
     axes_of,
     compose,
-    intrinsic_of,
     pose_from_look_at,
     quaternion_from_axes,
     rotation_matrix,
     triple,
     with_pose,
 )
-from workbench.core.camera_report import CameraReport, OfferedPlacement, in_words, join_reports
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_report import CameraReport, OfferedPlacement, SearchSpace, in_words, join_reports
+from workbench.core.camera_settings import CameraKey
 from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraKind
 from workbench.core.scene_index import SceneIndex, read_poses, scene_index
@@ -66,41 +65,6 @@ TRIES = 50
 """To find an eye clear of the robot; a box that lies within it is searched all the same."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
-
-
-@dataclass(frozen=True)
-class SearchSpace:
-    """What is looked for, and where."""
-
-    objects: tuple[str, ...]
-    """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
-    low: tuple[float, float, float]
-    """Of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
-    high: tuple[float, float, float]
-    lens: CameraSettings
-    """Everything of the camera but its pose; of that, where it is mounted, which way its picture is up."""
-    kind: CameraKind = "sensor"
-    candidates: int = 100
-    """Placements that the first round draws."""
-    best: int = 5
-    """Placements that are offered at most."""
-    apart: float | None = None
-    """Metres between the eyes of two that are offered; None for a seventh of the box's diagonal."""
-    seed: int = 0
-    mount: str | None = None
-    """Name of the body that the camera rides on."""
-
-    def __post_init__(self) -> None:
-        box = np.array([self.low, self.high], np.float64)
-        if not np.isfinite(box).all() or (box[0] > box[1]).any():
-            raise ValueError(
-                f"the box for the eye goes from {self.low} to {self.high}: each low must be below its high"
-            )
-        if not self.objects:
-            raise ValueError("name at least one object that must be seen")
-        if self.candidates < 1 or self.best < 1:
-            raise ValueError("a search draws at least one placement and offers at least one")
-        intrinsic_of(self.lens)
 
 
 def suggest_cameras(
@@ -157,6 +121,7 @@ class _Search:
         progress: Callable[[int, int], None],
         cancelled: Callable[[], bool],
     ) -> None:
+        space.check()
         if not envs:
             raise ValueError("no env is named to search in")
         for e in envs:

@@ -77,6 +77,7 @@ def _alike(a: Any, b: Any, close: float) -> bool:
     return a == b
 
 
+NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 MOST_PIXELS = 4096
 """On a side; a typing mistake of a digit more would take the memory of all envs."""
 

@@ -25,7 +25,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from workbench.core import seams
 from workbench.core.camera_frames import matrix3, triple
-from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
+from workbench.core.camera_settings import NOT_ON_THE_GPU, CameraKey, CameraSettings, why_no_camera
 
 
 @dataclass
@@ -96,9 +96,7 @@ def _camera(env: Any, key: CameraKey) -> Any:
     if not seams.camera_components(camera):
         raise ValueError(f"{name!r} is no plain camera, and only those can be placed")
     if env.scene.gpu_sim_enabled and seams.batched_system(env.scene) is None:
-        raise ValueError(
-            "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
-        )
+        raise ValueError(NOT_ON_THE_GPU)
     return camera
 
 

@@ -357,7 +357,6 @@ def _depths(
         # Where nothing counts is in view, all of it is room.
         beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
         nearest=_one(far.min() if len(far) else np.nan),
-        farthest=_one(far.max() if len(far) else np.nan),
         farthest_object=_one(limit),
     )
 

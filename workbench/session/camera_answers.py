@@ -19,7 +19,7 @@ from workbench.authoring.source.read_values import module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import seams
 from workbench.core.camera_report import CameraReport, OfferedPlacement
-from workbench.core.camera_search import SearchSpace, suggest_cameras
+from workbench.core.camera_search import suggest_cameras
 from workbench.core.exchange import put_class, undone
 from workbench.core.pictures import Picture
 from workbench.core.place_camera import PlacedCameras
@@ -102,15 +102,10 @@ def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> P
 
 
 def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
-    info = opened.description.camera(question.key)
-    width, height = (128, 128) if info is None else (info.width, info.height)
-    if question.settings is not None:
-        width, height = question.settings.width, question.settings.height
-    size = small_size(width, height, JUDGED_SIDE)
-    env = opened.env.env
-    return judge_camera(
-        env, question.key, question.env, settings=question.settings, size=size, poses=question.poses
-    )
+    key, settings = question.key, question.settings
+    own = settings or opened.description.camera(key)
+    size = None if own is None else small_size(own.width, own.height, JUDGED_SIDE)
+    return judge_camera(opened.env.env, key, question.env, settings=settings, size=size, poses=question.poses)
 
 
 def _suggested(
@@ -120,7 +115,6 @@ def _suggested(
     cancelled: Callable[[], bool],
 ) -> tuple[OfferedPlacement, ...]:
     told = 0.0
-    info = opened.description.camera(question.key)
 
     def progress(done: int, total: int) -> None:
         nonlocal told
@@ -129,18 +123,7 @@ def _suggested(
             tell(done, total)
 
     return suggest_cameras(
-        opened.env.env,
-        SearchSpace(
-            question.objects,
-            question.low,
-            question.high,
-            question.settings,
-            question.key[0],
-            mount=None if info is None else info.mount,
-        ),
-        question.envs,
-        progress=progress,
-        cancelled=cancelled,
+        opened.env.env, question.space, question.envs, progress=progress, cancelled=cancelled
     )
 
 

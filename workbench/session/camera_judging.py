@@ -10,45 +10,35 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_frames import compose
-from workbench.core.camera_report import CameraReport, join_reports
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_report import CameraReport, SearchSpace, join_reports
+from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
-from workbench.session.history import Lived
+from workbench.session.history import ShownMoment
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, Reset
 from workbench.session.questions import DrawCamera, JudgeCamera, SuggestCameras
-from workbench.session.studio_view import JudgedMoment, Looked, Picked, Progress
+from workbench.session.studio_cameras import StudioCameras
+from workbench.session.studio_view import JudgedMoment, Looked, Picked, Progress, StudioCamera
+from workbench.session.timeline import TimeTravel
 
 FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
 MOST_ENVS = 16
 """In the background: more are made of these by resetting them again."""
+MOST_SEEDS = 1000
+MOST_STEPS = 1000
 _TELL_EVERY = 8
 """Steps after which what is known so far is shown."""
 
 
-@dataclass(frozen=True)
-class ShownMoment:
-    """What the page shows."""
-
-    env: int
-    """The selected one."""
-    num_envs: int
-    poses: NDArray[np.float32] | None
-    """(N, B, 7) of a moment of the past; None for now."""
-
-    def of(self, env: int) -> NDArray[np.float32] | None:
-        """(B, 7) of one env."""
-        return None if self.poses is None else self.poses[env]
-
-
+Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, JudgedMoment | None]
 """Where a camera is judged: the env; (B, 7) its bodies, None for now; which moment of the past that is."""
 
@@ -56,13 +46,23 @@ Case = tuple[int, NDArray[np.float32] | None, JudgedMoment | None]
 class CameraJudging:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, asker: Asker, background: Background, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        cameras: StudioCameras,
+        asker: Asker,
+        background: Background,
+        on_change: Callable[[], None],
+        past: TimeTravel,
+        load: Callable[[], Load | None],
+    ) -> None:
         """
         Args:
             asker, background: ask the worker that plays, and the one in the background.
             on_change: called, on any thread, when there is something new.
+            past: says which moment the page shows.
+            load: how another worker gets the version that runs; None before there is one.
         """
-        self._on_change = on_change
+        self._cameras, self._past, self._load, self._on_change = cameras, past, load, on_change
         self._lock = threading.Lock()
         self._looked = Looked()
         self._live, self._background = asker, background
@@ -82,34 +82,47 @@ class CameraJudging:
 
     # --- jobs ------------------------------------------------------------------------------------------
 
-    def judge(self, key: CameraKey, now: CameraSettings | None, moment: ShownMoment) -> None:
-        """Judge a camera as it stands, in all envs, at the shown moment."""
-        cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
-        self._judge_live(f"judging {key[1]} in all envs", key, now, cases, len(cases))
+    def judge(self, key: CameraKey, seeds: int = 0) -> None:
+        """Judge a camera as it is placed over all envs.
 
-    def judge_steps(self, key: CameraKey, now: CameraSettings | None, moments: Sequence[Lived]) -> None:
-        """Judge a camera as it stands at moments of the past; what is known so far can be seen all the while."""
-        cases: list[Case] = [
-            (env, step.poses[env], JudgedMoment(moment.serial, env, int(step.elapsed_steps[env])))
-            for moment, env in moments
-            for step in [moment.step]
-        ]
-        self._judge_live(f"judging {key[1]} over {len(moments)} steps", key, now, cases, _TELL_EVERY)
+        Args:
+            seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background; what is
+                known so far can be seen all the while.
+        """
+        camera = self._asked_for(key)
+        if camera is not None and seeds <= 0:
+            moment = self._past.shown_moment()
+            cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
+            self._judge_live(f"judging {key[1]} in all envs", camera, cases, len(cases))
+        elif camera is not None and (load := self._load()) is not None:
+            self._judge_seeds(camera, load, min(seeds, MOST_SEEDS))
 
-    def _judge_live(
-        self, what: str, key: CameraKey, now: CameraSettings | None, cases: Sequence[Case], every: int
-    ) -> None:
+    def judge_steps(self, key: CameraKey, most: int = MOST_STEPS) -> None:
+        """Judge a camera as it is placed over the steps of the episode that the selected env is in; what is known so far
+        can be seen all the while.
+
+        Args:
+            most: how many of them, evenly spread.
+        """
+        camera = self._asked_for(key)
+        moments = self._past.episode_moments(min(max(1, most), MOST_STEPS))
+        if camera is not None and moments:
+            cases: list[Case] = [
+                (env, step.poses[env], JudgedMoment(moment.serial, env, int(step.elapsed_steps[env])))
+                for moment, env in moments
+                for step in [moment.step]
+            ]
+            self._judge_live(f"judging {key[1]} over {len(moments)} steps", camera, cases, _TELL_EVERY)
+
+    def _judge_live(self, what: str, camera: StudioCamera, cases: Sequence[Case], every: int) -> None:
         def work(job: Job) -> None:
             with self._judging_anew():
-                self._judge(job, self._live, JudgeCamera(key, None, 0), now, cases, len(cases), every)
+                question = JudgeCamera(camera.key, None, 0)
+                self._judge(job, self._live, question, camera.now, cases, len(cases), every)
 
         self._live_lane.start(what, work)
 
-    def judge_seeds(
-        self, key: CameraKey, now: CameraSettings | None, moved: bool, load: Load, seeds: int
-    ) -> None:
-        """Judge a camera over so many fresh episodes; what is known so far can be seen all the while."""
-
+    def _judge_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
         def work(job: Job) -> None:
             with self._judging_anew(), self._background.turn(job):
                 num_envs = self._background.ensure(job, _for_judging(load))
@@ -120,10 +133,10 @@ class CameraJudging:
                             self._background.ask(job.check, Reset(None, FIRST_SEED + seed))
                         yield seed % num_envs, None, None
 
-                question = JudgeCamera(key, now if moved else None, 0)
-                self._judge(job, self._background, question, now, cases(), seeds, num_envs, fresh=True)
+                question = JudgeCamera(camera.key, camera.now if camera.moved else None, 0)
+                self._judge(job, self._background, question, camera.now, cases(), seeds, num_envs, fresh=True)
 
-        self._background_lane.start(f"judging {key[1]} over {seeds} seeds", work)
+        self._background_lane.start(f"judging {camera.key[1]} over {seeds} seeds", work)
 
     def _judge(
         self,
@@ -160,17 +173,21 @@ class CameraJudging:
                     judging=False,
                 )
 
-    def suggest(
-        self,
-        key: CameraKey,
-        lens: CameraSettings,
-        objects: tuple[str, ...],
-        low: tuple[float, float, float],
-        high: tuple[float, float, float],
-        load: Load,
-        seeds: int,
-    ) -> None:
-        """Search placements over so many fresh episodes, or as many as there are envs."""
+    def suggest(self, key: CameraKey, objects: Sequence[str], low: Triple, high: Triple, seeds: int) -> None:
+        """Search placements that see these objects over so many fresh episodes, or as many as there are envs.
+
+        Args:
+            objects: names of objects, or of single links of them (``TaskDescription.objects``).
+            low, high: corners of the box for the eye; metres, in the frame of the camera's mount, or the env's.
+        """
+        camera = self._asked_for(key)
+        load = self._load()
+        if camera is not None and camera.now is None:
+            self._say(f"{key[1]} cannot be placed: {camera.refused}.")
+        if camera is None or camera.now is None or load is None:
+            return
+        space = SearchSpace(tuple(objects), low, high, camera.now, key[0], mount=camera.info.mount)
+        what = f"searching places for {key[1]}"
 
         def work(job: Job) -> None:
             self._know(suggestions=(), suggestions_of=key)
@@ -178,35 +195,40 @@ class CameraJudging:
                 num_envs = self._background.ensure(job, _for_judging(load))
                 self._background.ask(job.check, Reset(None, FIRST_SEED))
                 envs = tuple(range(min(max(1, seeds), num_envs)))
-                what = f"searching places for {key[1]}"
                 job.tell(0, 0, what)
-                question = SuggestCameras(key, lens, objects, low, high, envs)
                 found = self._background.ask(
-                    job.check, question, lambda done, total, part: job.tell(done, total, what)
+                    job.check,
+                    SuggestCameras(space, envs),
+                    lambda done, total, part: job.tell(done, total, what),
                 )
             problem = "" if found else f"no place in that box sees {' and '.join(objects)} in any env."
             self._know(suggestions=found, problem=problem)
 
-        self._background_lane.start(f"searching places for {key[1]}", work)
+        self._background_lane.start(what, work)
 
-    def compare(self, key: CameraKey, other: CameraSettings, moment: ShownMoment) -> None:
-        """Two pictures of the shown moment."""
+    def compare(self, key: CameraKey, other: CameraSettings) -> None:
+        """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
+        with self._cameras.lock:
+            why_not = self._cameras.refusal(key) or why_no_camera(other)
+        moment = self._past.shown_moment()
 
         def work(job: Job) -> None:
             pair = [self._draw(job, key, settings, moment.env, moment) for settings in (None, other)]
             self._know(compared=(pair[0], pair[1]))
 
-        self._live_lane.start(f"comparing two placements of {key[1]}", work)
+        if not why_not:
+            self._live_lane.start(f"comparing two placements of {key[1]}", work)
+        self._say(f"{key[1]} is not compared: {why_not}." if why_not else "")
 
-    def make_sheet(self, key: CameraKey, moment: ShownMoment) -> None:
-        """A picture of every env, as they come."""
-        looked = self.looked
-        order: tuple[int, ...] = tuple(range(moment.num_envs))
-        known = (looked.report_of, looked.report_seeds, looked.report_moments)
-        if looked.report is not None and known == (key, 0, ()):
-            judged = [looked.report.envs[i] for i in looked.report.worst_first()]
-            if sorted(judged) == list(order):
-                order = tuple(judged)
+    def make_sheet(self, key: CameraKey) -> None:
+        """The pictures of all envs by one camera, as they come; worst first if it was judged over them."""
+        if self._asked_for(key) is None:
+            return
+        moment, report = self._past.shown_moment(), self.looked.report_over_envs(key)
+        order = list(range(moment.num_envs))
+        if report is not None:
+            judged = [report.envs[i] for i in report.worst_first()]
+            order = judged if sorted(judged) == order else order
 
         def work(job: Job) -> None:
             self._know(sheet=())
@@ -217,12 +239,17 @@ class CameraJudging:
 
         self._live_lane.start(f"taking pictures by {key[1]} of all envs", work)
 
-    def pick(self, info: CameraInfo, u: float, v: float, moment: ShownMoment, names: dict[int, str]) -> None:
-        """What is at a place of the picture."""
+    def pick(self, key: CameraKey, u: float, v: float) -> None:
+        """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
+        with self._cameras.lock:
+            info, task = self._cameras.info(key), self._cameras.task
+        if info is None or task is None:
+            return
+        moment = self._past.shown_moment()
 
         def work(job: Job) -> None:
-            picture = self._draw(job, info.key, None, moment.env, moment, ("depth", "segmentation"))
-            self._know(picked=picked(info, picture, u, v, names))
+            picture = self._draw(job, key, None, moment.env, moment, ("depth", "segmentation"))
+            self._know(picked=picked(info, picture, u, v, task.segmentation))
 
         self._live_lane.start("looking closely", work)
 
@@ -245,6 +272,17 @@ class CameraJudging:
         self._background_lane.close()
 
     # --- small things ------------------------------------------------------------------------------------
+
+    def _asked_for(self, key: CameraKey) -> StudioCamera | None:
+        with self._cameras.lock:
+            camera = self._cameras.asked_for(key)
+        self._on_change()
+        return camera
+
+    def _say(self, problem: str) -> None:
+        with self._cameras.lock:
+            self._cameras.problem = problem
+        self._on_change()
 
     def _draw(
         self,

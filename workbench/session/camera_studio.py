@@ -6,39 +6,142 @@ A placement is known in three places: here (with its undo), in the worker's live
 author's file. What is here counts: after every version that comes in the worker is told again, so that neither a
 reload nor the end of a worker moves a camera. What is in the file counts more, when the author changed it there.
 
-Here is how a camera comes to stand somewhere, and what is asked about it there; the way into the file is `file`.
+A camera's picture may also be taken for a look only, by a camera beside the env's with the same lens
+(`core.temporary_camera`): one of 1280 x 720 takes long to draw where there is no GPU, one of 64 x 64 shows a person
+little, and giving the env's camera another size would change the observation that the task and a policy get. And one that
+is about to be added is not there yet, while whether it stands well is seen in its picture alone.
+
+Here is how a camera comes to stand somewhere; what is asked about it there is `judging`, the way into the file `file`.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from workbench.core.camera_frames import Convention, Direction, with_pose
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.authoring import camera_files
+from workbench.core.camera_frames import Convention, Direction, relative_to, with_pose
 from workbench.core.camera_settings import (
     CameraKey,
     CameraSettings,
     differences,
     why_no_camera,
 )
+from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging
+from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
-from workbench.session.placements import Step
-from workbench.session.preview import IN_A_QUICK_LOOK, Preview, Sight
-from workbench.session.studio_cameras import StudioCameras, exported, imported
+from workbench.session.questions import DrawCamera
+from workbench.session.studio_cameras import Step, StudioCameras
 from workbench.session.studio_file import StudioFile
-from workbench.session.studio_view import StudioCamera, StudioView, Wish
+from workbench.session.studio_view import StudioView, Wish
 from workbench.session.timeline import TimeTravel
 from workbench.session.versions import Versions
 
-MOST_SEEDS = 1000
-MOST_STEPS = 1000
 _LARGEST = 256
 """Pixels of the shorter side of a new camera's picture, before it is written."""
+
+
+IN_A_QUICK_LOOK = ("rgb", "depth", "segmentation")
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What would be looked at."""
+
+    key: CameraKey
+    settings: CameraSettings
+    env: int
+    step: StepResult | None = field(compare=False)
+    scale: float
+    """Of the picture's sides against the camera's own."""
+
+    def same(self, other: Sight | None) -> bool:
+        return other is not None and self.step is other.step and self == other
+
+
+class Preview:
+    """One look at a time; a new one takes the place of the one before. Thread-safe; every method returns at once."""
+
+    def __init__(
+        self,
+        asker: Asker,
+        on_change: Callable[[], None],
+        failing: str,
+        modalities: tuple[str, ...] = ("rgb",),
+    ) -> None:
+        """
+        Args:
+            failing: how the sentence begins that says why there is no picture.
+            modalities: that the picture has, whatever the camera's own shader gives.
+        """
+        self._asker, self._failing, self._modalities = asker, failing, modalities
+        self._lock = threading.Lock()
+        self._lane = Lane("studio-preview", on_change, self._failed)
+        self._asked: Sight | None = None
+        self._picture: Picture | None = None
+        self._problem = ""
+
+    @property
+    def problem(self) -> str:
+        """Why the last look failed, as a sentence."""
+        with self._lock:
+            return self._problem
+
+    def picture(self, key: CameraKey | None, env: int | None = None) -> Picture | None:
+        """The last look, if it was by this camera, and in this env if one is named."""
+        with self._lock:
+            found = self._picture
+        if found is None or (found.kind, found.camera) != key or env not in (None, found.env):
+            return None
+        return found
+
+    def wants(self, sight: Sight) -> bool:
+        """Whether this is to be looked at and was not yet, and nothing else is being looked at."""
+        with self._lock:
+            return self._lane.progress is None and not sight.same(self._asked)
+
+    def look(self, sight: Sight, poses: NDArray[np.float32] | None) -> None:
+        """
+        Args:
+            poses: (B, 7) of the env's bodies at a moment of the past; None for now.
+        """
+        question = DrawCamera(sight.key, sight.settings, sight.env, self._modalities, poses, sight.scale)
+
+        def work(job: Job) -> None:
+            picture = self._asker.ask(job.check, question)
+            with self._lock:
+                self._picture = picture
+
+        with self._lock:
+            self._asked, self._problem = sight, ""
+        self._lane.start("a preview", work)
+
+    def forget(self) -> None:
+        """What was seen is not to be shown any more."""
+        with self._lock:
+            self._asked, self._picture = None, None
+
+    def stop(self) -> None:
+        """The worker is gone, or another version runs: what is under way is not answered any more."""
+        self._lane.stop()
+        with self._lock:
+            self._asked = None
+
+    def close(self) -> None:
+        self._lane.close()
+
+    def _failed(self, job: Job, failure: JobFailed) -> None:
+        """The last picture stays; the next change looks again."""
+        with self._lock:
+            self._problem = f"{self._failing}: {failure}."
 
 
 class CameraStudio:
@@ -62,14 +165,14 @@ class CameraStudio:
             versions: say how another worker gets the version that runs, and open another file.
         """
         self._send, self._on_change = send, on_change
-        self._shown, self._episode, self._load = past.shown_moment, past.episode_moments, versions.same_again
-        self._cameras = StudioCameras()
+        self._shown = past.shown_moment
+        self._cameras, load = StudioCameras(), versions.same_again
         self._lock = self._cameras.lock
-        self.file = StudioFile(self._cameras, self._note, versions.open_file, asker, self._load)
+        self.file = StudioFile(self._cameras, self._note, versions.open_file, asker, load)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
-        self._judging = CameraJudging(asker, background, self._note)
+        self.judging = CameraJudging(self._cameras, asker, background, self._note, past, load)
         self._quick = Preview(asker, self._note, "The quick look failed", IN_A_QUICK_LOOK)
         self._quick_scale = 1.0
         self._first = Preview(asker, self._note, "There is no picture of the new camera")
@@ -128,63 +231,9 @@ class CameraStudio:
             self._first.forget()
             self._first.look(sight, moment.of(moment.env))
 
-    # --- judged ----------------------------------------------------------------------------------------
-
-    def judge(self, key: CameraKey, seeds: int = 0) -> None:
-        """Judge a camera as it is placed over all envs.
-
-        Args:
-            seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background.
-        """
-        camera = self._asked_for(key)
-        if camera is not None and seeds <= 0:
-            self._judging.judge(key, camera.now, self._shown())
-        elif camera is not None and (load := self._load()) is not None:
-            self._judging.judge_seeds(key, camera.now, camera.moved, load, min(seeds, MOST_SEEDS))
-
-    def _asked_for(self, key: CameraKey) -> StudioCamera | None:
-        with self._lock:
-            camera = self._cameras.asked_for(key)
-        self._note()
-        return camera
-
-    def judge_steps(self, key: CameraKey, most: int = MOST_STEPS) -> None:
-        """Judge a camera as it is placed over the steps of the episode that the selected env is in.
-
-        Args:
-            most: how many of them, evenly spread.
-        """
-        camera = self._asked_for(key)
-        if camera is not None and (moments := self._episode(min(max(1, most), MOST_STEPS))):
-            self._judging.judge_steps(key, camera.now, moments)
-
-    def suggest(
-        self,
-        key: CameraKey,
-        objects: Sequence[str],
-        low: tuple[float, float, float],
-        high: tuple[float, float, float],
-        seeds: int,
-    ) -> None:
-        """Search placements that see these objects over so many seeds, with the eye between two corners.
-
-        Args:
-            objects: names of objects, or of single links of them (``TaskDescription.objects``).
-            low, high: metres, in the frame of the camera's mount, or the env's if it has none.
-        """
-        camera = self._asked_for(key)
-        if camera is None:
-            return
-        if camera.now is None:
-            with self._lock:
-                self._cameras.problem = f"{key[1]} cannot be placed: {camera.refused}."
-            self._note()
-        elif (load := self._load()) is not None:
-            self._judging.suggest(key, camera.now, tuple(objects), low, high, load, seeds)
-
     def take_suggestion(self, index: int) -> None:
         """Place the camera as suggested."""
-        looked = self._judging.looked
+        looked = self.judging.looked
         key = looked.suggestions_of
         if key is None or not 0 <= index < len(looked.suggestions):
             return
@@ -193,24 +242,6 @@ class CameraStudio:
             now = self._cameras.placements.now(key)
         if now is not None:
             self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
-
-    def stop(self) -> None:
-        """Stop whatever runs in the background; what is known stays."""
-        self._judging.stop()
-
-    def compare(self, key: CameraKey, other: CameraSettings) -> None:
-        """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
-        with self._lock:
-            why_not = self._cameras.refusal(key) or why_no_camera(other)
-            self._cameras.problem = f"{key[1]} is not compared: {why_not}." if why_not else ""
-        if not why_not:
-            self._judging.compare(key, other, self._shown())
-        self._note()
-
-    def make_sheet(self, key: CameraKey) -> None:
-        """The pictures of all envs by one camera, worst first if it was judged over them."""
-        if self._asked_for(key) is not None:
-            self._judging.make_sheet(key, self._shown())
 
     def set_quick_scale(self, scale: float) -> None:
         """Look through the chosen camera in a picture of so much of its own size; 1 for that itself. Never written."""
@@ -234,13 +265,6 @@ class CameraStudio:
         step, env = self._cameras.drawn
         return Sight(key, now, env, step, self._quick_scale)
 
-    def pick(self, key: CameraKey, u: float, v: float) -> None:
-        """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
-        with self._lock:
-            info, task = self._cameras.info(key), self._cameras.task
-        if info is not None and task is not None:
-            self._judging.pick(info, u, v, self._shown(), task.segmentation)
-
     # --- in other words --------------------------------------------------------------------------------
 
     def export(self, keys: Sequence[CameraKey], form: Literal["json", "opencv", "ros"]) -> str:
@@ -253,7 +277,10 @@ class CameraStudio:
         """
         with self._lock:
             cameras = [self._cameras.to_export(key) for key in keys]
-        return exported(cameras, form)
+        if form == "ros":
+            return "---\n".join(camera_files.camera_as_ros_yaml(camera) for camera in cameras)
+        write = camera_files.cameras_as_json if form == "json" else camera_files.cameras_as_opencv_yaml
+        return write(cameras)
 
     def import_pose(
         self,
@@ -275,7 +302,16 @@ class CameraStudio:
             mount = None if info is None else self._cameras.mount_pose(info)
         if now is None or info is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
-        pose = imported(info, mount, text, direction, convention, metres_per_unit)
+        found = camera_files.find_poses(text)
+        chosen = [pose for pose in found if info.name in pose.label] or list(found)
+        if len(chosen) > 1:
+            labels = ", ".join(pose.label for pose in chosen)
+            raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
+        pose = camera_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
+        if chosen[0].said is not None and info.mount is not None:
+            if mount is None:
+                raise ValueError(f"where {info.mount} is, on which {info.name} rides, is not known yet")
+            pose = relative_to(mount, pose)  # ours is of the env's frame
         self.place(key, with_pose(now, pose))
 
     # --- what the page reads ---------------------------------------------------------------------------
@@ -286,7 +322,7 @@ class CameraStudio:
             step: of the shown moment.
             env: the selected one.
         """
-        looked, progress = self._judging.looked, self._judging.progress
+        looked, progress = self.judging.looked, self.judging.progress
         with self._lock:
             self._cameras.drawn = step, env
             sight = self._sight()
@@ -340,7 +376,7 @@ class CameraStudio:
                 self._cameras.selected = None
             self._serial += 1
             if level not in ("same", "cameras"):
-                self._judging.outdate()
+                self.judging.outdate()
             # The dropped ones too: their placement may have been on its way while the version came in. And those that
             # were changed here: taken back, one stands as the file says, which a version that is the same does not tell.
             asked = (*self._cameras.placements.all_moved, *dropped, *(own & said.keys()))
@@ -348,7 +384,7 @@ class CameraStudio:
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
-        self._judging.stop()
+        self.judging.stop()
         self._quick.stop()
         self._first.stop()
         self.file.stop()
@@ -384,7 +420,7 @@ class CameraStudio:
 
     def close(self) -> None:
         """Wait for what is being written."""
-        self._judging.close()
+        self.judging.close()
         self._quick.close()
         self._first.close()
         self.file.close()

@@ -10,8 +10,7 @@ this runs on the page's thread, and nothing here is thread-safe.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 
 from workbench.authoring import camera_source
@@ -20,17 +19,12 @@ from workbench.authoring.camera_source.cameras import Run
 from workbench.authoring.camera_source.hooks import HOOK_OF
 from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import read_exactly
-from workbench.authoring.source.text import plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
-from workbench.session.studio_view import Change, Wish, Writing, WritingStage
+from workbench.session.studio_view import Change, Wish, Writing
 
 Plan = SourceEdit | Refusal
-
-MADE: tuple[WritingStage, ...] = ("written", "checked", "mismatch")
-"""Stages in which the change is in the file."""
-
 
 SENTENCES: dict[Change, tuple[str, str, str]] = {
     "edit": ("This changes {old} in {file}.", "{old} is written to {file}, and the new env has it.", ""),
@@ -65,7 +59,8 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
     """
     made: Plan
     texts, unread = _texts(task)
-    text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
+    placed = None if wish.what == "remove" else wish.settings
+    text = "" if placed is None else camera_source.snippet(wish.result[1], placed)
     elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
     if unread:
         made = camera_source.Refusal(unread)
@@ -115,7 +110,7 @@ def _made_of_a_parents(
     task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str, run: Run
 ) -> Plan:
     """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
-    if wish.settings is None:
+    if wish.settings is None or wish.what == "remove":
         return camera_source.Refusal(elsewhere)
     (kind, _), (_, uid), site = wish.key, wish.result, info.site
     assert site is not None
@@ -197,128 +192,11 @@ def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
     return texts, ""
 
 
-class CameraWriting:
-    """One change at a time."""
-
-    def __init__(self) -> None:
-        self.view = Writing()
-        self.copy: Path | None = None
-        """Of the task, which is being opened."""
-        self._just_copied = ""
-        """What is said first of the plan in it."""
-        self._made: list[Writing] = []
-        """What is in the file and can be taken back, the last one last."""
-
-    def planned(self, view: Writing) -> None:
-        before, wish = self.view.wish if self.view.stage == "planned" else None, view.wish
-        assert wish is not None
-        first, self._just_copied = self._just_copied, ""
-        if before is not None and (before.what, before.key) != (wish.what, wish.key):
-            first = said(before, LEFT)
-        self.view = replace(view, message=f"{first} {view.message}".strip())
-
-    def drop(self) -> None:
-        if self.view.stage in MADE:
-            self._made.clear()
-        self.view = self._made[-1] if self._made else Writing()
-        self.copy, self._just_copied = None, ""
-
-    def copied(self, copy: Path | None, view: Writing) -> None:
-        """The task was copied, or not: the wish waits until its copy is there."""
-        self.copy = copy
-        if copy is not None:
-            self._made.clear()  # of another file
-        self.view = replace(view, wish=self.view.wish)
-        self._just_copied = "" if copy is None else f"This is your copy of the task, {copy}."
-
-    def wish_for(self, task: TaskDescription) -> Wish | None:
-        """What was wanted of the task whose copy this is, if this is the one that is awaited."""
-        if self.copy is None or task.file != str(self.copy):
-            return None
-        self.copy = None
-        return self.view.wish
-
-    def write(self) -> None:
-        """Make the planned edit, if there is one."""
-        self._apply(("planned",), camera_source.apply, "written", "Written to {file}, being loaded now.")
-
-    def undo(self) -> None:
-        """Take the edit that was made out of the file again."""
-        self._apply(MADE, camera_source.revert, "undone", "{file} {was} before, being loaded now.")
-
-    def _apply(
-        self,
-        needs: tuple[WritingStage, ...],
-        do: Callable[[SourceEdit], Refusal | None],
-        stage: WritingStage,
-        message: str,
-    ) -> None:
-        view = self.view
-        if view.edit is None or view.stage not in needs:
-            return
-        refusal = do(view.edit)
-        if refusal is not None:
-            kept = "refused" if stage == "written" else view.stage
-            self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
-            return
-        self._say(message.format(file=view.edit.names, was=_was(view.edit)), stage, loading=True)
-        if stage == "undone":
-            del self._made[-1:]
-        else:
-            self._made.append(self.view)
-
-    def is_in(self, task: TaskDescription) -> bool:
-        """Whether this version is the one with the edit, or without it, that is awaited."""
-        edit = self.view.edit
-        if edit is None or not self.view.loading:
-            return False
-        written = self.view.stage == "written"
-        return all(
-            task.source.get(change.file) == plain_line_ends(change.new_text if written else change.old_text)
-            for change in edit.changes
-        )
-
-    def compare(self, task: TaskDescription, went_back: bool) -> None:
-        """The version that was awaited runs: does it have what was written?
-
-        Args:
-            went_back: the camera stands as the file says again, and not as it was placed.
-        """
-        wish, edit = self.view.wish, self.view.edit
-        assert edit is not None and wish is not None
-        if self.view.stage == "undone":
-            back = f" {wish.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
-            self._say(f"{edit.names} {_was(edit)} before.{back}", "undone")
-            return
-        wrong = _mismatch(wish, {c.key: c for c in task.cameras}, edit.settings)
-        if wrong:
-            more = "Take the change back, or look at what else in the task places this camera."
-            self._say(f"{wrong} {more}", "mismatch")
-        else:
-            self._say(said(wish, DONE, edit.names), "checked")
-        self._made[-1:] = [self.view]
-
-    def failed_to_load(self) -> None:
-        if self.copy is not None:
-            why = f"{self.copy} was made, but does not load: mend or delete it."
-            self.view = Writing("refused", self.view.wish, message=why)
-        if self.view.loading and self.view.edit is not None:
-            edit, undone = self.view.edit, self.view.stage == "undone"
-            told = "the change is in it; take it back if that is the reason"
-            if undone:
-                told = "the camera's change is out of it"
-            does = "does" if len(edit.changes) == 1 else "do"
-            self._say(f"{edit.names} {does} not load: {told}.", self.view.stage, loading=not undone)
-
-    def _say(self, message: str, stage: WritingStage, loading: bool = False) -> None:
-        self.view = replace(self.view, stage=stage, message=message, refusal=None, loading=loading)
-
-
-def _was(edit: SourceEdit) -> str:
+def was_before(edit: SourceEdit) -> str:
     return "is as it was" if len(edit.changes) == 1 else "are as they were"
 
 
-def _mismatch(wish: Wish, infos: dict[CameraKey, CameraInfo], wanted: CameraSettings | None) -> str:
+def mismatch(wish: Wish, infos: Mapping[CameraKey, CameraInfo], wanted: CameraSettings | None) -> str:
     kind, name = wish.result
     info = infos.get(wish.result)
     if wish.what == "remove":

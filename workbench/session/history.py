@@ -141,6 +141,21 @@ Lived = tuple[Moment, int]
 """A moment of an episode, with the number that the env had then: another than now where it was given another env's."""
 
 
+@dataclass(frozen=True)
+class ShownMoment:
+    """What the page shows."""
+
+    env: int
+    """The selected one."""
+    num_envs: int
+    poses: NDArray[np.float32] | None
+    """(N, B, 7) of a moment of the past; None for now."""
+
+    def of(self, env: int) -> NDArray[np.float32] | None:
+        """(B, 7) of one env."""
+        return None if self.poses is None else self.poses[env]
+
+
 class History:
     """The moments of one built task, oldest first. Not thread-safe: its owner locks."""
 

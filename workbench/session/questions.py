@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import TaskName
-from workbench.core.camera_report import CameraReport, OfferedPlacement
+from workbench.core.camera_report import CameraReport, OfferedPlacement, SearchSpace
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import Picture
@@ -62,15 +62,9 @@ class JudgeCamera(Question[CameraReport]):
 
 @dataclass(frozen=True)
 class SuggestCameras(Question[tuple[OfferedPlacement, ...]]):
-    """Search placements of one camera that see these objects."""
+    """Search placements of one camera that see some objects."""
 
-    key: CameraKey
-    settings: CameraSettings
-    """Its lens; of the pose it matters only which way up a mounted camera's picture is."""
-    objects: tuple[str, ...]
-    low: tuple[float, float, float]
-    """Of the box for the eye, metres in the frame of its mount, or the env's if it has none."""
-    high: tuple[float, float, float]
+    space: SearchSpace
     envs: tuple[int, ...]
 
 

@@ -2,27 +2,203 @@
 
 It is what placing, judging and writing have in common: each asks here for a camera by its key, and whether it can be
 placed at all. Not thread-safe: whoever asks holds `lock`.
+
+What was placed by hand can be undone and made again. A step keeps the whole settings of one camera before and after, so
+it can be taken back whatever happened to the file meanwhile. What belongs to one gesture, the hundred positions of a
+drag, is one step. When a version comes in, what was placed and not written stays, except where the file says something
+new of that very camera: the author wrote that, so it counts, and the placement is one step of undo away.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from workbench.authoring import camera_files
-from workbench.core.camera_frames import Convention, Direction, Floats, relative_to
-from workbench.core.camera_settings import CameraKey
+from workbench.core.camera_settings import NOT_ON_THE_GPU, CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
 from workbench.session.messages import TaskDescription
-from workbench.session.placements import Placements
 from workbench.session.studio_view import StudioCamera
 
-_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
+_MOST_STEPS = 500
+
+
+@dataclass(frozen=True)
+class Step:
+    """One change of one camera."""
+
+    key: CameraKey
+    before: CameraSettings
+    after: CameraSettings
+    words: str
+    gesture: int | None = None
+
+
+class Placements:
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        self._file: dict[CameraKey, CameraSettings] = {}
+        self._now: dict[CameraKey, CameraSettings] = {}
+        self._done: list[Step] = []
+        self._undone: list[Step] = []
+
+    def now(self, key: CameraKey) -> CameraSettings | None:
+        """None for a camera that there is not, or whose config cannot be said in settings."""
+        return self._now.get(key, self._file.get(key))
+
+    def file(self, key: CameraKey) -> CameraSettings | None:
+        """What the loaded version says."""
+        return self._file.get(key)
+
+    def moved(self, key: CameraKey) -> bool:
+        return key in self._now
+
+    @property
+    def all_moved(self) -> dict[CameraKey, CameraSettings]:
+        return dict(self._now)
+
+    @property
+    def undo_words(self) -> str | None:
+        return self._done[-1].words if self._done else None
+
+    @property
+    def redo_words(self) -> str | None:
+        return self._undone[-1].words if self._undone else None
+
+    def place(
+        self, key: CameraKey, settings: CameraSettings, gesture: int | None = None, words: str = ""
+    ) -> bool:
+        """False if there is no such camera, or it stands so already."""
+        before = self.now(key)
+        if before is None or not differences(before, settings):
+            return False
+        last = self._done[-1] if self._done else None
+        if gesture is not None and last is not None and (last.key, last.gesture) == (key, gesture):
+            before = last.before
+            self._done.pop()
+        words = words or _in_words(key, before, settings)
+        self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, before, settings, words, gesture)]
+        self._undone.clear()
+        self._put(key, settings)
+        return True
+
+    def undo(self) -> Step | None:
+        """The step that was taken back."""
+        if not self._done:
+            return None
+        step = self._done.pop()
+        self._undone.append(step)
+        self._put(step.key, step.before)
+        return step
+
+    def redo(self) -> Step | None:
+        if not self._undone:
+            return None
+        step = self._undone.pop()
+        self._done.append(replace(step, gesture=None))
+        self._put(step.key, step.after)
+        return step
+
+    def refused(self, key: CameraKey) -> None:
+        """It could not be placed so: it is as it was before that."""
+        last = self._done[-1] if self._done else None
+        if last is not None and last.key == key:
+            self._done.pop()
+            self._put(key, last.before)
+        else:
+            self._now.pop(key, None)
+
+    def written(self, key: CameraKey) -> None:
+        """The file says now what was placed, or says nothing of this camera any more."""
+        self._now.pop(key, None)
+
+    def taken_back(self, key: CameraKey, written: CameraSettings, said: CameraSettings) -> bool:
+        """The file says again what it said before a placement was written to it: the camera stands as that says, and
+        the placement is one step of undo away. False, and nothing is done, if it was placed elsewhere since.
+
+        Args:
+            written: what was taken out of the file.
+            said: what it says now.
+        """
+        placed = self._now.get(key)
+        if placed is not None and differences(placed, written):
+            return False
+        self._now.pop(key, None)
+        if differences(written, said):
+            words = f"took back the change of {key[1]}"
+            self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, written, said, words)]
+            self._undone.clear()
+        return True
+
+    def keep(self, key: CameraKey, settings: CameraSettings) -> None:
+        """Place a camera that the next version may have, or have otherwise, without a step of undo."""
+        self._now[key] = settings
+
+    def rename(self, key: CameraKey, new: CameraKey) -> None:
+        """What is known of one camera is from now on of the other."""
+        if key in self._now:
+            self._now[new] = self._now.pop(key)
+        if key in self._file:
+            self._file[new] = self._file[key]
+        for steps in (self._done, self._undone):
+            steps[:] = [replace(s, key=new) if s.key == key else s for s in steps]
+
+    def loaded(
+        self, said: Mapping[CameraKey, CameraSettings], own: frozenset[CameraKey] = frozenset()
+    ) -> tuple[CameraKey, ...]:
+        """A version runs, whose cameras are these.
+
+        Args:
+            own: cameras that the studio itself changed in the file: nothing of theirs is dropped.
+
+        Returns:
+            cameras whose placement was dropped, since the file says something new of them.
+        """
+        before, self._file = self._file, dict(said)
+        dropped: list[CameraKey] = []
+        for key, placed in list(self._now.items()):
+            if key not in said:
+                del self._now[key]
+            elif not differences(placed, said[key]):
+                del self._now[key]
+            elif key not in own and key in before and differences(before[key], said[key]):
+                del self._now[key]
+                dropped.append(key)
+                words = f"took {key[1]} from the file"
+                self._done.append(Step(key, placed, said[key], words))
+        for steps in (self._done, self._undone):
+            steps[:] = [step for step in steps if step.key in said]
+        return tuple(dropped)
+
+    def _put(self, key: CameraKey, settings: CameraSettings) -> None:
+        file = self._file.get(key)
+        if file is not None and not differences(file, settings):
+            self._now.pop(key, None)
+        else:
+            self._now[key] = settings
+
+
+_IN_WORDS = (
+    ({"position"}, "moved {}"),
+    ({"orientation"}, "turned {}"),
+    ({"position", "orientation"}, "moved and turned {}"),
+    ({"fov", "intrinsic"}, "changed the lens of {}"),
+    ({"near", "far"}, "changed near and far of {}"),
+    ({"width", "height", "intrinsic"}, "changed the size of {}"),
+    ({"shader_pack"}, "changed the shader of {}"),
+)
+"""What a step is called of which no more is changed than this."""
+
+
+def _in_words(key: CameraKey, before: CameraSettings, after: CameraSettings) -> str:
+    changed = set(differences(before, after))
+    return next((words for most, words in _IN_WORDS if changed <= most), "changed {}").format(key[1])
 
 
 class StudioCameras:
@@ -51,7 +227,7 @@ class StudioCameras:
         if info is None:
             return f"there is no {key[0]} camera {key[1]}"
         if self.task is not None and self.task.backend == "gpu":
-            return _ON_THE_GPU
+            return NOT_ON_THE_GPU
         if info.settings is None:
             return "its pose is no pose, or its lens differs between envs, so one placement cannot be its"
         return None
@@ -87,41 +263,3 @@ class StudioCameras:
         if info is None or now is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} whose settings are known")
         return camera_files.CameraToExport(key, now, info.mount, self.mount_pose(info))
-
-
-def exported(cameras: Sequence[camera_files.CameraToExport], form: Literal["json", "opencv", "ros"]) -> str:
-    """The text of a file; ROS's form is one file a camera, so of several it is one document after the other."""
-    if form == "json":
-        return camera_files.cameras_as_json(cameras)
-    if form == "opencv":
-        return camera_files.cameras_as_opencv_yaml(cameras)
-    return "---\n".join(camera_files.camera_as_ros_yaml(camera) for camera in cameras)
-
-
-def imported(
-    info: CameraInfo,
-    mount: ArrayLike | None,
-    text: str,
-    direction: Direction | None,
-    convention: Convention | None,
-    metres_per_unit: float,
-) -> Floats:
-    """(7,) the pose that a calibration gives a camera: in the env's frame, or in its mount's if it is mounted.
-
-    Args:
-        mount: (7,) where its mount is; None for a camera that stands still, or where that is not known.
-
-    Raises:
-        ValueError: with a sentence for the reader.
-    """
-    found = camera_files.find_poses(text)
-    chosen = [pose for pose in found if info.name in pose.label] or list(found)
-    if len(chosen) > 1:
-        labels = ", ".join(pose.label for pose in chosen)
-        raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
-    pose = camera_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
-    if chosen[0].said is None or info.mount is None:
-        return pose
-    if mount is None:
-        raise ValueError(f"where {info.mount} is, on which {info.name} rides, is not known yet")
-    return relative_to(mount, pose)  # ours is of the env's frame

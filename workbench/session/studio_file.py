@@ -15,16 +15,21 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+from workbench.authoring import camera_source
+from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Ran
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import Refused, plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.askers import Asker
-from workbench.session.camera_writing import CameraWriting, copy, plan
+from workbench.session.camera_writing import DONE, LEFT, copy, mismatch, plan, said, was_before
 from workbench.session.lane import JobFailed, Stopped
 from workbench.session.messages import Load, TaskDescription
 from workbench.session.questions import RunCameras
 from workbench.session.studio_cameras import StudioCameras
-from workbench.session.studio_view import Wish, Writing
+from workbench.session.studio_view import Wish, Writing, WritingStage
+
+MADE: tuple[WritingStage, ...] = ("written", "checked", "mismatch")
+"""Stages in which the change is in the file."""
 
 
 class StudioFile:
@@ -53,19 +58,21 @@ class StudioFile:
         self._asker, self._load, self._patience = asker, load, patience
         self._stopped = threading.Event()
         """Nobody waits any more for what is being asked."""
-        self._writing = CameraWriting()
+        self.view = Writing()
+        self._copied: Path | None = None
+        """The copy of the task, which is being opened."""
+        self._just_copied = ""
+        """What is said first of the plan in it."""
+        self._made: list[Writing] = []
+        """What is in the file and can be taken back, the last one last."""
         self._removed: dict[CameraKey, CameraSettings] = {}
         """Where cameras were placed, otherwise than the file said, that were taken out of it."""
         self._thread = ThreadPoolExecutor(1, "studio")
         self._closing = False
 
-    @property
-    def view(self) -> Writing:
-        return self._writing.view
-
     def plan(self, wish: Wish) -> None:
         """Find the edit that fulfils a wish; it becomes `StudioView.writing`."""
-        if wish.settings is None and wish.what != "remove":
+        if wish.settings is None:
             with self._cameras.lock:
                 wish = replace(wish, settings=self._cameras.placements.now(wish.key))
         self._later(self._find_plan, wish)
@@ -77,7 +84,11 @@ class StudioFile:
             return
         writing = plan(task, info, wish, self._run)
         with self._cameras.lock:
-            self._writing.planned(writing)
+            before = self.view.wish if self.view.stage == "planned" else None
+            first, self._just_copied = self._just_copied, ""
+            if before is not None and (before.what, before.key) != (wish.what, wish.key):
+                first = said(before, LEFT)
+            self.view = replace(writing, message=f"{first} {writing.message}".strip())
         self._note()
 
     def _run(self, texts: Mapping[str, str]) -> Ran:
@@ -103,11 +114,37 @@ class StudioFile:
 
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
-        self._later(self._write, self._writing.write)
+        message = "Written to {file}, being loaded now."
+        self._later(self._exchange, ("planned",), camera_source.apply, "written", message)
 
     def undo_write(self) -> None:
         """Take the edit that was made last out of the file again."""
-        self._later(self._write, self._writing.undo)
+        message = "{file} {was} before, being loaded now."
+        self._later(self._exchange, MADE, camera_source.revert, "undone", message)
+
+    def _exchange(
+        self,
+        needs: tuple[WritingStage, ...],
+        do: Callable[[SourceEdit], Refusal | None],
+        stage: WritingStage,
+        message: str,
+    ) -> None:
+        with self._cameras.lock:  # the version with it must not come in before it is known to be awaited
+            view = self.view
+            if view.edit is None or view.stage not in needs:
+                return
+            refusal = do(view.edit)
+            if refusal is not None:
+                kept = "refused" if stage == "written" else view.stage
+                self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
+            else:
+                told = message.format(file=view.edit.names, was=was_before(view.edit))
+                self._say(told, stage, loading=True)
+                if stage == "undone":
+                    del self._made[-1:]
+                else:
+                    self._made.append(self.view)
+        self._note()
 
     def copy_task(self) -> None:
         """Copy the task's file into `folder` and open the copy; what was refused before is planned in it then.
@@ -118,25 +155,27 @@ class StudioFile:
 
     def _copy(self) -> None:
         with self._cameras.lock:
-            task, can = self._cameras.task, self._writing.view.can_copy
+            task, can = self._cameras.task, self.view.can_copy
         if task is None or not can:
             return
         file, view = copy(task, self.folder)
         with self._cameras.lock:
-            self._writing.copied(file, view)
+            # The wish waits until the copy is there.
+            self._copied, self.view = file, replace(view, wish=self.view.wish)
+            self._just_copied = "" if file is None else f"This is your copy of the task, {file}."
+            if file is not None:
+                self._made.clear()  # of another file
         self._note()
         if file is not None:
             self._open_copy(file, task.class_name)
 
-    def _write(self, do: Callable[[], None]) -> None:
-        with self._cameras.lock:  # the version with it must not come in before it is known to be awaited
-            do()
-        self._note()
-
     def drop_plan(self) -> None:
         """Forget the plan: the change before, which can be taken back, is spoken of again. Or forget that one."""
         with self._cameras.lock:
-            self._writing.drop()
+            if self.view.stage in MADE:
+                self._made.clear()
+            self.view = self._made[-1] if self._made else Writing()
+            self._copied, self._just_copied = None, ""
             if self._cameras.task is not None:
                 self.loaded(self._cameras.task)  # what is spoken of again may have come in meanwhile
         self._note()
@@ -149,19 +188,39 @@ class StudioFile:
         Returns:
             the cameras that were changed here, if this is the version with that change.
         """
-        wish = self._writing.view.wish
-        if wish is None or not self._writing.is_in(task):
+        wish, edit = self.view.wish, self.view.edit
+        if wish is None or edit is None or not self._is_in(task, edit):
             return frozenset()
-        said = {info.key: info.settings for info in task.cameras}
-        went_back = self._follow_the_file(wish, said.get(wish.key))
-        self._writing.compare(task, went_back)
+        infos = {info.key: info for info in task.cameras}
+        had = infos.get(wish.key)
+        went_back = self._follow_the_file(wish, None if had is None else had.settings)
+        if self.view.stage == "undone":
+            back = f" {wish.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
+            self._say(f"{edit.names} {was_before(edit)} before.{back}", "undone")
+        elif wrong := mismatch(wish, infos, edit.settings):
+            more = "Take the change back, or look at what else in the task places this camera."
+            self._say(f"{wrong} {more}", "mismatch")
+        else:
+            self._say(said(wish, DONE, edit.names), "checked")
+        if self.view.stage != "undone":
+            self._made[-1:] = [self.view]
         return frozenset({wish.key, wish.result})
+
+    def _is_in(self, task: TaskDescription, edit: SourceEdit) -> bool:
+        """Whether this version is the one with the edit, or without it, that is awaited."""
+        written = self.view.stage == "written"
+        return self.view.loading and all(
+            task.source.get(change.file) == plain_line_ends(change.new_text if written else change.old_text)
+            for change in edit.changes
+        )
 
     def plan_in_copy(self, task: TaskDescription) -> None:
         """What was refused before is planned in the copy of the task, if this is that; the lock is held."""
-        refused = self._writing.wish_for(task)
-        if refused is not None and not self._closing:
-            self._submit(self._find_plan, refused)
+        if self._copied is None or task.file != str(self._copied):
+            return
+        self._copied = None
+        if self.view.wish is not None and not self._closing:
+            self._submit(self._find_plan, self.view.wish)
 
     def _follow_the_file(self, wish: Wish, said: CameraSettings | None) -> bool:
         """What an edit, or its being taken back, means for the placements: none is to be lost by it.
@@ -173,7 +232,7 @@ class StudioFile:
             whether the camera went back from where it was placed to where the file says.
         """
         went_back = False
-        placements, undone = self._cameras.placements, self._writing.view.stage == "undone"
+        placements, undone = self._cameras.placements, self.view.stage == "undone"
         now = placements.now(wish.key)
         if wish.what == "rename":
             pair = (wish.result, wish.key) if undone else (wish.key, wish.result)
@@ -196,7 +255,19 @@ class StudioFile:
 
     def failed_to_load(self) -> None:
         """A version does not load; the lock is held."""
-        self._writing.failed_to_load()
+        if self._copied is not None:
+            why = f"{self._copied} was made, but does not load: mend or delete it."
+            self.view = Writing("refused", self.view.wish, message=why)
+        edit, undone = self.view.edit, self.view.stage == "undone"
+        if self.view.loading and edit is not None:
+            told = "the change is in it; take it back if that is the reason"
+            if undone:
+                told = "the camera's change is out of it"
+            does = "does" if len(edit.changes) == 1 else "do"
+            self._say(f"{edit.names} {does} not load: {told}.", self.view.stage, loading=not undone)
+
+    def _say(self, message: str, stage: WritingStage, loading: bool = False) -> None:
+        self.view = replace(self.view, stage=stage, message=message, refusal=None, loading=loading)
 
     def close(self) -> None:
         """Wait for what is being written."""

@@ -35,7 +35,7 @@ class Wish:
     key: CameraKey
     """The camera that is changed, copied, renamed or removed, or the one that is added."""
     settings: CameraSettings | None = None
-    """What it is to have; None where it is removed, and for as it is placed when it is asked for."""
+    """What it is to have, or has where it is removed; None for as it is placed when it is asked for."""
     name: str = ""
     """The new name."""
     target: tuple[float, float, float] | None = None
@@ -157,6 +157,12 @@ class Looked:
     """The selected camera's picture in every env, worst first where it was judged."""
     problem: str = ""
     """Why the last question was not answered, as a sentence."""
+
+    def report_over_envs(self, key: CameraKey) -> CameraReport | None:
+        """The report, if it is of this camera and of the envs at one moment."""
+        return (
+            self.report if (self.report_of, self.report_seeds, self.report_moments) == (key, 0, ()) else None
+        )
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraKind, Picture
-from workbench.session.camera_judging import ShownMoment
 from workbench.session.env_table import EnvTable
-from workbench.session.history import History, Lived, Moment
+from workbench.session.history import History, Lived, Moment, ShownMoment
 from workbench.session.messages import (
     CameraRequest,
     DrawPast,

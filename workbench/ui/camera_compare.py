@@ -11,7 +11,7 @@ import math
 import numpy as np
 import viser
 
-from workbench.core import camera_frames as frames
+from workbench.core.camera_frames import angle_between
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import Picture
 from workbench.session.session import Session
@@ -82,7 +82,7 @@ class CameraCompare:
             other = camera.info.settings if choice == FILE else self._kept[camera.key]
             self._asked = (camera.key, camera.now, other, choice)
             self._pair.asked(self._session.view().studio.looked.compared)
-            self._session.studio.compare(camera.key, other)
+            self._session.studio.judging.compare(camera.key, other)
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio
@@ -119,7 +119,7 @@ def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
     moved = float(np.linalg.norm(np.subtract(new.position, old.position)))
     if moved > 1e-6:
         said.append(f"moved {1000 * moved:.1f} mm" if moved < 0.1 else f"moved {moved:.3f} m")
-    turned = angle_between(old.quaternion, new.quaternion)
+    turned = math.degrees(angle_between(old.quaternion, new.quaternion))
     if turned > 1e-4:
         said.append(f"turned {turned:.2f}°")
     if old.fov is not None and new.fov is not None and abs(old.fov - new.fov) > 1e-9:
@@ -134,11 +134,3 @@ def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
     if old.shader_pack != new.shader_pack:
         said.append(f"shader {old.shader_pack} → {new.shader_pack}")
     return said
-
-
-def angle_between(first: tuple[float, ...], second: tuple[float, ...]) -> float:
-    """Degrees between two orientations (4,) wxyz."""
-    turn = frames.rotation_matrix(first).T @ frames.rotation_matrix(second)
-    # Of the skew part too: the arc cosine alone knows no angle below some 1e-8 and is blunt below 1e-4.
-    skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return math.degrees(math.atan2(float(np.linalg.norm(skew)), float(np.trace(turn)) - 1))

@@ -87,8 +87,8 @@ class CameraGizmo:
         self._start: _Taken | None = None
         # Async: callbacks in viser's pool of threads would come in any order.
         self._camera.on_update(self._on_camera)
-        self._eye.on_update(self._on_eye)
-        self._target.on_update(self._on_target)
+        self._eye.on_update(self._on_point)
+        self._target.on_update(self._on_point)
 
     @property
     def held(self) -> bool:
@@ -162,14 +162,9 @@ class CameraGizmo:
             moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
             self._place(start, moved, float(np.linalg.norm(start.target - pose[:3])))
 
-    async def _on_eye(self, event: viser.TransformControlsEvent) -> None:
-        self._look(event, moves_eye=True)
-
-    async def _on_target(self, event: viser.TransformControlsEvent) -> None:
-        self._look(event, moves_eye=False)
-
-    def _look(self, event: viser.TransformControlsEvent, moves_eye: bool) -> None:
-        start = self._went_on(event.phase)
+    async def _on_point(self, event: viser.TransformControlsEvent) -> None:
+        """The eye or the target is moved."""
+        moves_eye, start = event.target is self._eye, self._went_on(event.phase)
         if start is None:
             return
         pose, target = start.pose, start.target

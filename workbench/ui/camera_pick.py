@@ -49,7 +49,7 @@ class CameraPick:
     def _pick(self, u: float, v: float) -> None:
         key = self._session.view().studio.selected
         if key is not None:
-            self._session.studio.pick(key, u, v)
+            self._session.studio.judging.pick(key, u, v)
 
     def draw(self, view: SessionView, shown: bool) -> None:
         """Draw what is new.

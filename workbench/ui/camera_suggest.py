@@ -131,7 +131,7 @@ class CameraSuggest:
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             self._offers.asked(self._session.view().studio.looked.suggestions)
-            self._session.studio.suggest(key, wanted, *self._bounds(), self._resets.value)
+            self._session.studio.judging.suggest(key, wanted, *self._bounds(), self._resets.value)
 
     # --- drawn ---------------------------------------------------------------------------------------
 

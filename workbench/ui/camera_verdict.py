@@ -18,7 +18,7 @@ import viser
 
 from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
 from workbench.core.pictures import Picture
-from workbench.session.camera_studio import MOST_STEPS
+from workbench.session.camera_judging import MOST_SEEDS, MOST_STEPS
 from workbench.session.session import Session
 from workbench.session.studio_view import Looked, StudioCamera, StudioView
 from workbench.session.view import SessionView
@@ -29,7 +29,6 @@ from workbench.ui.presses import Presses
 
 AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"
 OVERS = (AS_THEY_ARE, STEPS, FRESH)
-MOST_RESETS = 1000
 MOST_PICTURES = 64
 """On the sheet: the worst of them."""
 THUMBNAIL = 128
@@ -61,7 +60,7 @@ class CameraVerdict:
                 "Resets",
                 32,
                 min=1,
-                max=MOST_RESETS,
+                max=MOST_SEEDS,
                 step=1,
                 visible=False,
                 hint="How many, each with a seed of its own.",
@@ -85,15 +84,15 @@ class CameraVerdict:
         self._report.asked(self._session.view().studio.looked.report)
         over = self._over.value
         if over == STEPS:
-            self._session.studio.judge_steps(key, self._steps.value)
+            self._session.studio.judging.judge_steps(key, self._steps.value)
         else:
-            self._session.studio.judge(key, self._resets.value if over == FRESH else 0)
+            self._session.studio.judging.judge(key, self._resets.value if over == FRESH else 0)
 
     def _ask_for_sheet(self) -> None:
         key = self._session.view().studio.selected
         if key is not None:
             self._pictures.asked(self._session.view().studio.looked.sheet)
-            self._session.studio.make_sheet(key)
+            self._session.studio.judging.make_sheet(key)
 
     def _show_moment(self, position: int) -> None:
         moments = self._session.view().studio.looked.report_moments
@@ -148,8 +147,7 @@ class CameraVerdict:
         looked, env = view.studio.looked, view.selected_env
         sheet = looked.sheet
         mine = camera is not None and bool(sheet) and (sheet[0].kind, sheet[0].camera) == camera.key
-        judged = camera is not None and looked.report_of == camera.key
-        report = looked.report if judged and not looked.report_seeds and not looked.report_moments else None
+        report = None if camera is None else looked.report_over_envs(camera.key)
         told = id(report), env
         self._pictures.draw(
             view.studio.progress,
@@ -355,10 +353,10 @@ def env_words(report: CameraReport, position: int) -> str:
     Args:
         position: in `CameraReport.envs`.
     """
-    found = [(_mark(thing, position), thing) for thing in report.wanted_objects() if thing.present[position]]
+    found = [thing for thing in report.wanted_objects() if thing.present[position]]
     if not found:
         return ""
-    _, thing = min(found, key=lambda pair: pair[0])
+    thing = min(found, key=lambda thing: float(thing.marks()[position]))
     hidden = float(thing.hidden_share[position])
     if thing.pixels[position] == 0:
         return f"{thing.name} hidden" if thing.alone[position] > 0 else f"no {thing.name}"
@@ -407,7 +405,3 @@ def _mood(thing: ObjectSeen, position: int) -> str:
         return "bad"
     hindered = max(float(thing.hidden_share[position]), float(thing.covered_share[position]))
     return "warn" if thing.cut[position] or hindered > 0.5 else "good"
-
-
-def _mark(thing: ObjectSeen, position: int) -> float:
-    return float(thing.marks()[position])

@@ -51,7 +51,7 @@ class Answer:
         gui = server.gui
         self._bar = gui.add_html("", visible=False)
         self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        self._stop.on_click(lambda _: session.studio.stop())
+        self._stop.on_click(lambda _: session.studio.judging.stop())
         self._html = gui.add_html("", visible=False)
         self._began: float | None = None
         self._arrival = Arrival()

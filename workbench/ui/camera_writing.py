@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePath
 
 import numpy as np
@@ -19,7 +19,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.core.camera_frames import axes_of, intrinsic_of, pose_of, vertical_fov
-from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings
+from workbench.core.camera_settings import CameraKind, CameraSettings
 from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioView, Wish, Writing
@@ -168,8 +168,6 @@ class CameraWriting:
     ) -> None:
         self._session, self._placing, self._from_viewer = session, placing, from_viewer
         gui = server.gui
-        self._planned: tuple[CameraKey, CameraSettings | None] | None = None
-        """Whose plan it is, and how that camera was placed then."""
         self._about = ""
         """What is said of the plan beside."""
         self._before: Writing | None = None
@@ -203,11 +201,11 @@ class CameraWriting:
     def _plan_write(self) -> None:
         camera = self._placing.camera
         if camera is not None:
-            self._ask(Wish("edit", camera.key), camera.now)
+            self._ask(Wish("edit", camera.key))
 
-    def _ask(self, wish: Wish, placed: CameraSettings | None, about: str = "") -> None:
+    def _ask(self, wish: Wish, about: str = "") -> None:
         """Note what is asked for and where, and then ask: the answer may come at once."""
-        self._planned, self._about = (wish.key, placed), about
+        self._about = about
         self._before = self._session.view().studio.writing
         self._say("")
         change = self._change if wish.what == "edit" else self._member_change
@@ -231,23 +229,19 @@ class CameraWriting:
         if what in (ADD_SENSOR, ADD_HUMAN) and client is not None:
             kind = "sensor" if what == ADD_SENSOR else "human"
             key = (kind, self._checked_name(view.studio, kind, NEW_NAMES[kind]))
-            seen_from, (names, places) = (
-                self._from_viewer(client, lens_of_siblings(view.studio, kind)),
-                objects_in(view),
-            )
+            settings, words = self._from_viewer(client, lens_of_siblings(view.studio, kind)), ""
+            names, places = objects_in(view)
             if kind == "sensor":
-                place = first_place(seen_from, names, places)
-            else:
-                place = FirstPlace(seen_from, "", aimed_at(seen_from, places))
-            self._ask(Wish("add", key, place.settings, target=place.target), None, place.words)
+                settings, words = first_place(settings, names, places)
+            self._ask(Wish("add", key, settings, target=aimed_at(settings, places)), words)
         elif chosen is None:
             raise ValueError("Choose the camera first.")
         elif what == REMOVE:
-            self._ask(Wish("remove", chosen.key), chosen.now)
+            self._ask(Wish("remove", chosen.key))
         elif what in (DUPLICATE, RENAME):
             name = self._checked_name(view.studio, chosen.key[0], chosen.key[1] if what == DUPLICATE else "")
             change = "duplicate" if what == DUPLICATE else "rename"
-            self._ask(Wish(change, chosen.key, name=name), chosen.now)
+            self._ask(Wish(change, chosen.key, name=name))
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
         """The name that was typed, or a free one like another; `ValueError` where neither is there."""
@@ -268,7 +262,7 @@ class CameraWriting:
 
     def draw(self, studio: StudioView) -> None:
         chosen, writing = studio.chosen, studio.writing
-        stale = self._is_stale(studio)
+        stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
         if writing is not self._before:
             self._before = None
@@ -295,13 +289,14 @@ class CameraWriting:
             self._sight = picture, data_address(picture.rgb, PREVIEW)
         return self._sight[1]
 
-    def _is_stale(self, studio: StudioView) -> bool:
-        """The camera was moved since the plan for it was made."""
-        if studio.writing.stage != "planned" or self._planned is None:
-            return False
-        key, placed = self._planned
-        camera = studio.camera(key)
-        return placed is not None and camera is not None and camera.now != placed
+
+def is_stale(studio: StudioView) -> bool:
+    """The camera was moved since the plan for it was made."""
+    wish = studio.writing.wish
+    if studio.writing.stage != "planned" or wish is None or wish.what == "add":
+        return False
+    camera = studio.camera(wish.key)
+    return camera is not None and camera.now != wish.settings
 
 
 def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
@@ -339,17 +334,11 @@ NEAREST_TARGET = 0.1
 MOST_NAMES = 3
 
 
-@dataclass(frozen=True)
-class FirstPlace:
-    settings: CameraSettings
-    words: str
-    """Where that is, a sentence."""
-    target: tuple[float, float, float] | None = None
-    """The point on its line of sight that is nearest to the objects; None if they are not before it."""
+def first_place(
+    seen_from: CameraSettings, names: tuple[str, ...], places: NDArray[np.float64]
+) -> tuple[CameraSettings, str]:
+    """A new sensor, and where that is, a sentence.
 
-
-def first_place(seen_from: CameraSettings, names: tuple[str, ...], places: NDArray[np.float64]) -> FirstPlace:
-    """
     Args:
         seen_from: a camera of the lens that is added, where somebody looks from, in the env's frame.
         names: of the objects that it is to see.
@@ -357,7 +346,7 @@ def first_place(seen_from: CameraSettings, names: tuple[str, ...], places: NDArr
     """
     stays = "It stands where you look from."
     if not len(places):
-        return FirstPlace(seen_from, stays)
+        return seen_from, stays
     pose = pose_of(seen_from)
     # One object that fell from the table must not take the camera away from all others.
     middle = np.median(places, axis=0)
@@ -366,15 +355,11 @@ def first_place(seen_from: CameraSettings, names: tuple[str, ...], places: NDArr
     wanted = max(NEAREST, ROOM * reach / math.sin(fov / 2))
     away = float(np.linalg.norm(middle - pose[:3]))
     if away <= NEAR_ENOUGH * wanted:
-        return FirstPlace(seen_from, stays, aimed_at(seen_from, places))
+        return seen_from, stays
     x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
     told = ", ".join(names[:MOST_NAMES]) + (" and others" if len(names) > MOST_NAMES else "")
-    settings = replace(seen_from, position=(x, y, z))
-    return FirstPlace(
-        settings,
-        f"It looks from your side at {told} from {wanted:.2f} m; you look from {away:.1f} m away.",
-        aimed_at(settings, places),
-    )
+    words = f"It looks from your side at {told} from {wanted:.2f} m; you look from {away:.1f} m away."
+    return replace(seen_from, position=(x, y, z)), words
 
 
 def aimed_at(settings: CameraSettings, places: NDArray[np.float64]) -> tuple[float, float, float] | None:

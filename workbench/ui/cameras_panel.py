@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.session.camera_studio import IN_A_QUICK_LOOK
 from workbench.session.messages import CameraRequest
-from workbench.session.preview import IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import Seen, SessionView
 from workbench.ui.fragments import render

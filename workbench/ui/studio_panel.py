@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import PurePath
 from typing import Any
 
@@ -30,9 +31,8 @@ from workbench.ui.camera_compare import CameraCompare
 from workbench.ui.camera_export import CameraExport
 from workbench.ui.camera_frustums import Placed
 from workbench.ui.camera_gizmo import CameraGizmo
-from workbench.ui.camera_lens import CameraLens
 from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
-from workbench.ui.camera_numbers import CameraNumbers
+from workbench.ui.camera_numbers import CameraLens, CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_suggest import CameraSuggest
 from workbench.ui.camera_verdict import CameraVerdict
@@ -278,20 +278,16 @@ class StudioPanel(PagePart[SessionView]):
     def _handles_of(self, scale: float) -> str:
         """What is dragged in the view, along which axes, in which steps; and how large the picture above is."""
 
-        def place(look_at: bool) -> None:
-            self._look_at = look_at
-
-        def along(own_axes: bool) -> None:
-            self._own_axes = own_axes
-
-        def in_steps(snap: Snap) -> None:
-            self._snap = snap
+        def keep(name: str) -> Callable[[Any], None]:
+            return partial(setattr, self, name)
 
         kinds = {KINDS.get(kind, kind): kind for kind in self._picture.kinds}
         toggles = (
-            Toggle("Place", PLACE, {"move, turn": False, "eye and target": True}, self._look_at, place),
-            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, along),
-            Toggle("Steps", STEPS, SNAPS, self._snap, in_steps),
+            Toggle(
+                "Place", PLACE, {"move, turn": False, "eye and target": True}, self._look_at, keep("_look_at")
+            ),
+            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, keep("_own_axes")),
+            Toggle("Steps", STEPS, SNAPS, self._snap, keep("_snap")),
             Toggle(
                 "Shows", "What the picture above is of.", kinds, self._picture.shows, self._picture.show_kind
             ),
@@ -364,16 +360,12 @@ class StudioPanel(PagePart[SessionView]):
         ]
 
     def _moves(self, name: str, key: HotkeyKey, step: tuple[float, float, float]) -> Command:
-        def run() -> None:
-            self._by_key(lambda pose: nudged(pose, step), "key")
-
-        return Command(f"Move the chosen camera {name}", run, key, "alt")
+        move = partial(self._by_key, partial(nudged, step=step), "key")
+        return Command(f"Move the chosen camera {name}", move, key, "alt")
 
     def _turns(self, name: str, key: HotkeyKey, left: float, up: float) -> Command:
-        def run() -> None:
-            self._by_key(lambda pose: panned(pose, left, up), "turning key")
-
-        return Command(f"Turn the chosen camera {name}", run, key, "alt+shift")
+        turn = partial(self._by_key, partial(panned, left=left, up=up), "turning key")
+        return Command(f"Turn the chosen camera {name}", turn, key, "alt+shift")
 
     def _by_key(self, move: Callable[[Floats], Floats], hand: str) -> None:
         camera = self._placing.camera

@@ -12,12 +12,12 @@ from mani_skill.utils import sapien_utils
 from transforms3d.quaternions import quat2mat
 
 from workbench.authoring.source.rotations import (
-    angle_between,
     from_euler,
     look_at,
     to_euler,
     unit,
 )
+from workbench.core.camera_frames import angle_between
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)
 parts = st.floats(-1, 1)

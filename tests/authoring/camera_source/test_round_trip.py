@@ -15,7 +15,8 @@ from tests.authoring.camera_source.real_cameras import FILE, close, key_of, look
 from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
 from workbench.authoring.camera_source.cameras import changed_fields
-from workbench.authoring.source.rotations import angle_between, unit
+from workbench.authoring.source.rotations import unit
+from workbench.core.camera_frames import angle_between
 from workbench.core.camera_settings import CameraKey, CameraSettings
 
 KEY: CameraKey = ("sensor", "cam")

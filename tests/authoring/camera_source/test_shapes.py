@@ -22,7 +22,8 @@ from tests.authoring.camera_source.real_cameras import (
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
-from workbench.authoring.source.rotations import angle_between, unit
+from workbench.authoring.source.rotations import unit
+from workbench.core.camera_frames import angle_between
 from workbench.core.camera_settings import CameraSettings
 
 Edit = Callable[[CameraSettings], CameraSettings]

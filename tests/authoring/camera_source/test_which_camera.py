@@ -319,7 +319,9 @@ def test_a_change_of_two_files_is_one_plan_with_both() -> None:
     assert isinstance(plan, SourceEdit), plan
     assert [change.file for change in plan.changes] == [FILE, "/author/places.py"]
     assert "places.SIZE, 100, 1.0" in plan.new_text and "[0.5, 0, 0.75]" in plan.others[0].new_text
-    assert plan.diff.count("+++") == 2 and plan.notes[-1].startswith("2 files change together")
+    assert [change.diff.count("+++") for change in plan.changes] == [1, 1] and plan.notes[-1].startswith(
+        "2 files change together"
+    )
     new = {change.file: change.new_text for change in plan.changes}
     assert plan.settings == real_settings(sources | new, "cam")
 

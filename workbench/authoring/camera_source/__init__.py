@@ -7,11 +7,17 @@ with the reason and a snippet to copy.
 """
 
 from workbench.authoring.camera_source.disk import apply, not_writable, revert
-from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
-from workbench.authoring.camera_source.override import override_text, plan_override
+from workbench.authoring.camera_source.hooks import snippet
+from workbench.authoring.camera_source.members import (
+    override_text,
+    plan_add,
+    plan_duplicate,
+    plan_override,
+    plan_remove,
+    plan_rename,
+)
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.camera_source.result import Refusal, SourceEdit
-from workbench.authoring.camera_source.snippet import snippet
 
 __all__ = [
     "Refusal",

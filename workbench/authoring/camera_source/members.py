@@ -1,4 +1,5 @@
-"""Cameras added to a task, duplicated, renamed and removed.
+"""Cameras added to a task, duplicated, renamed and removed; and one that a parent class makes, put elsewhere by a hook of
+one's own that takes the parent's cameras and puts another in its place.
 
 A hook returns one config, a list or tuple of them, or a dict. One becomes a list when a second is added. Where
 a hook does anything else (a name, a concatenation, several returns, a call of the parent's hook), the reason is told
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from workbench.authoring.camera_source.cameras import (
     HOOKS,
@@ -24,17 +25,19 @@ from workbench.authoring.camera_source.cameras import (
 from workbench.authoring.camera_source.hooks import (
     HOOK_OF,
     appended,
+    at_end_of_class,
     class_named,
     needed_imports,
     new_hook,
+    repr_text,
     returned,
+    snippet,
 )
 from workbench.authoring.camera_source.result import Refusal, SourceEdit
-from workbench.authoring.camera_source.snippet import repr_text, snippet
 from workbench.authoring.camera_source.write_pose import look_at_text
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.text import FUNCTIONS, Refused, Replacement, SourceFile
-from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
+from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, why_no_camera
 from workbench.core.pictures import CameraKind
 
 
@@ -147,6 +150,66 @@ def plan_remove(sources: Mapping[str, str], key: CameraKey, run: Run) -> SourceE
         return _proven(project, call.file, new_text, notes, ran, run, key, None)
     except Refused as refused:
         return Refusal(refused.reason)
+
+
+_PARSE = ("parse_camera_configs", "from mani_skill.sensors.camera import parse_camera_configs\n")
+
+
+def override_text(
+    kind: CameraKind, uid: str, settings: CameraSettings, more: Sequence[str] = (), indent: str = "    "
+) -> str:
+    """The whole hook, to be copied into a class; `more` are arguments of the camera, such as its mount."""
+    hook, inner = HOOK_OF[kind], indent + "    "
+    lines = (
+        f"{indent}@property",
+        f"{indent}def {hook}(self):",
+        f"{inner}cameras = parse_camera_configs(super().{hook})",
+        f"{inner}cameras[{repr_text(uid)}] = {snippet(uid, settings, inner, more)}",
+        f"{inner}return cameras",
+    )
+    return "\n".join(lines) + "\n"
+
+
+def plan_override(
+    sources: Mapping[str, str],
+    file: str,
+    class_name: str,
+    kind: CameraKind,
+    uid: str,
+    settings: CameraSettings,
+    site: CallSite,
+    run: Run,
+    more: Sequence[str] = (),
+) -> SourceEdit | Refusal:
+    """The edit that gives `class_name` such a hook; `site` is where the parent makes the camera."""
+    why = why_no_camera(settings)
+    if why is not None:
+        return Refusal(why)
+    hook, parent = HOOK_OF[kind], site.function.rpartition(".")[0]
+    try:
+        project, ran = run_first(sources, run)
+        source = project.given(file)
+        check_own(file)
+        cls = class_named(source, class_name)
+        own = hook in project.bindings(source, cls)
+        owner, where = (class_name, file) if own else ran.owners.get(hook, ("", ""))
+        if where in sources:
+            raise Refused(
+                f"{uid} is made by {parent}, and the {hook} of {owner} ({project.file(where).name}) hands it on: put the "
+                "text below in its place there"
+            )
+        imports, notes = needed_imports(project, source, settings, more=(_PARSE,))
+        replacement = at_end_of_class(
+            source, cls, hook, lambda indent: override_text(kind, uid, settings, more, indent)
+        )
+        told = (
+            f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets a {hook} of its own, with all "
+            f"cameras of {parent} and this one in place of its {uid}"
+        )
+        new_text = source.replaced([*imports, replacement])
+        return _proven(project, source, new_text, [told, *notes], ran, run, (kind, uid), (kind, uid))
+    except Refused as refused:
+        return Refusal(refused.reason, snippet(uid, settings, more=more))
 
 
 def _proven(

@@ -22,14 +22,14 @@ from workbench.authoring.camera_source.cameras import (
     run_first,
     with_fields,
 )
+from workbench.authoring.camera_source.hooks import snippet
 from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
-from workbench.authoring.camera_source.snippet import snippet
 from workbench.authoring.camera_source.write_pose import ANGLE_STEP, POSITION_STEP, why_not_a_pose, write_pose
-from workbench.authoring.source import rotations
 from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import matrix_text, number_text
 from workbench.authoring.source.text import Refused, Replacement
+from workbench.core.camera_frames import angle_between
 from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
 
 
@@ -215,7 +215,7 @@ def _check_asked(
         was, wanted = getattr(found, name, None), getattr(after, name, None)
         if name == "pose":
             moved = max(abs(a - b) for a, b in zip(found.position, after.position, strict=True))
-            turned = rotations.angle_between(found.quaternion, after.quaternion)
+            turned = angle_between(found.quaternion, after.quaternion)
             right = right and moved <= POSITION_STEP and turned <= 1.5 * ANGLE_STEP
         elif name == "intrinsic" and found.intrinsic is not None and after.intrinsic is not None:
             flat = [[x for row in matrix for x in row] for matrix in (found.intrinsic, after.intrinsic)]

@@ -31,13 +31,10 @@ class FileChange:
 
 
 @dataclass(frozen=True)
-class SourceEdit:
-    """A change of the author's files, not made yet: `workbench.authoring.camera_source.apply` makes it."""
+class SourceEdit(FileChange):
+    """A change of the author's files, not made yet: `workbench.authoring.camera_source.apply` makes it. It is about one
+    of them; where a constant of another module is changed too, that is one of `others`."""
 
-    file: str
-    """The one that it is about; where a constant of another module is changed too, that is one of `others`."""
-    old_text: str
-    new_text: str
     notes: tuple[str, ...]
     """Sentences for the author: what was done otherwise than they may expect."""
     settings: CameraSettings | None
@@ -48,17 +45,12 @@ class SourceEdit:
     @property
     def changes(self) -> tuple[FileChange, ...]:
         """Of every file, the one that it is about first."""
-        return (FileChange(self.file, self.old_text, self.new_text), *self.others)
+        return (self, *self.others)
 
     @property
     def names(self) -> str:
         """Of the files, for a sentence."""
         return " and ".join(change.name for change in self.changes)
-
-    @property
-    def diff(self) -> str:
-        """Of every file, one after the other; see `FileChange.diff`."""
-        return "\n".join(change.diff for change in self.changes)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import list_text, quaternion_texts
 from workbench.authoring.source.text import Replacement, SourceFile
 from workbench.authoring.source.trace import Part
+from workbench.core.camera_frames import angle_between, rotation_matrix
 from workbench.core.camera_settings import CameraSettings
 
 POSITION_STEP = 1e-4
@@ -75,7 +76,7 @@ def write_pose(changes: Changes, project: Project, pose: Part, after: CameraSett
         return
     _position(changes, pose, after.position)
     quaternion = pose.numbers[3:]
-    if rotations.angle_between(quaternion, after.quaternion) <= ANGLE_STEP / 10:
+    if angle_between(quaternion, after.quaternion) <= ANGLE_STEP / 10:
         return
     part = pose.parts.get("q")
     if part is not None and part.function and _euler(changes, part, after):
@@ -127,14 +128,14 @@ def _look_at(changes: Changes, pose: Part, after: CameraSettings) -> bool:
     """Write eye and target, if a look_at can say where the camera looks."""
     eye, target = pose.parts["eye"], pose.parts["target"]
     up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
-    forward = rotations.matrix(after.quaternion)[:, 0].tolist()
+    forward = rotation_matrix(after.quaternion)[:, 0].tolist()
     # As close to `up` as this, 0.1 mm of the target turns the picture.
     if abs(_cosine(forward, up)) > math.cos(1e-3):
         return False
 
     def error(a: Sequence[float], b: Sequence[float]) -> float:
         quaternion = rotations.look_at(a, b, up)
-        return math.inf if quaternion is None else rotations.angle_between(quaternion, after.quaternion)
+        return math.inf if quaternion is None else angle_between(quaternion, after.quaternion)
 
     still = error(after.position, target.numbers) <= _STILL_AT_TARGET
     for decimals in _METRES if still else ():
@@ -158,7 +159,7 @@ def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str
     Args:
         aim: the point that it looks at; else it is one a metre ahead.
     """
-    forward = rotations.matrix(settings.quaternion)[:, 0]
+    forward = rotation_matrix(settings.quaternion)[:, 0]
     ahead = [float(x) for x in settings.position + forward]
     if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
         return None
@@ -166,7 +167,7 @@ def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str
         for decimals in _METRES:
             eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
             made = rotations.look_at(eye, point)
-            if made is not None and rotations.angle_between(made, settings.quaternion) <= ANGLE_STEP:
+            if made is not None and angle_between(made, settings.quaternion) <= ANGLE_STEP:
                 return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
     return None
 
@@ -175,7 +176,7 @@ def _as_quaternion(changes: Changes, project: Project, pose: Part, after: Camera
     """A pose in place of a look_at, with the author's own expression for where the camera stands."""
     file, node = changes.find(pose.at)
     assert isinstance(node, ast.Call)
-    height = float(rotations.matrix(after.quaternion)[2, 0])
+    height = float(rotation_matrix(after.quaternion)[2, 0])
     if abs(height) > math.cos(1e-3):
         changes.note(
             f"the camera looks straight {'down' if height < 0 else 'up'}; look_at gives no valid rotation there (its "
@@ -231,7 +232,7 @@ def _euler(changes: Changes, angles: Part, after: CameraSettings) -> bool:
     wanted = rotations.to_euler(after.quaternion, [item.numbers[0] for item in items])
     for decimals in (4, 5, 6):
         roll, pitch, yaw = (settled(item, w, decimals) for item, w in zip(items, wanted, strict=True))
-        if rotations.angle_between(rotations.from_euler(roll, pitch, yaw), after.quaternion) <= ANGLE_STEP:
+        if angle_between(rotations.from_euler(roll, pitch, yaw), after.quaternion) <= ANGLE_STEP:
             for item, w in zip(items, wanted, strict=True):
                 changes.number(item, w, decimals)
             return True

@@ -9,9 +9,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from transforms3d.euler import euler2quat
-from transforms3d.quaternions import mat2quat, qconjugate, qmult, quat2mat
+from transforms3d.quaternions import mat2quat
+
+from workbench.core.camera_frames import rotation_matrix
 
 Quaternion = tuple[float, float, float, float]
 
@@ -23,18 +24,6 @@ def unit(quaternion: Sequence[float]) -> Quaternion:
         raise ValueError("a quaternion of length 0 is no orientation")
     w, x, y, z = (float(part) / length for part in quaternion)
     return w, x, y, z
-
-
-def matrix(quaternion: Sequence[float]) -> NDArray[np.float64]:
-    """(3, 3), of a quaternion of any length but 0."""
-    return quat2mat(unit(quaternion))
-
-
-def angle_between(a: Sequence[float], b: Sequence[float]) -> float:
-    """Radians of the rotation from one orientation to the other; q and -q are the same one."""
-    # By the vector part, which keeps its digits where the angle is small.
-    w, *vector = qmult(unit(a), qconjugate(unit(b)))
-    return 2 * math.atan2(math.hypot(*vector), abs(w))
 
 
 def look_at(
@@ -58,7 +47,7 @@ def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 def to_euler(quaternion: Sequence[float], near: Sequence[float]) -> tuple[float, float, float]:
     """The angles of `from_euler`, of the ways to say them the one closest to `near`. Radians."""
-    m = matrix(quaternion)
+    m = rotation_matrix(quaternion)
     level = math.hypot(m[0, 0], m[1, 0])
     if level > 1e-6:
         roll, pitch = math.atan2(m[2, 1], m[2, 2]), math.atan2(-m[2, 0], level)
