@@ -42,6 +42,7 @@ ENOUGH = 85
 
 PROTECTED = {
     "recording/journal": "recording/test_journal.py",
+    "recording/reader/episode_wire": "recording/test_episode_wire.py",
     "recording/recover": "recording/test_recover.py",
     "recording/trash": "recording/test_trash.py",
     "authoring/registry": "authoring/test_registry.py",

@@ -63,7 +63,7 @@ def test_the_library_lists_them(place: Path, expected: dict[str, Any]) -> None:
     library = Library(place)
     library.refresh()
     rows = {row.name: row for row in library.rows()}
-    pictured = {name for name, row in rows.items() if library.thumbnail(row.id)}
+    pictured = {name for name, row in rows.items() if library.thumbnails((row.id,))}
     library.close()
     assert sorted(rows) == sorted(f"{kind}/{name}" for kind in KINDS for name in expected[kind])
     for kind in KINDS:

@@ -20,7 +20,7 @@ from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.entries import split_entries
 from workbench.core.step import OtherEntry
-from workbench.recording.entry_texts import (
+from workbench.recording.columns import (
     CUT,
     MOST_BYTES,
     TextWriter,

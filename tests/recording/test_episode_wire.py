@@ -15,8 +15,8 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes,
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import OtherEntry
 from workbench.jobs.wire import Unpacker, pack_message
+from workbench.recording.columns import MOST_LINES
 from workbench.recording.encoded_pictures import EncodedPictures, Modality, encode
-from workbench.recording.entry_texts import MOST_LINES
 from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo, Unread
 from workbench.recording.reader.episode_wire import Garbled, KnownShapes, SentShapes, packed, unpacked
 from workbench.recording.reader.requests import EpisodeRead, PictureRead, RowsRead

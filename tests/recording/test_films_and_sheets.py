@@ -25,7 +25,7 @@ from workbench.recording.camera_pictures import (
 )
 from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.recording.episode import Episode
-from workbench.recording.mp4 import Encoding, write_mp4
+from workbench.recording.films import Encoding, write_mp4
 from workbench.recording.read_episode import read_episode
 from workbench.recording.scene_film import Eye, usual_eye
 
@@ -85,7 +85,7 @@ def test_a_film_is_never_written_over_another_file_and_nothing_half_written_stay
 def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     # In a process of its own: the limit on the size of files cannot be taken back by everybody.
     noise = (
-        "import numpy as np, sys, pathlib; from workbench.recording.mp4 import write_mp4\n"
+        "import numpy as np, sys, pathlib; from workbench.recording.films import write_mp4\n"
         "rng = np.random.default_rng(0)\n"
         "frames = (rng.integers(0, 255, (240, 320, 3), np.uint8) for _ in range(60))\n"
         "try: write_mp4(pathlib.Path(sys.argv[1]), frames, 20)\n"

@@ -97,7 +97,10 @@ def test_a_recording_of_ours_is_a_row_with_what_its_description_says(
     assert row.date is not None and row.date.isoformat() == "2026-11-21T10:00:00+00:00"
     assert [path.suffix for path in row.paths] == [".json", ".h5", ".rrd"]
     assert row.size == sum(path.stat().st_size for path in row.paths)
-    assert library.thumbnail("ab12") == jpeg() and library.thumbnail("other") is None
+    assert (
+        library.thumbnails(("ab12",)).get("ab12") == jpeg()
+        and library.thumbnails(("other",)).get("other") is None
+    )
 
 
 def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
@@ -146,8 +149,8 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
         file.create_dataset("traj_0/obs/sensor_data/hand/rgb", data=seen, compression="gzip")
     library.refresh()
     first, second = library.rows()
-    picture = library.thumbnail(first.id)
-    assert picture is not None and library.thumbnail(second.id) is None
+    picture = library.thumbnails((first.id,)).get(first.id)
+    assert picture is not None and library.thumbnails((second.id,)).get(second.id) is None
     with Image.open(io.BytesIO(picture)) as image:
         assert image.size == (96, 64)
         red, green, _ = np.asarray(image.convert("RGB")).mean((0, 1))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from workbench.recording.episode import CameraTrack, Episode
+from workbench.recording.episode import CameraTrack, Episode, camera_names
 
 SMALLEST_SIDE = 256
 """Pixels. What a policy sees is often 128 wide, which no player shows well; whole pixels are repeated."""
@@ -21,18 +21,10 @@ GOOD, BAD = (43, 138, 62), (201, 42, 42)
 
 
 def cameras_by_name(episode: Episode) -> dict[str, CameraTrack]:
-    """The cameras that have colour pictures, by the names that people give them.
-
-    Where a human-render camera is called like a sensor, ``_human`` follows its name.
-    """
+    """The cameras that have colour pictures, by their `camera_names`; sensors first."""
     seen = [camera for camera in episode.cameras if camera.rgb is not None and len(camera.rgb)]
-    named: dict[str, CameraTrack] = {}
-    for camera in sorted(seen, key=lambda camera: camera.info.kind != "sensor"):
-        name = camera.info.name
-        while name in named:
-            name += f"_{camera.info.kind}"
-        named[name] = camera
-    return named
+    seen.sort(key=lambda camera: camera.info.kind != "sensor")
+    return dict(zip(camera_names([camera.info for camera in seen]), seen))
 
 
 def camera_of(episode: Episode, name: str) -> CameraTrack:

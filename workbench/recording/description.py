@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from workbench.recording.columns import BATCH
+from workbench.recording.columns import BATCH, tracks_words
 from workbench.recording.document import SHARED, CameraWords, ColumnWords, Description, SceneWords, checksum
 from workbench.recording.encoded_pictures import small_jpeg
-from workbench.recording.entry_texts import tracks_words
 from workbench.recording.made_here import seal
 from workbench.recording.survey import Survey
 

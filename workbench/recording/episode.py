@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import datetime
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import OtherEntry
+from workbench.recording.columns import TextTrack, entry_at
 from workbench.recording.encoded_pictures import EncodedPictures
-from workbench.recording.entry_texts import TextTrack, entry_at
 
 
 def _now() -> str:
@@ -96,6 +96,17 @@ class CameraTrack:
     rgb: EncodedPictures | None = None
     depth: EncodedPictures | None = None
     segmentation: EncodedPictures | None = None
+
+
+def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
+    """What people know each by: its name, after which ``_human`` follows where a sensor has the same."""
+    names = [""] * len(cameras)
+    for index in sorted(range(len(cameras)), key=lambda index: cameras[index].kind != "sensor"):
+        name = cameras[index].name or "unnamed"
+        while name in names:
+            name += f"_{cameras[index].kind}"
+        names[index] = name
+    return names
 
 
 @dataclass(frozen=True)

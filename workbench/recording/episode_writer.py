@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import OtherEntry
-from workbench.recording.columns import Layout
+from workbench.recording.columns import TEXT, Layout, TextWriter
 from workbench.recording.encode_soon import encode_soon
 from workbench.recording.encoded_pictures import MODALITIES, Modality
-from workbench.recording.entry_texts import KIND as TEXT
-from workbench.recording.entry_texts import TextWriter
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.journal import FOLDER, Entry, Journal
 from workbench.recording.journal import Item as JournalItem

@@ -11,7 +11,7 @@ read. A state's pictures come before its row, so a state is there with all of it
 - ``header``: JSON; the scene's meshes lie beside it (`scene_file`);
 - ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: a row of that layout, or several one behind the other;
 - ``acted`` `action`: text of what chooses the actions from this one on, where the header does not say it;
-- ``entry`` `state`: JSON of an entry of ``evaluate()`` that is no number and changes here (`entry_texts`);
+- ``entry`` `state`: JSON of an entry of ``evaluate()`` that is no number and changes here (`columns.TextWriter`);
 - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 
 A row is on the disk within half a second, and its owner does not wait for that: one thread for all journals of the process writes

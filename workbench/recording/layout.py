@@ -39,6 +39,7 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import BATCH, EVALUATE, OBS
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
+from workbench.recording.episode import camera_names
 from workbench.recording.rerun_chunks import TimedChunks, series_chunk, static_chunk, still_pose
 from workbench.recording.survey import CameraSurvey, Pictures, Survey
 
@@ -136,16 +137,8 @@ def body_entities(geometry: SceneGeometry) -> tuple[str, ...]:
 
 
 def camera_entities(cameras: Sequence[CameraInfo]) -> tuple[str, ...]:
-    """Entity path of each camera; a human-render camera gives way to a sensor of the same name."""
-    taken: set[str] = set()
-    entities = [""] * len(cameras)
-    for index in sorted(range(len(cameras)), key=lambda i: cameras[i].kind != "sensor"):
-        name = cameras[index].name or "unnamed"
-        while name in taken:
-            name += f"_{cameras[index].kind}"
-        taken.add(name)
-        entities[index] = rr.new_entity_path(["world", "cameras", name])
-    return tuple(entities)
+    """Entity path of each camera."""
+    return tuple(rr.new_entity_path(["world", "cameras", name]) for name in camera_names(cameras))
 
 
 def evaluate_entity(name: str) -> str:

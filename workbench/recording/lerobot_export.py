@@ -24,8 +24,8 @@ import pyarrow.parquet as pq
 
 from workbench.recording import lerobot_format as form
 from workbench.recording.episode import Episode
+from workbench.recording.films import Encoding, FilmWriter
 from workbench.recording.lerobot_frames import Choice, Frames, feature_name, frames_of
-from workbench.recording.mp4 import Encoding, FilmWriter
 
 ENCODING = Encoding(crf=20, key_every=2, exact_size=True)
 """A whole frame every second one, as lerobot's own films: training asks for frames in no order."""

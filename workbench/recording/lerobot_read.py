@@ -27,7 +27,7 @@ from workbench.recording import lerobot_format as form
 from workbench.recording.document import read_json
 from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
-from workbench.recording.film_pictures import FilmPictures
+from workbench.recording.films import FilmPictures
 from workbench.recording.library_row import Facts, text, whole
 from workbench.recording.sources import UnreadableRecording
 

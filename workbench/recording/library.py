@@ -118,9 +118,6 @@ class Library:
         jpegs = {} if index is None or not places else index.thumbnails(list(places.values()))
         return {id: jpegs[place] for id, place in places.items() if place in jpegs}
 
-    def thumbnail(self, id: str) -> bytes | None:
-        return self.thumbnails((id,)).get(id)
-
     # --- keeping up with the folder ------------------------------------------------------------------
 
     def watch(self) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry, SharedShapes
+from workbench.recording.columns import tracks_from
 from workbench.recording.document import (
     CameraWords,
     ColumnWords,
@@ -30,7 +31,6 @@ from workbench.recording.document import (
     task_file,
 )
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
-from workbench.recording.entry_texts import tracks_from
 from workbench.recording.episode import CameraTrack, Episode, Unread
 from workbench.recording.layout import (
     OBSERVATION,

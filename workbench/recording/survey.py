@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.recording.columns import EVALUATE, assemble, layout_type
+from workbench.recording.columns import EVALUATE, TEXT, TextTrack, assemble, layout_type, tracks_of
 from workbench.recording.document import CameraWords, json_text
 from workbench.recording.encoded_pictures import MODALITIES, Modality
-from workbench.recording.entry_texts import KIND as TEXT
-from workbench.recording.entry_texts import TextTrack, tracks_of
 from workbench.recording.episode import EpisodeInfo, acted_by_from, flag_of
 from workbench.recording.journal import Entry, read_journal
 from workbench.recording.made_here import is_sealed, seal_text

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes, Visual
+from workbench.recording.columns import MOST_LINES
 from workbench.recording.document import CameraWords
 from workbench.recording.encoded_pictures import (
     MODALITIES,
@@ -24,7 +25,6 @@ from workbench.recording.encoded_pictures import (
     LazyPictures,
     Modality,
 )
-from workbench.recording.entry_texts import MOST_LINES
 from workbench.recording.episode import CameraTrack, Episode, Unread
 from workbench.recording.reader.requests import CameraRead, EpisodeRead, PictureRead, ShapeRead, VisualRead
 

@@ -1,4 +1,4 @@
-"""The process that readers are made of: it has imported what they need, and has read nothing itself.
+"""The process that readers are made of, which has imported what they need and has read nothing itself; and their loop.
 
 Started as ``python -m workbench.recording.reader.nursery SOCKET``, it forks a reader for each folder that somebody
 wants to look into. That takes milliseconds where starting Python takes half a second, and a reader that was ended is
@@ -13,16 +13,44 @@ import os
 import signal
 import socket
 import sys
+from collections import OrderedDict
 from multiprocessing.connection import Connection
+from typing import Literal, get_args
 
-from workbench.jobs.wire import Unpacker, pack
+from workbench.jobs.wire import Unpacker, pack, pack_message
 from workbench.machine.confinement import confine, end_with_parent
-from workbench.recording.reader.requests import Ended, NewReader
-from workbench.recording.reader.serve import serve, warm_up
+from workbench.recording.encoded_pictures import EncodedPictures
+from workbench.recording.episode import CameraTrack
+from workbench.recording.library_read import read_found
+from workbench.recording.library_row import text
+from workbench.recording.library_scan import found_of
+from workbench.recording.reader.episode_wire import SentShapes, packed
+from workbench.recording.reader.requests import (
+    Answer,
+    Ended,
+    EpisodeRead,
+    Failed,
+    Forget,
+    ForRerun,
+    NewReader,
+    Open,
+    PictureAt,
+    PictureRead,
+    Request,
+    Rows,
+    RowsRead,
+    Sources,
+    SourcesFound,
+    ToldRerun,
+)
+from workbench.recording.sources import Source, UnreadableRecording
 
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
 LONGEST = 1 << 20
+MOST_SHARED = 4
+"""Groups of episodes whose shapes are remembered."""
+LONGEST_WORDS = 600
 
 
 def main() -> None:
@@ -62,6 +90,130 @@ def _be_a_reader(connection: Connection, wanted: NewReader, nursery: int) -> Non
         serve(connection)
     finally:
         os._exit(0)
+
+
+# --- a reader --------------------------------------------------------------------------------------
+
+
+def warm_up() -> None:
+    """Import what reads an episode."""
+    import workbench.recording.blueprint_in_file
+    import workbench.recording.lerobot_read
+    import workbench.recording.read_episode  # noqa: F401
+
+
+def serve(connection: Connection) -> None:
+    """Answer one request after the other, until nobody asks any more."""
+    reader, unpacker = _Reader(), Unpacker(get_args(Request))
+    while True:
+        try:
+            wanted = unpacker.message(connection.recv_bytes())
+            if isinstance(wanted, Forget):
+                reader.forget(wanted.opened)
+                continue
+            connection.send_bytes(reader.answer(wanted))
+        except (EOFError, OSError):
+            return
+
+
+class _Reader:
+    def __init__(self) -> None:
+        self._opened: dict[int, list[CameraTrack]] = {}
+        self._number = 0
+        self._shapes: OrderedDict[int, SentShapes] = OrderedDict()
+
+    def forget(self, opened: list[int]) -> None:
+        for number in opened:
+            self._opened.pop(number, None)
+
+    def answer(self, wanted: Request) -> bytes:
+        """Packed, which a reader may have no memory for either."""
+        try:
+            return pack_message(self._answer(wanted))
+        except UnreadableRecording as error:
+            failed = _failed("unreadable", str(error))
+        except MemoryError:
+            failed = _failed("unreadable", "To read it takes more memory than a recording may take.")
+        except OSError as error:
+            failed = _failed("system", str(error))
+        except Exception as error:
+            # Files of strangers: what they can be wrong in has no end, and the next one is to be read too.
+            failed = _failed("unreadable", f"It cannot be read ({type(error).__name__}: {error}).")
+        except BaseException as error:
+            if type(error).__name__ != "PanicException":  # of rerun's reader, which is Rust
+                raise
+            failed = _failed("unreadable", f"It cannot be read (rerun's reader gave up: {error}).")
+        return pack_message(failed)
+
+    def _answer(self, wanted: Request) -> Answer:
+        if isinstance(wanted, Rows):
+            found = found_of(os.fsdecode(wanted.key), wanted.signature)
+            entries = read_found(wanted.folder, found)
+            return RowsRead([facts for facts, _ in entries], [thumbnail for _, thumbnail in entries])
+        if isinstance(wanted, Open):
+            return self._open(wanted)
+        if isinstance(wanted, PictureAt):
+            return self._picture(wanted)
+        if isinstance(wanted, Sources):
+            return _sources(wanted)
+        assert isinstance(wanted, ForRerun)
+        return _told_rerun(wanted)
+
+    def _open(self, wanted: Open) -> EpisodeRead:
+        from workbench.recording.lerobot_read import read_lerobot
+        from workbench.recording.read_episode import read_inert, read_maniskill
+
+        shapes = self._shapes.setdefault(wanted.sharing, SentShapes())
+        self._shapes.move_to_end(wanted.sharing)
+        while len(self._shapes) > MOST_SHARED:
+            self._shapes.popitem(last=False)
+        source_path = None
+        if wanted.kind == "lerobot":
+            episode = read_lerobot(wanted.path, int(wanted.part))
+        elif wanted.kind == "maniskill":
+            episode = read_maniskill(wanted.path, wanted.part)
+        else:
+            episode, source_path = read_inert(wanted.path, shapes.shapes)
+        self._number += 1
+        self._opened[self._number] = episode.cameras
+        return packed(episode, source_path, self._number, shapes)
+
+    def _picture(self, wanted: PictureAt) -> PictureRead | Failed:
+        cameras = self._opened.get(wanted.opened, [])
+        if not 0 <= wanted.camera < len(cameras):
+            return _failed("gone", "That recording is not open.")
+        pictures: EncodedPictures | None = getattr(cameras[wanted.camera], wanted.modality)
+        if pictures is None or not 0 <= wanted.index < len(pictures):
+            return _failed("unreadable", "There is no such picture.")
+        if wanted.encoded:
+            return PictureRead(blob=pictures.blob(wanted.index))
+        return PictureRead(pictures[wanted.index])
+
+
+def _sources(wanted: Sources) -> SourcesFound:
+    from workbench.recording.read_maniskill import trajectories
+    from workbench.recording.source_files import sources_in
+
+    if wanted.trajectories:
+        return SourcesFound([Source(wanted.path, name) for name in trajectories(wanted.path)])
+    return SourcesFound(list(sources_in(wanted.path)))
+
+
+def _told_rerun(wanted: ForRerun) -> ToldRerun:
+    from workbench.recording.blueprint_in_file import blueprint_stream
+    from workbench.recording.rerun_seam import store_id
+
+    found = []
+    for ask in (store_id, blueprint_stream):
+        try:
+            found.append(ask(wanted.path))
+        except (ValueError, OSError, RuntimeError, AssertionError):
+            found.append(None)  # rerun then shows it in an arrangement of its own, from its first moment on
+    return ToldRerun(found[0], found[1])
+
+
+def _failed(why: Literal["unreadable", "system", "gone"], words: str) -> Failed:
+    return Failed(why, text(words, LONGEST_WORDS))
 
 
 if __name__ == "__main__":
