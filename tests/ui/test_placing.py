@@ -12,7 +12,7 @@ from tests.ui.scenes import camera
 from workbench.core.camera_frames import LookAt, pose_from_look_at, with_pose
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.placing import Placing
+from workbench.ui.camera_moves import Placing
 
 EYE, TARGET = (0.45, 0.0, 0.6), (0.08, 0.0, 0.2)
 """It looks at something above the ground, which a line of sight does not tell."""

@@ -200,3 +200,9 @@ class StudioView:
     def chosen(self) -> StudioCamera | None:
         """The selected camera."""
         return self.camera(self.selected)
+
+    @property
+    def placeable(self) -> StudioCamera | None:
+        """The selected camera, if it can be placed: then it is known how it is."""
+        chosen = self.chosen
+        return None if chosen is None or chosen.now is None or chosen.refused else chosen

@@ -36,11 +36,10 @@ from workbench.core.camera_frames import (
 )
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.camera_moves import Floats, kept_where_equal, rounded
+from workbench.ui.camera_moves import FARTHEST, Floats, Placing, kept_where_equal, rounded
 from workbench.ui.control_values import limit_text
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
-from workbench.ui.placing import FARTHEST, Placing
 
 TYPED = 0.3
 """Seconds without another number after which the last is taken: the arrows beside a field are held down."""

@@ -20,12 +20,12 @@ from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
+from workbench.ui.camera_moves import FARTHEST
 from workbench.ui.camera_work import Answer
 from workbench.ui.controls import refusals_told
 from workbench.ui.env_layout import box_corners
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
-from workbench.ui.placing import FARTHEST
 from workbench.ui.presses import Presses
 from workbench.ui.selection_mark import line_set
 
@@ -137,8 +137,7 @@ class CameraSuggest:
 
     def draw(self, view: SessionView) -> None:
         studio, camera = view.studio, view.studio.chosen
-        able = camera is not None and camera.now is not None and not camera.refused
-        self._search.disabled = not able
+        self._search.disabled = studio.placeable is None
         self._draw_mounted(camera)
         self._draw_bounds(camera)
         self._draw_names(view)

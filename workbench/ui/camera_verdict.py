@@ -9,7 +9,6 @@ is seen; pressing a step of it shows that moment.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +19,7 @@ from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport,
 from workbench.core.pictures import Picture
 from workbench.session.camera_judging import MOST_SEEDS, MOST_STEPS
 from workbench.session.session import Session
-from workbench.session.studio_view import Looked, StudioCamera, StudioView
+from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import Answer
 from workbench.ui.fragments import counted, render
@@ -101,15 +100,13 @@ class CameraVerdict:
 
     def _use(self, plane: str) -> None:
         studio = self._session.view().studio
-        camera, report = studio.chosen, studio.looked.report
+        camera, report = studio.placeable, studio.looked.report
         if camera is None or camera.now is None or report is None or studio.looked.report_of != camera.key:
             return
-        value = report.depth.suggested_near if plane == "near" else report.depth.suggested_far
-        if value is None:
-            return
-        wanted = replace(camera.now, near=value) if plane == "near" else replace(camera.now, far=value)
-        if wanted.near < wanted.far:
-            self._session.studio.place(camera.key, wanted)
+        near = report.depth.suggested_near if plane == "near" else camera.now.near
+        far = report.depth.suggested_far if plane == "far" else camera.now.far
+        if near is not None and far is not None and near < far:
+            self._session.studio.place(camera.key, replace(camera.now, near=near, far=far))
 
     # --- drawn ---------------------------------------------------------------------------------------
 
@@ -127,21 +124,66 @@ class CameraVerdict:
 
         def html(new: bool) -> str:
             assert camera is not None and report is not None, "drawn only then"
-            seen_at = [
-                {
-                    "words": f"step {moment.step}",
-                    "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
-                }
-                for i, moment in enumerate(looked.report_moments)
-            ]
-            uses = {
-                plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p))
-                for plane in ("near", "far")
-            }
-            return report_html(report, camera, looked, studio.report_stale, new, uses, seen_at)
+            return self._report_html(studio, camera, report, new)
 
         told = studio.report_stale, looked.judging, None if camera is None else camera.now
         self._report.draw(studio.progress, report, told, html)
+
+    def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
+        """The table, the bars and the planes that would fit; `new`: it is to come into sight."""
+        looked, depth, lens = studio.looked, report.depth, camera.now or camera.info
+        moments = [
+            {
+                "words": f"step {moment.step}",
+                "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
+            }
+            for i, moment in enumerate(looked.report_moments)
+        ]
+        planes = []
+        for name, now, better in (
+            ("near", lens.near, depth.suggested_near),
+            ("far", lens.far, depth.suggested_far),
+        ):
+            fits = better is None or abs(better / now - 1) < 0.02
+            press = self._presses.id_of(name, lambda _, plane=name: self._use(plane))
+            planes.append(
+                {
+                    "name": name,
+                    "now": metres(now),
+                    "better": "" if fits or better is None else metres(better),
+                    "press": "" if studio.placeable is None else press,
+                }
+            )
+        count = len(report.envs)
+        over = (
+            counted(count, "fresh reset") if looked.report_seeds else f"{counted(count, 'env')} as they are"
+        )
+        unit = "envs"
+        if moments:
+            span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
+            over, unit = (
+                f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; press a step to go there",
+                "steps",
+            )
+        width, height = report.judged_size
+        return render(
+            "camera_report",
+            stale=studio.report_stale,
+            before=looked.judging,
+            new=new,
+            over=over,
+            how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
+            "without the robot if that is in it, and of each object alone",
+            unit=unit,
+            moments=moments,
+            headline=headline(report, unit),
+            rows=object_rows(report, unit),
+            bars=histogram(depth, lens.near, lens.far),
+            metres=metres,
+            background=percent(float(depth.background.mean())),
+            beyond=percent(float(depth.beyond.mean())),
+            planes=planes,
+        )
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         looked, env = view.studio.looked, view.selected_env
@@ -182,68 +224,6 @@ class CameraVerdict:
         task = self._session.view().task
         if task is not None and env < task.num_envs:  # a version with fewer envs may have been loaded since
             self._session.change(selected_env=env)
-
-
-def report_html(
-    report: CameraReport,
-    camera: StudioCamera,
-    looked: Looked,
-    moved: bool,
-    new: bool,
-    uses: dict[str, str],
-    moments: Sequence[dict[str, str]] = (),
-) -> str:
-    """The table, the bars and the planes that would fit.
-
-    Args:
-        looked: what it is of.
-        moved: the camera stands otherwise by now.
-        new: it is to come into sight.
-        uses: what takes a near or far plane that would fit.
-        moments: where the report is over an episode's steps, ``words`` and ``press`` of each.
-    """
-    depth, info = report.depth, camera.info
-    near = info.near if camera.now is None else camera.now.near
-    far = info.far if camera.now is None else camera.now.far
-    planes = []
-    for name, now, better in (("near", near, depth.suggested_near), ("far", far, depth.suggested_far)):
-        fits = better is None or abs(better / now - 1) < 0.02
-        planes.append(
-            {
-                "name": name,
-                "now": metres(now),
-                "better": "" if fits or better is None else metres(better),
-                "press": uses[name] if camera.now is not None and not camera.refused else "",
-            }
-        )
-    count = len(report.envs)
-    over = counted(count, "fresh reset") if looked.report_seeds else f"{counted(count, 'env')} as they are"
-    unit = "envs"
-    if moments:
-        span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
-        over, unit = (
-            f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; press a step to go there",
-            "steps",
-        )
-    width, height = report.judged_size
-    return render(
-        "camera_report",
-        stale=moved,
-        before=looked.judging,
-        new=new,
-        over=over,
-        how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
-        "without the robot if that is in it, and of each object alone",
-        unit=unit,
-        moments=moments,
-        headline=headline(report, unit),
-        rows=object_rows(report, unit),
-        bars=histogram(depth, near, far),
-        metres=metres,
-        background=percent(float(depth.background.mean())),
-        beyond=percent(float(depth.beyond.mean())),
-        planes=planes,
-    )
 
 
 # --- a report in words, rows and bars: plain functions of plain data ---------------------------------

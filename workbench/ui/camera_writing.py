@@ -24,12 +24,11 @@ from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioView, Wish, Writing
 from workbench.session.view import SessionView
-from workbench.ui.camera_moves import rounded
+from workbench.ui.camera_moves import Placing, rounded
 from workbench.ui.camera_work import Arrival
 from workbench.ui.control_values import limit_text
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
-from workbench.ui.placing import Placing
 from workbench.ui.viser_seam import element_id
 
 LEAVE, CLOSE = "Leave the file as it is", "Close"

@@ -5,8 +5,8 @@ tell whose numbers they read. It is chosen here or by a press on its frustum. It
 since it is what every movement is judged by; what one does all the time (look through it, undo) is under it, then
 where it is; the lens, which is set once, is folded.
 
-This module is the tab and who is told of what. What a movement means is in `camera_moves`; `placing` is the one way
-to the session; `camera_gizmo`, `camera_numbers`, `look_through` and `camera_writing` are the parts.
+This module is the tab and who is told of what. What a movement means, and the one way to the session, is in
+`camera_moves`; `camera_gizmo`, `camera_numbers` and `camera_writing` are the parts.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from workbench.session.view import SessionView
 from workbench.ui.camera_compare import CameraCompare
 from workbench.ui.camera_export import CameraExport
 from workbench.ui.camera_frustums import Placed
-from workbench.ui.camera_gizmo import CameraGizmo
-from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
+from workbench.ui.camera_gizmo import CameraGizmo, LookThrough
+from workbench.ui.camera_moves import Floats, Frame, Placing, Snap, nudged, panned
 from workbench.ui.camera_numbers import CameraLens, CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_suggest import CameraSuggest
@@ -41,9 +41,7 @@ from workbench.ui.cameras_panel import KIND_NAMES, StudioPicture
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control, refusals_told
 from workbench.ui.fragments import render, sentence
-from workbench.ui.look_through import LookThrough
 from workbench.ui.parts import Clock, PagePart
-from workbench.ui.placing import Placing
 from workbench.ui.presses import Presses
 
 NOBODY = "none"
@@ -144,7 +142,7 @@ class StudioPanel(PagePart[SessionView]):
         self._placing.offset = offset
         self._suggest.draw_in_view(view, offset)
         self._pick.draw_in_view(view, offset)
-        chosen = self._shown(view.studio)
+        chosen = view.studio.placeable
         camera = chosen if view.timeline.shown is None else None
         self._look.draw(chosen)
         eye = None if chosen is None else self._placing.frame(chosen).to_view(_placed(chosen))
@@ -154,10 +152,6 @@ class StudioPanel(PagePart[SessionView]):
         if chosen is None or eye is None:
             return {}
         return {chosen.key: Placed(eye, _placed(chosen), hidden=covered)}
-
-    def _shown(self, studio: StudioView) -> StudioCamera | None:
-        chosen = studio.chosen
-        return None if chosen is None or chosen.now is None or chosen.refused else chosen
 
     def _is_in_eye(self, pose: Floats) -> bool:
         """Whether a page looks from where the camera stands: its frustum, with its picture, would fill that view."""
@@ -172,7 +166,7 @@ class StudioPanel(PagePart[SessionView]):
         studio = view.studio
         self._draw_choice(view)
         self._writing.draw(studio)
-        chosen, camera = studio.chosen, self._shown(studio)
+        chosen, camera = studio.chosen, studio.placeable
         if chosen is None and self._is_empty:
             return
         self._is_empty = chosen is None
