@@ -216,7 +216,7 @@ class CameraStudio:
     def back_to_file(self, key: CameraKey) -> None:
         """Place a camera as the file says."""
         with self._lock:
-            file = self._cameras.placements.file(key)
+            file = self._cameras.placements.said.get(key)
             moved = file is not None and self._cameras.placements.place(
                 key, file, words=f"put {key[1]} back to the file"
             )
@@ -379,7 +379,7 @@ class CameraStudio:
                 self.judging.outdate()
             # The dropped ones too: their placement may have been on its way while the version came in. And those that
             # were changed here: taken back, one stands as the file says, which a version that is the same does not tell.
-            asked = (*self._cameras.placements.all_moved, *dropped, *(own & said.keys()))
+            asked = (*self._cameras.placements.placed, *dropped, *(own & said.keys()))
             return tuple(dict.fromkeys(asked))
 
     def interrupted(self) -> None:
@@ -399,7 +399,7 @@ class CameraStudio:
         """What is to be asked of another worker, so that its cameras stand where they are placed."""
         with self._lock:
             return tuple(
-                PlaceCamera(key, settings) for key, settings in self._cameras.placements.all_moved.items()
+                PlaceCamera(key, settings) for key, settings in self._cameras.placements.placed.items()
             )
 
     def placed(self, event: Placed, task: TaskDescription | None) -> None:
@@ -432,8 +432,7 @@ class CameraStudio:
         # What is asked for is read and sent in one go, or of two threads the one that read first might send last.
         with self._asking:
             with self._lock:
-                now = self._cameras.placements
-                requests = [PlaceCamera(key, now.now(key) if now.moved(key) else None) for key in keys]
+                requests = [PlaceCamera(key, self._cameras.placements.placed.get(key)) for key in keys]
             for request in requests:
                 self._send(request)
         self._note()

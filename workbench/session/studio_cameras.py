@@ -43,25 +43,16 @@ class Placements:
     """See the module's text."""
 
     def __init__(self) -> None:
-        self._file: dict[CameraKey, CameraSettings] = {}
-        self._now: dict[CameraKey, CameraSettings] = {}
+        self.said: dict[CameraKey, CameraSettings] = {}
+        """What the loaded version says."""
+        self.placed: dict[CameraKey, CameraSettings] = {}
+        """How cameras stand that were placed otherwise; what is put or taken here is no step of undo."""
         self._done: list[Step] = []
         self._undone: list[Step] = []
 
     def now(self, key: CameraKey) -> CameraSettings | None:
         """None for a camera that there is not, or whose config cannot be said in settings."""
-        return self._now.get(key, self._file.get(key))
-
-    def file(self, key: CameraKey) -> CameraSettings | None:
-        """What the loaded version says."""
-        return self._file.get(key)
-
-    def moved(self, key: CameraKey) -> bool:
-        return key in self._now
-
-    @property
-    def all_moved(self) -> dict[CameraKey, CameraSettings]:
-        return dict(self._now)
+        return self.placed.get(key, self.said.get(key))
 
     @property
     def undo_words(self) -> str | None:
@@ -112,11 +103,7 @@ class Placements:
             self._done.pop()
             self._put(key, last.before)
         else:
-            self._now.pop(key, None)
-
-    def written(self, key: CameraKey) -> None:
-        """The file says now what was placed, or says nothing of this camera any more."""
-        self._now.pop(key, None)
+            self.placed.pop(key, None)
 
     def taken_back(self, key: CameraKey, written: CameraSettings, said: CameraSettings) -> bool:
         """The file says again what it said before a placement was written to it: the camera stands as that says, and
@@ -126,26 +113,22 @@ class Placements:
             written: what was taken out of the file.
             said: what it says now.
         """
-        placed = self._now.get(key)
+        placed = self.placed.get(key)
         if placed is not None and differences(placed, written):
             return False
-        self._now.pop(key, None)
+        self.placed.pop(key, None)
         if differences(written, said):
             words = f"took back the change of {key[1]}"
             self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, written, said, words)]
             self._undone.clear()
         return True
 
-    def keep(self, key: CameraKey, settings: CameraSettings) -> None:
-        """Place a camera that the next version may have, or have otherwise, without a step of undo."""
-        self._now[key] = settings
-
     def rename(self, key: CameraKey, new: CameraKey) -> None:
         """What is known of one camera is from now on of the other."""
-        if key in self._now:
-            self._now[new] = self._now.pop(key)
-        if key in self._file:
-            self._file[new] = self._file[key]
+        if key in self.placed:
+            self.placed[new] = self.placed.pop(key)
+        if key in self.said:
+            self.said[new] = self.said[key]
         for steps in (self._done, self._undone):
             steps[:] = [replace(s, key=new) if s.key == key else s for s in steps]
 
@@ -160,15 +143,15 @@ class Placements:
         Returns:
             cameras whose placement was dropped, since the file says something new of them.
         """
-        before, self._file = self._file, dict(said)
+        before, self.said = self.said, dict(said)
         dropped: list[CameraKey] = []
-        for key, placed in list(self._now.items()):
+        for key, placed in list(self.placed.items()):
             if key not in said:
-                del self._now[key]
+                del self.placed[key]
             elif not differences(placed, said[key]):
-                del self._now[key]
+                del self.placed[key]
             elif key not in own and key in before and differences(before[key], said[key]):
-                del self._now[key]
+                del self.placed[key]
                 dropped.append(key)
                 words = f"took {key[1]} from the file"
                 self._done.append(Step(key, placed, said[key], words))
@@ -177,11 +160,11 @@ class Placements:
         return tuple(dropped)
 
     def _put(self, key: CameraKey, settings: CameraSettings) -> None:
-        file = self._file.get(key)
+        file = self.said.get(key)
         if file is not None and not differences(file, settings):
-            self._now.pop(key, None)
+            self.placed.pop(key, None)
         else:
-            self._now[key] = settings
+            self.placed[key] = settings
 
 
 _IN_WORDS = (
@@ -252,7 +235,7 @@ class StudioCameras:
             key=key,
             info=info,
             now=self.placements.now(key),
-            moved=self.placements.moved(key),
+            moved=key in self.placements.placed,
             mount_pose=self.mount_pose(info),
             refused=self.refusal(key) or "",
         )

@@ -233,22 +233,22 @@ class StudioFile:
         """
         went_back = False
         placements, undone = self._cameras.placements, self.view.stage == "undone"
-        now = placements.now(wish.key)
+        now, placed = placements.now(wish.key), placements.placed.get(wish.key)
         if wish.what == "rename":
             pair = (wish.result, wish.key) if undone else (wish.key, wish.result)
             placements.rename(*pair)
-        elif wish.what == "duplicate" and not undone and placements.moved(wish.key) and now is not None:
-            placements.keep(wish.result, now)
+        elif wish.what == "duplicate" and not undone and placed is not None:
+            placements.placed[wish.result] = placed
         elif wish.what == "edit" and wish.settings is not None:
             if undone and said is not None:
                 went_back = placements.taken_back(wish.key, wish.settings, said)
             elif not undone and now is not None and not differences(now, wish.settings):
-                placements.written(wish.key)  # but for what was rounded
+                placements.placed.pop(wish.key, None)  # but for what was rounded
         elif wish.what == "remove":
-            if not undone and placements.moved(wish.key) and now is not None:
-                self._removed[wish.key] = now
-            elif undone and (placed := self._removed.pop(wish.key, None)) is not None:
-                placements.keep(wish.key, placed)
+            if not undone and placed is not None:
+                self._removed[wish.key] = placed
+            elif undone and wish.key in self._removed:
+                placements.placed[wish.key] = self._removed.pop(wish.key)
         if not undone and wish.what in ("add", "duplicate", "rename"):
             self._cameras.selected = wish.result
         return went_back
