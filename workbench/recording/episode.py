@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
+from workbench.core.geometry import BodyKind, SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import OtherEntry
 from workbench.recording.columns import TextTrack, entry_at
@@ -190,6 +190,15 @@ def flag_of(values: NDArray | None) -> NDArray[np.bool_] | None:
     if values is None or values.ndim != 1:
         return None
     return np.nan_to_num(values.astype(np.float64)) != 0
+
+
+def box_of_moving(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, NDArray]:
+    """Lowest and highest corner (3,), in metres, of where the bodies (..., B, 7) are that can move; the origin where none can."""
+    points = poses[..., np.isin(np.array(kinds), ("link", "dynamic")), :3].reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        points = np.zeros((1, 3), np.float32)
+    return points.min(axis=0), points.max(axis=0)
 
 
 ActedBy = tuple[tuple[int, str], ...]

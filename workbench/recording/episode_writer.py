@@ -96,10 +96,6 @@ class EpisodeWriter:
         return len(self._header.action_names)
 
     @property
-    def folder(self) -> Path:
-        return self._folder
-
-    @property
     def bytes_written(self) -> int:
         """What the episode takes on the disk so far."""
         return self._journal.size

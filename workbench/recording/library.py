@@ -78,7 +78,7 @@ class Library:
         """Held while the folder is looked through: by one thread at a time."""
         self._changing = threading.RLock()
         """Held while `_found` and `_kept` are changed, but not while all that changed is read."""
-        self._changed = threading.Condition()
+        self._changed = threading.Lock()
         self._view = LibraryView(reading=(0, 0))
         self._places: dict[str, tuple[str, int]] = {}
         """Id to key and number of the row in what its files gave."""
@@ -103,12 +103,6 @@ class Library:
     def row(self, id: str) -> LibraryRow | None:
         """None for an id that is not in the table (any more)."""
         return self._by_id.get(id)
-
-    def wait(self, seen: int, timeout: float) -> int:
-        """Wait until the table's serial is not `seen`, at most `timeout` seconds; returns the serial."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._view.serial != seen, timeout)
-            return self._view.serial
 
     def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
         """Small jpegs of those of these recordings that have one."""
@@ -258,7 +252,6 @@ class Library:
                 self._by_id = {row.id: row for row in view.rows}
             if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
                 self._view = replace(view, serial=self._view.serial + 1)
-                self._changed.notify_all()
 
     # --- what is done to recordings --------------------------------------------------------------------
 

@@ -33,7 +33,7 @@ from workbench.recording.columns import BATCH
 from workbench.recording.description import describe
 from workbench.recording.document import fields_of, json_text
 from workbench.recording.encoded_pictures import MODALITIES
-from workbench.recording.episode import EpisodeInfo, acted_by_in_words
+from workbench.recording.episode import EpisodeInfo, acted_by_in_words, box_of_moving
 from workbench.recording.layout import (
     EVENTS,
     LOGS,
@@ -276,12 +276,7 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
 
 def _eye(survey: Survey) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Where the eye is and what it looks at: what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
-    kinds = np.array(survey.header.geometry.body_kinds)
-    points = survey.poses[0, np.isin(kinds, ("link", "dynamic")), :3]
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        points = np.zeros((1, 3), dtype=np.float32)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = box_of_moving(survey.poses[0], survey.header.geometry.body_kinds)
     # Of what differs by centimetres from episode to episode nothing hangs on, and the same blueprint is made once.
     middle = np.round((low + high).astype(np.float64) / 2, 1)
     direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from transforms3d.quaternions import mat2quat, quat2mat
 
 from workbench.core.camera_frames import triple
-from workbench.recording.episode import Episode
+from workbench.recording.episode import Episode, box_of_moving
 
 SIZE = (960, 720)
 """Width and height in pixels."""
@@ -54,12 +54,7 @@ def usual_eye(episode: Episode) -> Eye:
             look_at = position + forward
             return Eye(triple(position), triple(look_at), fovy=float(camera.info.fovy))
     assert episode.poses is not None and episode.geometry is not None
-    moving = np.isin(np.array(episode.geometry.body_kinds), ("link", "dynamic"))
-    points = episode.poses[:, moving, :3].reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
-        points = np.zeros((1, 3), np.float32)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = box_of_moving(episode.poses, episode.geometry.body_kinds)
     middle = (low + high) / 2
     # Origins of bodies, not their outlines: half as far again holds a hand or a cube around its origin.
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1
