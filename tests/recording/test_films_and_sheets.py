@@ -15,19 +15,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workbench.recording.camera_pictures import (
+from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
+from workbench.recording.episode import Episode
+from workbench.recording.episode_pictures import (
+    Eye,
     camera_of,
     cameras_by_name,
     chosen_states,
     contact_sheet,
     enlarged,
     frames,
+    usual_eye,
 )
-from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
-from workbench.recording.episode import Episode
 from workbench.recording.films import Encoding, write_mp4
 from workbench.recording.read_episode import read_episode
-from workbench.recording.scene_film import Eye, usual_eye
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

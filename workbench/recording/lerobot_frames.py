@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.recording.camera_pictures import cameras_by_name, picture_index
 from workbench.recording.episode import Episode
+from workbench.recording.episode_pictures import cameras_by_name, picture_index
 from workbench.recording.lerobot_format import ACTION, DONE, ENVIRONMENT, IMAGES, REWARD, STATE, SUCCESS
 
 

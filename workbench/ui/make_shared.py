@@ -15,11 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.atomic_files import new_file
-from workbench.recording.camera_pictures import camera_of, cameras_by_name, contact_sheet, enlarged, frames
 from workbench.recording.episode import Episode
+from workbench.recording.episode_pictures import (
+    Eye,
+    camera_of,
+    cameras_by_name,
+    contact_sheet,
+    enlarged,
+    frames,
+    scene_frames,
+)
 from workbench.recording.films import write_mp4
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
-from workbench.recording.scene_film import Eye, scene_frames
 from workbench.recording.sources import Source
 from workbench.ui.fragments import counted
 from workbench.ui.scene_html import seconds_a_step, write_scene_html

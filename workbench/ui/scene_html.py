@@ -21,7 +21,7 @@ import viser
 
 from workbench.machine.atomic_files import new_file
 from workbench.recording.episode import Episode
-from workbench.recording.scene_film import Eye, usual_eye
+from workbench.recording.episode_pictures import Eye, usual_eye
 from workbench.session.review_events import success_words
 from workbench.ui.door import DoorOptions, open_door
 from workbench.ui.env_layout import lay_out

@@ -17,11 +17,10 @@ from typing import Any
 import viser
 
 from workbench.core.camera_frames import triple
-from workbench.recording.camera_pictures import cameras_by_name
+from workbench.recording.episode_pictures import Eye, cameras_by_name
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.library import Library
 from workbench.recording.library_row import LibraryRow
-from workbench.recording.scene_film import Eye
 from workbench.recording.sources import Source
 from workbench.session.review_view import ReviewView
 from workbench.ui.door import Door
