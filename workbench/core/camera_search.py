@@ -36,7 +36,7 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraKind
 from workbench.core.scene_index import SceneIndex, read_poses, scene_index
-from workbench.core.temporary_camera import undrawn
+from workbench.core.temporary_camera import temporary_camera, undrawn
 from workbench.core.visibility import (
     Placement,
     SceneObject,
@@ -45,7 +45,6 @@ from workbench.core.visibility import (
     measure,
     mount_column,
     picture_of,
-    placed_camera,
     small_size,
 )
 
@@ -187,14 +186,13 @@ class _Search:
         None at all where the search is cancelled on the way.
         """
         measured: list[list[CameraReport]] = [[] for _ in candidates]
-        placement = Placement(self.space.lens, self.space.kind)
         key: CameraKey = (self.space.kind, "suggested")
         local = [self._pose(candidate) for candidate in candidates]
         for position, e in enumerate(self.envs):
             robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.index)]
             poses = local if self.mounts is None else [compose(self.mounts[e], pose) for pose in local]
             with (
-                placed_camera(self.env, e, placement, self.size, None) as view,
+                temporary_camera(self.env, e, self.space.kind, self.space.lens, self.size) as view,
                 undrawn(robots if bare is None else []),
             ):
                 for i, pose in enumerate(poses):

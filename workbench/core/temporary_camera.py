@@ -21,7 +21,8 @@ import sapien.render
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.core.camera_frames import checked_intrinsic
+from workbench.core.camera_frames import intrinsic_of, scaled_intrinsic
+from workbench.core.camera_settings import CameraSettings
 from workbench.core.drawn_poses import drawn_at, temporarily
 from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraKind
@@ -61,18 +62,16 @@ def temporary_camera(
     env: Any,
     env_index: int,
     kind: CameraKind,
-    size: Sequence[int],
-    intrinsic: ArrayLike,
-    near: float,
-    far: float,
+    settings: CameraSettings,
+    size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
 ) -> Iterator[TemporaryCamera]:
     """A camera in one env; nothing of the env may be changed, and no other picture taken, while it is there.
 
     Args:
         kind: sensors do not see what the task hides from them.
-        size: width and height in pixels.
-        intrinsic: (3, 3) in those pixels.
+        settings: its lens; its pose is for `look` to say.
+        size: width and height of the pictures, which show the same view; None for its own.
         poses: (B, 7) where to draw the env's bodies; None for where the tensors have them.
 
     Raises:
@@ -81,7 +80,9 @@ def temporary_camera(
         RuntimeError: the env was made without a render device, or the renderer failed.
     """
     require_env(env_index, env.num_envs)
-    k = checked_intrinsic(intrinsic)
+    own, near, far = (settings.width, settings.height), settings.near, settings.far
+    size = size or own
+    k = scaled_intrinsic(intrinsic_of(settings), own, size)
     if not 0 < near < far:
         raise ValueError(f"the near plane must lie before the far plane, and both ahead: {near} m, {far} m")
     scene = env.scene

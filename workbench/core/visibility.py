@@ -26,7 +26,7 @@ from mani_skill.utils.scene_builder import SceneBuilder
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic, triple
+from workbench.core.camera_frames import compose, make_pose, matrix3, triple
 from workbench.core.camera_report import (
     DEPTH_EDGES,
     CameraReport,
@@ -194,7 +194,7 @@ def judge_placement(
     """
     index = scene_index(env)
     pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, index)
-    with placed_camera(env, e, placement, size, poses) as view:
+    with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         camera = placement.kind, name
         return measure(view, pose, e, list_objects(env), index, camera, placement.settings)
 
@@ -208,7 +208,7 @@ def picture_of(
 ) -> Picture:
     """What a camera that does not exist sees of one env, in its own size or another; raises as `judge_placement`."""
     pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
-    with placed_camera(env, e, placement, size, poses) as view:
+    with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         segmentation, depth = view.look(pose)
         rgb = view.colours()
     return Picture("suggested", placement.kind, e, pose.astype(np.float32), rgb, depth, segmentation)
@@ -242,16 +242,6 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 
 
 # --- measuring ---------------------------------------------------------------------------------------------------
-
-
-def placed_camera(
-    env: Any, e: int, placement: Placement, size: tuple[int, int] | None, poses: NDArray[np.float32] | None
-) -> Any:
-    """A `temporary_camera` with a placement's lens, in pictures of `size`; its pose is for `look` to say."""
-    s = placement.settings
-    own = (s.width, s.height)
-    intrinsic = scaled_intrinsic(intrinsic_of(s), own, size or own)
-    return temporary_camera(env, e, placement.kind, size or own, intrinsic, s.near, s.far, poses)
 
 
 def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneIndex) -> NDArray[np.float64]:
