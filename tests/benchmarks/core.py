@@ -38,7 +38,7 @@ class Options:
     """Of stepping, a turn."""
     turns: int = 3
     most_envs: int = 960
-    """The scaling table doubles from 1 to this; a process has room for a little more (`core/scene_limit.py`)."""
+    """The scaling table doubles from 1 to this; a process has room for a little more (`core/cpu_scene.py`)."""
     resets: int = 1000
     rebuilds: int = 100
     write: bool = False

@@ -6,7 +6,7 @@ silent: with several envs ``success`` of shape ``()`` gives a ``terminated`` of 
 ``(N, 1)``, of shape ``()``, or a Python float is handed on, and then broadcasts against ``(N,)``
 into an ``(N, N)`` in somebody's trainer. With one env all of them look right. So they are checked
 here, and told at the ``def`` of the hook that returned them. (A NaN has the right shape: it is a value,
-and flagged in the env that has it, see `workbench.session.outliers`.)
+and flagged in the env that has it, see `workbench.session.env_table`.)
 
 Entries of ``evaluate()`` besides ``success`` and ``fail`` may be anything: ManiSkill passes them on. The checks are
 pure: nothing is stepped, changed or moved from its device. Their words are those of `workbench.core.entries`, which the core's strict mode raises with.

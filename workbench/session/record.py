@@ -2,7 +2,7 @@
 
 Each episode is started by a reset of its env alone with a seed of its own, so that episode k of a recording is the one
 that ``gym.make(...).reset(seed=seed + k)`` starts, whatever the number of envs and processes; and its actions are its
-own too (`record_acting`).
+own too (`acting.RecordActing`).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ the env. The worker's events come one by one on one thread and change the `LiveS
 the last version that ran, and the page never goes away.
 
 What is done here is to bring those together: who is asked, and who is told of what. What an event means is in
-`live_state`, which version is loaded, and when, in `versions`, how the past is gone through in `time_travel`.
+`live_state`, which version is loaded, and when, in `versions`, how the past is gone through in `timeline`.
 """
 
 from __future__ import annotations
