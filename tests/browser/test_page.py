@@ -148,7 +148,7 @@ def test_a_saved_edit_appears_by_itself(calm: Desk) -> None:
     assert '"cube_to_goal"' in text
     calm.tab("Reward")
     calm.file.write_text(text.replace('"cube_to_goal"', '"cube_to_goal_v2"'))
-    expect(calm.page.get_by_text("cube_to_goal_v2", exact=True)).to_be_visible()
+    expect(calm.page.get_by_role("cell", name="cube_to_goal_v2", exact=True)).to_be_visible()
 
 
 def test_a_patch_keeps_the_step_and_says_so_and_a_rebuild_can_be_asked_for(calm: Desk) -> None:
