@@ -55,6 +55,8 @@ from workbench.session.recorded_pictures import recorded_pictures
 logger = logging.getLogger(__name__)
 _MOST_HELD = 2048
 """Steps times envs that are taken apart together: 3 MB; fewer where half a second is over, or an episode begins."""
+_MOST_PICTURES = 1 << 25
+"""Bytes of pictures that wait, too."""
 
 
 class _Held(NamedTuple):
@@ -120,6 +122,8 @@ class Recorder(gym.Wrapper):
         self._held: deque[_Held] = deque()
         """What the gatherer does not have yet: taken apart one by one, while the env waits and with the processor's caches
         full of physics, steps cost twice as much."""
+        self._waiting_pictures = 0
+        """Bytes, about: another thread may take them at the same time."""
         self._gathering = threading.Lock()
         self._failure: Exception | None = None
         """Of gathering; it may be another thread's."""
@@ -218,15 +222,18 @@ class Recorder(gym.Wrapper):
         pictures = step_pictures(task, self._envs, wanted)
         seeds = self._seeds.copy() if reset_mask.any() else None
         self._held.append(_Held(step, reset_mask, pictures, seeds, read_states(task)))
+        self._waiting_pictures += sum(picture.nbytes for picture in pictures)
         follows = np.array_equal(step.elapsed_steps, self._elapsed + 1)
         self._elapsed = step.elapsed_steps
+        full = len(self._held) * len(reset_mask) > _MOST_HELD or self._waiting_pictures > _MOST_PICTURES
         # What does not follow is said at its own step.
-        if not follows or pictures or len(self._held) * len(reset_mask) > _MOST_HELD:
+        if full or not follows:
             self._gather()
         self._say_what_failed()
 
     def _gather(self) -> None:
         with self._gathering:
+            self._waiting_pictures = 0
             try:
                 while self._held and self._gatherer is not None:
                     self._gatherer.take(self._held.popleft().stepped())

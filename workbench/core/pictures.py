@@ -75,3 +75,9 @@ class Picture:
     """(H, W, 3) of unit length, in the same frame; 0 where the ray met nothing."""
     albedo: NDArray[np.uint8] | None = None
     """(H, W, 3) colour without light."""
+
+    @property
+    def nbytes(self) -> int:
+        """What its pixels take in memory."""
+        pixels = self.rgb, self.depth, self.segmentation, self.position, self.normal, self.albedo
+        return sum(array.nbytes for array in pixels if array is not None)

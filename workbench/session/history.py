@@ -492,8 +492,4 @@ def _step_bytes(step: StepResult) -> int:
 
 
 def _picture_bytes(picture: Picture) -> int:
-    arrays = (
-        *(picture.rgb, picture.depth, picture.segmentation),
-        *(picture.position, picture.normal, picture.albedo),
-    )
-    return 300 + sum(array.nbytes for array in arrays if array is not None)
+    return 300 + picture.nbytes

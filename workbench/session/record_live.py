@@ -225,7 +225,5 @@ def recovered_in_words(paths: Sequence[str]) -> str:
 def _size(stepped: Stepped) -> int:
     step = stepped.step
     arrays = [*stepped.columns.values(), *step.evaluate.values(), step.poses, step.reward]
-    for picture in stepped.captured:
-        arrays += [a for a in (picture.rgb, picture.depth, picture.segmentation) if a is not None]
     kept = len(stepped.snapshot) + sum(map(len, stepped.new_parts.values()))
-    return kept + sum(array.nbytes for array in arrays)
+    return kept + sum(array.nbytes for array in arrays) + sum(picture.nbytes for picture in stepped.captured)
