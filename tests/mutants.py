@@ -45,6 +45,10 @@ PROTECTED = {
     "recording/reader/episode_wire": "recording/test_episode_wire.py",
     "recording/recover": "recording/test_recover.py",
     "recording/trash": "recording/test_trash.py",
+    "recording/document": "recording/test_document.py recording/test_checksums.py",
+    "recording/sources": "recording/test_sources.py",
+    "machine/atomic_files": "recording/test_new_file.py recording/test_annotations.py recording/test_landing.py"
+    " machine/test_user_folder.py authoring/camera_source/test_disk.py",
     "authoring/registry": "authoring/test_registry.py",
     "authoring/modules": "authoring/test_load.py authoring/test_task_content.py authoring/test_library_names.py"
     " authoring/test_named_modules.py",
@@ -70,8 +74,8 @@ PROTECTED = {
     "core/mirrors": "core/test_batched_cpu.py core/test_drive_targets.py core/test_strict.py",
     "core/cpu_system": "core/test_batched_cpu.py core/test_gpu_members.py core/test_stepping.py core/test_strict.py",
     "core/strict_system": "core/test_strict.py",
-    "core/scene_index": "core/test_scene_index.py core/test_merged_structs.py",
-    "core/camera_report": "core/test_visibility.py core/test_camera_search.py",
+    "core/scene_index": "core/test_scene_index.py core/test_state_columns.py core/test_merged_structs.py",
+    "core/camera_report": "core/test_camera_report.py",
     "jobs/pool": "jobs/test_pool.py",
     "jobs/wire": "jobs/test_wire.py jobs/test_message_reader.py",
     "jobs/message_reader": "jobs/test_message_reader.py",

@@ -18,7 +18,7 @@ from workbench.core.step import StepResult
 from workbench.session.askers import Background
 from workbench.session.history import History
 from workbench.session.judge import Judge
-from workbench.session.judgement import Judgement
+from workbench.session.judgement import MOST_ENTRIES, Judgement
 from workbench.session.judging import StoppedBy
 from workbench.session.messages import Load, Stepped, TaskOptions
 
@@ -252,6 +252,34 @@ def test_an_entry_that_only_one_version_has_differs_and_comes_first() -> None:
         judgement.add(row, replace(old[row], evaluate={**old[row].evaluate, "width": old[row].reward}))
     assert judgement.names() == (("reward", "width", "success", "height"), frozenset({"width"}))
     assert not any(verdict.differing for verdict in judgement.verdicts())
+    curve = judgement.curve("width", 1)
+    assert curve is not None and np.isnan(curve.old).all() and np.isfinite(curve.new).all()
+
+
+def test_of_very_many_entries_the_first_are_compared() -> None:
+    old, _, jumped = drawn(3, 5, 2)
+    many = {f"entry {k}": old[0].reward for k in range(MOST_ENTRIES + 2)}
+    judgement = Judgement(recorded([replace(step, evaluate=many) for step in old], jumped))
+    assert MOST_ENTRIES == 24, "each takes 8 bytes for every moment and env"
+    assert judgement.names()[0] == ("reward", *list(many)[:MOST_ENTRIES])
+
+
+def test_of_nothing_that_was_lived_through_nothing_is_judged() -> None:
+    judgement = Judgement(History(table(drawn(0, 2, 2)[0][0]), 10**9))
+    assert (judgement.steps, judgement.judged_steps, judgement.num_envs) == (0, 0, 0)
+    assert judgement.verdicts() == []
+    assert judgement.names() == (("reward",), frozenset())
+
+
+def test_a_run_is_compared_from_its_first_step_on_and_what_was_judged_is_counted() -> None:
+    old, new, _ = drawn(4, 5, 2)
+    jumped = np.zeros((5, 2), bool)
+    jumped[0] = True
+    judgement = Judgement(recorded(old, jumped))
+    judgement.add(0, new[0])
+    assert judgement.verdicts() == [] and judgement.judged_steps == 0
+    judgement.add(1, new[1])
+    assert [verdict.length for verdict in judgement.verdicts()] == [1, 1] and judgement.judged_steps == 1
 
 
 def test_steps_are_those_of_the_episode_also_where_its_beginning_is_not_kept() -> None:
@@ -295,7 +323,8 @@ def test_what_is_not_judged_yet_has_no_new_value() -> None:
     assert curve is not None and curve.serial.tolist() == [1, 2, 3, 4]
     np.testing.assert_array_equal(curve.old, [step.reward[1] + 1 for step in old[1:]])
     np.testing.assert_array_equal(curve.new, [new[1].reward[1] + 1, new[2].reward[1] + 1, np.nan, np.nan])
-    assert judgement.curve("pose", 0) is None and judgement.curve("reward", 9) is None
+    assert judgement.curve("pose", 0) is None
+    assert judgement.curve("reward", 2) is None and judgement.curve("reward", -1) is None
 
 
 def test_other_bodies_cannot_be_compared() -> None:

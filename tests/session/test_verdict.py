@@ -77,6 +77,7 @@ def test_a_flag_that_is_first_true_as_before_and_then_otherwise_is_said() -> Non
     assert found.success == (1, 1) and found.differing == ("success",)
     assert (found.first_difference, found.look_at) == (3, 3)
     assert words.what_changed(found) == "success at other steps, from step 3"
+    assert not compare(0, said(success=[0.5] * 5), said(success=[0.0] * 5)).differs, "half a truth is none"
     both = compare(0, said(success=[1, 1, 1, 1, 1]), said([9, 1, 2, 3], success=[1, 0, 1, 1, 1]))
     assert words.what_changed(both) == "reward by up to 9, from step 1" and both.look_at == 1
 

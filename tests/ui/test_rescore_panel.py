@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -174,6 +175,35 @@ def test_why_nothing_could_be_judged_is_said_once(rescoring: Rescoring) -> None:
     assert "not judged: it has no step" in rescoring.panels.html()
     rescoring.draw(JudgedView("done", 2, lost, 3, 3))
     assert rescoring.panels.html().count(f"not judged: {why}") == 2, "nothing else says it"
+
+
+def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescoring: Rescoring) -> None:
+    moved = {"first_difference": 4, "largest": 0.25, "differing": ("reward",), "returns": (1.0, 2.5)}
+    given = (
+        verdict("same", seed=5),
+        verdict("lost", seed=6, why_not="it has no step"),
+        verdict("other", seed=7, metres=0.032, **moved),
+    )
+    rescoring.draw(JudgedView("done", 1, given, 3, 3))
+    html = rescoring.panels.html("wb-again-table")
+    rows = re.findall(r'<tr [^>]*class="([^"]*)" title="[^"]*">(.*?)</tr>', html)
+    said = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
+    assert said == [
+        ([], "|seed 7||reward by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
+        (["wb-same"], "|seed 5||as it was||10|"),
+        (["wb-same"], "|seed 6||not judged: it has no step|||"),
+    ]
+    assert words.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
+
+
+def test_before_anything_was_judged_the_page_says_how_and_shows_no_list(rescoring: Rescoring) -> None:
+    rescoring.draw(JudgedView())
+    assert "Select recordings in the Library" in rescoring.panels.html("wb-again")
+    assert not rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
+    rescoring.draw(JudgedView("done", 1, (verdict(),), 1, 1))
+    assert rescoring.panels.html("wb-again-table")
+    rescoring.draw(JudgedView("judging", 2, (), 0, 1))
+    assert rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
 
 
 def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
