@@ -204,3 +204,8 @@ def test_what_cannot_be_looked_for_is_refused(changes: Any, says: str) -> None:
     SPACE.check()
     with pytest.raises(ValueError, match=says):
         replace(SPACE, **changes).check()
+
+
+def test_a_search_that_says_no_more_draws_a_hundred_and_offers_five() -> None:
+    space = SearchSpace(("cube",), SPACE.low, SPACE.high, LENS)
+    assert (space.kind, space.candidates, space.best, space.mount) == ("sensor", 100, 5, None)

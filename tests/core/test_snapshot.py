@@ -25,7 +25,13 @@ import workbench
 from tests.drive.envs import CPU, PICK_CUBE, batched, stock
 from workbench.core.cpu_state import CpuState, plan_cpu_state, renew_physics
 from workbench.core.gpu_state import read_gpu_state, write_gpu_state
-from workbench.core.snapshot import begin_anew, in_this_state, restore_snapshot, take_snapshot
+from workbench.core.snapshot import (
+    begin_anew,
+    in_this_state,
+    only_these_move,
+    restore_snapshot,
+    take_snapshot,
+)
 from workbench.core.task_env import TaskEnv
 
 pytestmark = pytest.mark.thorough
@@ -393,6 +399,35 @@ def drawn_next(set_it_on: bool = False) -> tuple[float, ...]:
     np.random.set_state(kept[1])
     random.setstate(kept[2])
     return drawn
+
+
+def test_while_some_envs_move_the_others_stay_as_they_are_and_the_processs_generators_go_on(
+    pick: BaseEnv,
+) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 3, 0))
+    before, cubes = packs(pick), pick.cube.pose.raw_pose.clone()
+    with only_these_move(pick, [1, 4], take_snapshot(pick, [0, 2, 3, 5])):
+        pick.cube.set_pose(
+            Pose.create(cubes + torch.tensor([0, 0, 0.1, 0, 0, 0, 0]) * (torch.arange(N) == 2)[:, None])
+        )
+        pick.scene._gpu_apply_all()
+        pick.scene._gpu_fetch_all()
+        after(pick, random_actions(pick, 2, 1))
+        assert packs(pick)[2] != before[2], "somebody wrote to it"
+        drawn = drawn_next(set_it_on=True)
+    assert drawn_next() == drawn
+    assert pick.elapsed_steps.tolist() == [3, 5, 3, 3, 5, 3]
+    assert [now == was for now, was in zip(packs(pick), before, strict=True)] == [
+        i not in (1, 4) for i in range(N)
+    ]
+    now = packs(pick)
+    with only_these_move(pick, [0], None):
+        after(pick, random_actions(pick, 1, 2))
+    assert [pack == was for pack, was in zip(packs(pick), now, strict=True)] == [i > 0 for i in range(N)]
+    now = packs(pick)
+    after(pick, random_actions(pick, 1, 3))
+    assert not any(pack == was for pack, was in zip(packs(pick), now, strict=True)), "all move again"
 
 
 def test_joint_forces_are_restored() -> None:

@@ -97,4 +97,6 @@ def test_a_file_in_place_of_the_folder_is_said(tmp_path: Path) -> None:
         with pytest.raises(OSError) as told:
             write(path)
         assert told.value.strerror == f"Cannot write {path}: Not a directory."
+        with pytest.raises(OSError, match="Not a directory"), new_file(path):
+            pytest.fail("it is said before anything is made")
     assert there(tmp_path) == {"file": b"mine"}
