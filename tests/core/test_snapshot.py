@@ -614,8 +614,11 @@ def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv
     vector = ManiSkillVectorEnv(wrapped)
     vector.reset(seed=0)
     assert not restore_snapshot(vector, take_snapshot(wrapped)).not_carried
-    with pytest.raises(IndexError, match="the snapshot is of envs .* and this env has 2: say with env_idx"):
-        restore_snapshot(wrapped, take_snapshot(pick))
+    for taken in (None, [0, 2]):
+        with pytest.raises(
+            IndexError, match="the snapshot is of envs .* and this env has 2: say with env_idx"
+        ):
+            restore_snapshot(wrapped, take_snapshot(pick, taken))
     vector.close()
     with pytest.raises(RuntimeError, match="this env was closed"):
         take_snapshot(wrapped)

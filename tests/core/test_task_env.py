@@ -60,6 +60,11 @@ def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> No
     assert np.array_equal(step.reward, copies[1]) and np.array_equal(step.elapsed_steps, copies[2])
 
 
+def test_an_env_that_goes_on_has_been_observed_last_by_who_had_it_before(push: TaskEnv) -> None:
+    assert TaskEnv(push.env, 50, obs=(seen := torch.ones(N, 3))).obs is seen
+    assert TaskEnv(push.env, 50).obs is None
+
+
 def test_the_time_limit_truncates(push: TaskEnv) -> None:
     push.reset(seed=0)
     results = [push.step(np.zeros((N, 8), np.float32)) for _ in range(push.max_episode_steps)]
