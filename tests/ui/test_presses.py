@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
 from workbench.ui.fragments import render
-from workbench.ui.presses import NUMBERS, PARTS, Paged, Presses, in_turn, place_of
+from workbench.ui.presses import NUMBERS, PARTS, Presses, in_turn, place_of
 
 
 def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an_id() -> None:
@@ -56,15 +56,14 @@ def test_a_number_comes_back_whatever_the_running_part(panels: Panels, number: i
 
 def test_what_a_page_counts_in_is_what_its_script_says(panels: Panels) -> None:
     """``pressed.js``: a row by eights below 1e8, a place in ten-thousandths, down and across from the upper left corner."""
-    came: list[tuple[object, ...]] = []
+    came: list[object] = []
     presses = Presses(panels.server)
-    presses.number_id("number", lambda *sent: came.append(sent))
-    presses.place_id("place", lambda *place: came.append(place))
+    presses.number_id("number", lambda sent, *_: came.append(sent))
+    presses.place_id("place", lambda column, row, *_: came.append((column, row)))
     panels.claim("number", 3 * 1e8 + 99_999_999)
     panels.claim("place", 7 * 1e8 + 2500 * 10_000 + 9999)
     panels.claim("place", 88 * 1e8 + 9999 * 10_000)
-    client = panels.client
-    assert came == [(99_999_999, client), (2500 / 9999, 1.0, client), (1.0, 0.0, client)]
+    assert came == [99_999_999, (2500 / 9999, 1.0), (1.0, 0.0)]
 
 
 def test_the_same_key_is_the_same_part_and_what_was_said_of_it_first_stays(panels: Panels) -> None:
@@ -75,8 +74,8 @@ def test_the_same_key_is_the_same_part_and_what_was_said_of_it_first_stays(panel
     assert presses.id_of(("row", 3), lambda client: came.append("another")) != first
     panels.claim("row 2", True, "button")
     assert came == [panels.client]
-    number = presses.number_id("n", lambda sent, client: came.append(sent))
-    assert presses.number_id("n", lambda sent, client: came.append("later")) == number
+    number = presses.number_id("n", lambda sent, *_: came.append(sent))
+    assert presses.number_id("n", lambda *_: came.append("later")) == number
     panels.claim("n", 5)
     assert came[1:] == [5]
 
@@ -102,29 +101,6 @@ def test_what_is_not_to_be_seen_comes_after_all_else_and_after_the_mark_of_it(pa
         for word in ("shown", '"wb-presses">', "data-unfolded")
     )
     assert shown < mark < unfolded
-
-
-def test_a_long_list_is_shown_a_page_at_a_time(panels: Panels) -> None:
-    presses = Presses(panels.server)
-    pages = Paged(presses, 10)
-    assert pages.shown is None
-    assert pages.places(10) == range(10) and pages.shown is None, "one page has all"
-    assert pages.places(11) == range(10)
-    ids = {"back": presses.id_of("back", lambda _: None), "on": presses.id_of("on", lambda _: None)}
-    assert pages.shown == {"first": 1, "last": 10, "of": 11, **ids} and ids["back"] != ids["on"]
-    panels.claim("back", True, "button")
-    assert pages.places(23) == range(10), "there is none before the first"
-    for there in (range(10, 20), range(20, 23), range(20, 23)):
-        panels.claim("on", True, "button")
-        assert pages.places(23) == there
-    assert pages.shown == {"first": 21, "last": 23, "of": 23, **ids}
-    panels.claim("back", True, "button")
-    assert pages.places(23) == range(10, 20)
-    for place, first in ((9, 0), (10, 10), (19, 10), (22, 20), (23, 20), (-5, 0), (22, 20)):
-        pages.go_to(place)
-        assert pages.first == first
-    assert pages.places(20) == range(10, 20), "the nearest that there is"
-    assert pages.places(0) == range(0) and pages.shown is None
 
 
 class Page:
