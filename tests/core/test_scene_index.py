@@ -105,6 +105,26 @@ def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     env.close()
 
 
+class MarkerFirst(PushCubeEnv):
+    """Nothing stands before its marker among the bodies."""
+
+    def _load_scene(self, options: dict) -> None:
+        builder = self.scene.create_actor_builder()
+        builder.add_sphere_visual(radius=0.02)
+        builder.initial_pose = Pose.create(sapien.Pose([0.3, 0.3, 1.0]))
+        self.marker = builder.build_kinematic(name="marker")
+        super()._load_scene(options)
+
+
+def test_the_first_body_of_all_may_be_hidden_too() -> None:
+    env: Any = begun(batched(MarkerFirst, 2))
+    assert scene_index(env).names[0] == "marker"
+    shown = read_poses(env)
+    env.marker.hide_visual()
+    np.testing.assert_array_equal(read_poses(env), shown)
+    env.close()
+
+
 class SparseBodiesEnv(PushCubeEnv):
     """A body that only envs 0 and 2 have, and a view over two bodies of the same env."""
 

@@ -41,6 +41,19 @@ def test_columns_are_the_state_dict_and_the_observation(obs_mode: str) -> None:
     task.close()
 
 
+def test_what_the_task_itself_moves_has_no_velocity_whatever_was_written() -> None:
+    task = made("PickCube-v1", rules="off")
+    env: Any = task.env
+    for actor in (env.goal_site, env.cube):
+        actor.set_linear_velocity(torch.ones(3, 3))
+    columns = read_state_columns(task)
+    for actor, speed in ((env.goal_site, 0.0), (env.cube, 1.0)):
+        column = columns[f"state/actors/{actor.name}"]
+        assert (column[:, 7:10] == speed).all()
+        np.testing.assert_array_equal(column, actor.get_state().numpy())
+    task.close()
+
+
 def test_columns_are_copies() -> None:
     task = made("PushCube-v1")
     before = read_state_columns(task)

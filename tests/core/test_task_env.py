@@ -358,6 +358,24 @@ def test_options_that_cannot_be_are_refused(wrong: dict, words: str) -> None:
     assert EnvOptions(threads=1).threads == 1 and EnvOptions(num_envs=1).num_envs == 1
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        EnvOptions(2, "cpu", render=False),
+        EnvOptions(2, "cpu", render=False, kwargs={"render_backend": "cpu"}),
+        EnvOptions(2, "cpu", kwargs={"render_backend": "none"}),
+        EnvOptions(2, "cpu", kwargs={"render_backend": None}),
+    ],
+)
+def test_without_pictures_there_is_no_render_system(options: EnvOptions) -> None:
+    env = make_env(Bare, options)
+    assert env.backend.render_backend == "none"
+    for scene in env.scene.sub_scenes:
+        with pytest.raises(RuntimeError, match="no system with name .render."):
+            _ = scene.render_system
+    env.close()
+
+
 class OnlyDense(Bare):
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "none")
 

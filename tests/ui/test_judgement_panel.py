@@ -165,6 +165,9 @@ def test_the_new_line_lies_over_the_recorded_one(judging: Judging) -> None:
         "as recorded",
         "judged again",
     ]
+    recorded, judged = ((series.get("width"), series.get("stroke")) for series in chart.series[1:])
+    assert recorded[0] is not None and judged[0] is not None and recorded[0] < judged[0]
+    assert recorded[1] != judged[1], "the record stands back"
     judging.draw(done(same(3), serial=2), selected_env=3)
     assert judging.panels.charts() == [] and not judging.panels.shows("Curve")
 

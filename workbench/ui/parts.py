@@ -5,7 +5,6 @@ The clock is given by who draws, so that all parts of a page go by one, and a te
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable
 from typing import ClassVar, Generic, TypeVar
@@ -48,16 +47,17 @@ class DrawDue:
 
     def __init__(self, every: float, clock: Clock = time.monotonic) -> None:
         self._every, self._clock = every, clock
-        self._drawn: object = object()
-        self._urgent: object = object()
-        self._drawn_at = -math.inf
+        self._drawn: tuple[object, object, float] | None = None
+        """Key, urgent, and when."""
 
     def is_due(self, key: object, urgent: object = None) -> bool:
         """Whether to draw now; if so, this is what is drawn from here on."""
         now = self._clock()
-        if urgent == self._urgent and (key == self._drawn or now - self._drawn_at < self._every):
-            return False
-        self._drawn, self._urgent, self._drawn_at = key, urgent, now
+        if self._drawn is not None:
+            drawn, was_urgent, at = self._drawn
+            if urgent == was_urgent and (key == drawn or now - at < self._every):
+                return False
+        self._drawn = key, urgent, now
         return True
 
 
