@@ -24,7 +24,8 @@ from workbench.session.messages import Event, Failed, Loaded, Loading, TaskOptio
 from workbench.session.session import HISTORY_BYTES, Session
 from workbench.terminal import out, print_event, print_line, refuse, say, say_addresses, warn
 from workbench.ui.commands import Command
-from workbench.ui.door import Door, DoorError, DoorOptions, open_door
+from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.listening import DoorError
 from workbench.ui.pages import Which
 from workbench.ui.put_together import Workplace
 

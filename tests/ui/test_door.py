@@ -20,8 +20,9 @@ from tests.drive.page import page_at
 from workbench.terminal import say_addresses
 from workbench.ui import door as door_module
 from workbench.ui import listening, viser_seam
-from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
+from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
+from workbench.ui.listening import DEFAULT_PORT, DoorError
 from workbench.ui.replies import SCRIPTS, STYLES, folder_handler
 from workbench.web_assets import web_assets_folder
 

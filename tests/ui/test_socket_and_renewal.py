@@ -25,8 +25,9 @@ from tests.ui.knocking import PROTOCOL, ask, both, client, close_code, cookie_of
 from tests.ui.tabs import open_deaf_tab, tabs_of
 from workbench.machine.child_python import child_environment, python_command
 from workbench.ui import listening
-from workbench.ui.door import Door, DoorError, DoorOptions, open_door
+from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
+from workbench.ui.listening import DoorError
 from workbench.ui.viser_seam import element_id
 
 
@@ -164,7 +165,7 @@ def test_many_that_start_at_once_are_one(folder):
     def start() -> None:
         try:
             made.append(listening.listen_on_file(folder / "page.sock", 0))
-        except listening.ListenError:
+        except DoorError:
             pass
 
     threads = [threading.Thread(target=start) for _ in range(8)]

@@ -9,9 +9,11 @@ control is left undecoded (`GuiUpdateMessage.updates`), since what it may be dep
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
+
+T = TypeVar("T")
 
 MAX_BYTES = 256 * 1024
 """The largest thing that a page sends is a text that was pasted. viser's pictures of a view are never asked for."""
@@ -133,8 +135,13 @@ _kind_decoder = msgspec.msgpack.Decoder(_Any)
 _decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in KINDS.items()}
 _value_decoder = msgspec.msgpack.Decoder(Value)
 
-_DECODING = (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError)
-"""What msgspec raises: a ValidationError is a DecodeError; the others are nesting without end and text that is not UTF-8."""
+
+def _decoded(decoder: msgspec.msgpack.Decoder[T], raw: bytes | msgspec.Raw, problem: ValueError) -> T:
+    try:
+        return decoder.decode(raw)
+    # A ValidationError is a DecodeError; the others are nesting without end and text that is not UTF-8.
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError):
+        raise problem from None
 
 
 def kind_of(raw: object) -> str:
@@ -147,10 +154,7 @@ def kind_of(raw: object) -> str:
         raise MalformedMessage("a text frame")
     if len(raw) > MAX_BYTES:
         raise MalformedMessage("a message that is too long")
-    try:
-        return _kind_decoder.decode(raw).type
-    except _DECODING:
-        raise MalformedMessage("what is not a message") from None
+    return _decoded(_kind_decoder, raw, MalformedMessage("what is not a message")).type
 
 
 def read_message(raw: bytes, kind: str) -> ClientMessage:
@@ -160,10 +164,7 @@ def read_message(raw: bytes, kind: str) -> ClientMessage:
         MalformedMessage: Fields are missing, surplus, of another type or of another length.
         ImpossibleValue: A number in it is not finite, or cannot be meant.
     """
-    try:
-        message = _decoders[kind].decode(raw)
-    except _DECODING:
-        raise MalformedMessage(f"wrong fields in {kind}") from None
+    message = _decoded(_decoders[kind], raw, MalformedMessage(f"wrong fields in {kind}"))
     message.check()
     return message
 
@@ -174,10 +175,7 @@ def read_value(raw: msgspec.Raw) -> Value:
     Raises:
         ValueError: It is nested, bytes, or of a kind that no control holds.
     """
-    try:
-        return _value_decoder.decode(raw)
-    except _DECODING:
-        raise ValueError("No control holds that.") from None
+    return _decoded(_value_decoder, raw, ValueError("No control holds that."))
 
 
 def _check_numbers(*numbers: float) -> None:

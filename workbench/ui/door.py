@@ -27,7 +27,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
-from workbench.ui.listening import DEFAULT_PORT, ListenError, Listening, listen_on_file, listen_on_port
+from workbench.ui.listening import DEFAULT_PORT, DoorError, Listening, listen_on_file, listen_on_port
 from workbench.ui.replies import (
     Handler,
     admitted_reply,
@@ -49,10 +49,6 @@ TURNED_AWAY = {
     gate.Why.NO_TOKEN: "Turned away a request{} that did not show the token.",
     gate.Why.OTHER_TOKEN: "Turned away a request{} with a token that is not valid: a page that was open before, perhaps.",
 }
-
-
-class DoorError(RuntimeError):
-    """The door cannot be opened. The message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +225,10 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
     Raises:
         DoorError: the host or port cannot be bound, or the installed viser is not one that can be gated.
     """
-    listening = _listen(options)
+    if options.socket is None:
+        listening = listen_on_port(options.host, options.port)
+    else:
+        listening = listen_on_file(options.socket, options.port)
     token = secrets.token_urlsafe(32) if options.token else None
     the_gate = gate.Gate(token=token, names=_our_names(options), any_address=not listening.loopback)
     told = ToldRarely()
@@ -241,10 +240,8 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
 
     try:
         gated = viser_seam.make_viser(listening.socket, wrap, label, RESPONSE_SECONDS, told)
-    except BaseException as error:
+    except BaseException:
         listening.remove()
-        if isinstance(error, viser_seam.SeamError):
-            raise DoorError(str(error)) from error
         raise
     door = Door(
         options=options,
@@ -291,15 +288,6 @@ def _url(listening: Listening, token: str | None, host: str | None = None) -> st
 
 def _elsewhere(listening: Listening, token: str | None) -> tuple[str, ...]:
     return tuple(_url(listening, token, host) for host in listening.hosts_elsewhere())
-
-
-def _listen(options: DoorOptions) -> Listening:
-    try:
-        if options.socket is not None:
-            return listen_on_file(options.socket, options.port)
-        return listen_on_port(options.host, options.port)
-    except ListenError as error:
-        raise DoorError(str(error)) from None
 
 
 def _our_names(options: DoorOptions) -> frozenset[str]:

@@ -45,6 +45,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from workbench.ui.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.ui.listening import DoorError
 from workbench.ui.page_guard import PageGuard
 from workbench.ui.strangers import Connection, Strangers, ToldRarely, let_go_when_deaf
 
@@ -106,10 +107,6 @@ warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarn
 
 # Any: the checker rightly says that viser does not export these names.
 infra: Any = viser.infra._infra
-
-
-class SeamError(RuntimeError):
-    """viser is not the viser that this module was written for."""
 
 
 def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
@@ -175,8 +172,8 @@ def _page_is_known() -> bool:
     return page.is_file() and hashlib.sha256(page.read_bytes()).hexdigest() == PAGE_SHA256
 
 
-def _moved(what: str) -> SeamError:
-    return SeamError(
+def _moved(what: str) -> DoorError:
+    return DoorError(
         f"The page cannot be made safe: {what}. workbench/ui/viser_seam.py is written for viser {WRITTEN_FOR} "
         f"and viser {viser.__version__} is installed; install viser=={WRITTEN_FOR}."
     )
@@ -348,7 +345,7 @@ def make_viser(
         told: says what pages did that they should not.
 
     Raises:
-        SeamError: the installed viser has moved. Nothing is left listening.
+        DoorError: the installed viser has moved. Nothing is left listening.
     """
     missing = missing_names()
     if missing:
