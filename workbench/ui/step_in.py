@@ -33,7 +33,6 @@ from workbench.session.step_back import (
     why_not_into,
     write_source,
 )
-from workbench.session.view import SessionView
 from workbench.ui.banner import is_busy_for_long
 from workbench.ui.controls import tell_all
 from workbench.ui.fragments import render, sentence
@@ -42,30 +41,6 @@ from workbench.ui.rescore_panel import RECORDED, TODAYS
 
 if TYPE_CHECKING:
     from workbench.ui.put_together import Workplace
-
-
-@dataclass(frozen=True)
-class GoingLive:
-    session: Session
-    number: int
-    """What `TimelineView.entered` is when it is there."""
-    task: str
-    state: int
-    problems: int
-
-    def is_over(self, view: SessionView) -> bool:
-        """Whether the live page has something to show now."""
-        arrived = view.timeline.entered == self.number
-        failed = view.problem_serial > self.problems or view.state == "stopped"
-        return arrived or failed or is_busy_for_long(view)
-
-    def words(self, view: SessionView) -> str:
-        """What is waited for."""
-        if view.task is None:
-            doing = f"loading {self.task} at step {self.state}"
-        else:
-            doing = f"putting {self.task} into step {self.state}"
-        return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
 
 
 ONE, ALL = "the selected env", "all envs"
@@ -77,14 +52,41 @@ MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 
 @dataclass
-class _Clearing:
-    """A way to a live env that waits for somebody to say that its code may run."""
+class _Way:
+    """From a recording to a live env."""
 
-    wanted: Wanted
+    info: EpisodeInfo
     run: RecordedRun
     state: int
-    stop: threading.Event = field(default_factory=threading.Event)
+    given_up: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
+    """Waits for somebody to say that the code may run."""
+    number: int = 0
+    """What `TimelineView.entered` is when it is there."""
+    problems: int = 0
+    session: Session | None = None
+    """That is put into the state; None while somebody is asked. Set last."""
+
+    def is_over(self) -> bool:
+        """Whether the live page has something to show now."""
+        if self.session is None:
+            return False
+        view = self.session.view()
+        arrived = view.timeline.entered == self.number
+        failed = view.problem_serial > self.problems or view.state == "stopped"
+        return arrived or failed or is_busy_for_long(view)
+
+    def words(self) -> str:
+        """What is waited for."""
+        task = self.info.task
+        if self.session is None:
+            return f"asking whether the code of {task} may run"
+        view = self.session.view()
+        if view.task is None:
+            doing = f"loading {task} at step {self.state}"
+        else:
+            doing = f"putting {task} into step {self.state}"
+        return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
 
 
 class StepIn:
@@ -109,12 +111,11 @@ class StepIn:
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
-        self._going: GoingLive | None = None
-        self._clearing: _Clearing | None = None
+        self._way: _Way | None = None
 
     def go(self, id: str, state: int) -> None:
         """Go on live from a state of an opened recording; on the way there, stay in the review after all."""
-        if self._going is not None or self._clearing is not None:
+        if self._way is not None:
             self._give_up()
             return
         review = self._place.shelf.review.view()
@@ -130,19 +131,19 @@ class StepIn:
         if (why := self._clearances.why_not_its_arguments(info)) is not None:
             self._say(sentence(why))
             return
-        there = None if self.recorded_source else self._open_already(info)
-        if there is not None:
-            self._enter(there, run, info, state)
-            return
-        wanted = Wanted(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
         if self.recorded_source:
             run = replace(run, name=f"{run.name} as it was recorded")
-        self._clearing = clearing = _Clearing(wanted, run, state)
+        self._way = way = _Way(info, run, state)
+        there = None if self.recorded_source else self._open_already(info)
+        if there is not None:
+            self._enter(there, way)
+            return
+        wanted = Wanted(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
         # An answer may take long, and this is one of the few threads that the page's buttons have.
-        clearing.thread = threading.Thread(
-            target=self._clear_and_go, args=(clearing,), name="clear", daemon=True
+        way.thread = threading.Thread(
+            target=self._clear_and_go, args=(way, wanted), name="clear", daemon=True
         )
-        clearing.thread.start()
+        way.thread.start()
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
         """A session that has this task open, in today's code."""
@@ -156,59 +157,52 @@ class StepIn:
             task = None if known is None else known.view().task
             return known if task is not None and not why_not_into(task, info) else None
 
-    def _clear_and_go(self, clearing: _Clearing) -> None:
-        wanted = clearing.wanted
+    def _clear_and_go(self, way: _Way, wanted: Wanted) -> None:
         folder: Path | None = None
         try:
-            reference = self._clearances.clear(wanted, clearing.stop.is_set)
+            reference = self._clearances.clear(wanted, way.given_up.is_set)
             if wanted.recorded_text:
                 folder, reference = write_source(wanted.info)
         except (CannotStepIn, NotCleared) as error:
-            if not clearing.stop.is_set():
+            if not way.given_up.is_set():
                 self._say(sentence(str(error)))
-            self._cleared(clearing)
+            if self._way is way:
+                self._way = None
             return
         with self._lock:
-            if clearing.stop.is_set():
+            if way.given_up.is_set():
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
                 return
             session = self._open(reference, options_of(wanted.info, self._count(), self._base), folder)
-        self._enter(session, clearing.run, wanted.info, clearing.state)
-        self._cleared(clearing)
+        self._enter(session, way)
 
-    def _enter(self, session: Session, run: RecordedRun, info: EpisodeInfo, state: int) -> None:
+    def _enter(self, session: Session, way: _Way) -> None:
         self._place.session = session
-        problems = session.view().problem_serial
-        number = session.step_back(run, self.everywhere, info.source_file, info.source)
-        self._going = GoingLive(session, number, info.task, state, problems)
-
-    def _cleared(self, clearing: _Clearing) -> None:
-        if self._clearing is clearing:
-            self._clearing = None
+        way.problems = session.view().problem_serial
+        way.number = session.step_back(way.run, self.everywhere, way.info.source_file, way.info.source)
+        way.session = session
 
     def _give_up(self) -> None:
-        self._going = None
-        clearing, self._clearing = self._clearing, None
-        if clearing is not None:
-            clearing.stop.set()
+        way, self._way = self._way, None
+        if way is not None:
+            way.given_up.set()
 
     def going(self) -> str:
         """What is waited for on the way to the live env; empty while nobody is on it."""
-        going, clearing = self._going, self._clearing
-        if going is not None:
-            return going.words(going.session.view())
-        return "" if clearing is None else f"asking whether the code of {clearing.wanted.info.task} may run"
+        way = self._way
+        return "" if way is None else way.words()
 
     def change_pages_when_there(self) -> None:
-        going = self._going
-        if going is not None and going.is_over(going.session.view()):
-            self._going = None
+        way = self._way
+        if way is not None and way.is_over():
+            self._way = None
             self._place.pages.show("live")
 
     def review_is_back(self) -> None:
-        """The page of recordings is shown anew: nobody is on the way any more."""
-        self._going = None
+        """The page of recordings is shown anew: nobody is on the way any more who is not asked something."""
+        if self._way is not None and self._way.session is not None:
+            self._way = None
 
     def can_go_home(self) -> bool:
         """Whether another session is live than the one that was opened first."""
@@ -225,10 +219,10 @@ class StepIn:
 
     def close(self) -> None:
         """End what was opened here; the pages must be stopped."""
-        clearing = self._clearing
+        way = self._way
         self._give_up()
-        if clearing is not None and clearing.thread is not None:
-            clearing.thread.join()
+        if way is not None and way.thread is not None:
+            way.thread.join()
         with self._lock:
             own, self._own = self._own, None
         if own is not None:
