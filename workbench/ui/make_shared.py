@@ -113,7 +113,7 @@ def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> lis
 
 
 def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
-    name, fps = source.stem, _rate(episode)
+    name, fps = source.stem, 1.0 / seconds_a_step(episode)
     if wanted.what == "film":
         cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
         if not cameras:
@@ -159,10 +159,6 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
     """Of one of several."""
     return lambda done, doing: on_progress((number + done) / count, doing)
-
-
-def _rate(episode: Episode) -> float:
-    return 1.0 / seconds_a_step(episode)
 
 
 def _counted(

@@ -25,7 +25,7 @@ from workbench.recording.sources import Source
 from workbench.session.review_view import ReviewView
 from workbench.ui.door import Door
 from workbench.ui.file_reply import Offers
-from workbench.ui.fragments import counted, render, size
+from workbench.ui.fragments import counted, render
 from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
 from workbench.ui.making import Making, MakingView
@@ -113,13 +113,8 @@ class SharePanel:
             return
         self._drawn = now
         names = [source.stem for source in chosen.sources]
-        self._about.content = render(
-            "share_about",
-            count=len(names),
-            names=list(zip(short_names(names)[:MOST_NAMED], names)),
-            more=len(names[MOST_NAMED:]),
-            selected=chosen.selected,
-        )
+        files = list(zip(short_names(names), names))
+        self._about.content = render("share_about", files=files, most=MOST_NAMED, selected=chosen.selected)
         options = _names(chosen.cameras)
         if self._camera.options != options:
             self._camera.options = options
@@ -131,7 +126,7 @@ class SharePanel:
         self._stop.visible = view.running
         self._make.disabled = not chosen.sources
         will = None if view.running or not names else will_make(what, chosen, camera, self._folder)
-        self._will.content = "" if will is None else render("share_will", will=will)
+        self._will.content = "" if will is None else render("share_will", **will, most=MOST_NAMED)
         self._made.content = self._html(view)
 
     def _start(self, client: viser.ClientHandle | None) -> None:
@@ -156,33 +151,24 @@ class SharePanel:
         self._making.start(replace(wanted, folder=folder, camera=camera))
 
     def _html(self, view: MakingView) -> str:
-        return render("share", view=view, made=[self._said(one) for one in view.made[:MOST_SHOWN]])
+        made = [(one, self._links(one)) for one in view.made[:MOST_SHOWN]]
+        return render("share", view=view, made=made)
 
-    def _said(self, made: Made) -> dict[str, object]:
-        links = [
-            {
-                "address": self._offers.address(path, download=True),
-                "name": path.name,
-                "size": size(path.stat().st_size),
-            }
-            for path in made.paths
-            if path.is_file()
-        ]
-        short = short_names([str(link["name"]) for link in links])
-        for link, name in zip(links, short):
-            link["short"] = name
-        lost = made.words if made.not_made else ""
-        return {"links": links, "lost": lost, "words": made.words, "folder": ", ".join(map(str, made.paths))}
+    def _links(self, made: Made) -> list[tuple[str, Path, str]]:
+        """Of its files: where each is fetched, it, and its short name."""
+        files = [path for path in made.paths if path.is_file()]
+        short = short_names([path.name for path in files])
+        return [(self._offers.address(path, download=True), path, name) for path, name in zip(files, short)]
 
 
 def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str, Any]:
-    """What a press on *Make* makes, as far as it is known before the recordings are read: in words, its files, how many
-    `more` there are, and the folder ``where`` they go; empty for files that the page offers to save."""
+    """What a press on *Make* makes, as far as it is known before the recordings are read: in words, its files
+    with their short names, and the folder ``where`` they go; empty for files that the page offers to save."""
     names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what == "lerobot":
         where = f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a"
-        return {"what": f"one dataset {of}", "files": (), "more": 0, "where": where}
+        return {"what": f"one dataset {of}", "files": (), "where": where}
     if what != "film":
         files = [file_name(what, name) for name in names]
     elif camera in chosen.cameras:
@@ -191,9 +177,8 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str
         files = [file_name(what, name, known) for name in names for known in chosen.cameras]
     else:
         known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
-        return {"what": f"one film for each camera{known} {of}", "files": (), "more": 0, "where": ""}
-    shown = list(zip(files, short_names(files)))[:MOST_NAMED]
-    return {"what": counted(len(files), "file"), "files": shown, "more": len(files[MOST_NAMED:]), "where": ""}
+        return {"what": f"one film for each camera{known} {of}", "files": (), "where": ""}
+    return {"what": counted(len(files), "file"), "files": list(zip(files, short_names(files))), "where": ""}
 
 
 _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
