@@ -14,7 +14,6 @@ from workbench.ui.env_layout import (
     lay_out,
     place_of_plane,
     plane_normal,
-    rotate,
 )
 
 
@@ -117,6 +116,15 @@ def test_click_past_everything_or_with_broken_numbers_finds_none(direction: list
     assert env_under_ray(layout, np.array([0.0, MARGIN, 5.0]), np.array(direction)) is None
 
 
-def test_rotation_follows_the_right_hand_rule() -> None:
-    quarter_about_z = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
-    np.testing.assert_allclose(rotate(quarter_about_z, np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12)
+def test_the_box_of_a_body_is_turned_with_it_by_the_right_hand_rule() -> None:
+    arm = visual("arm", box_mesh((1.0, 0.2, 0.4), (0.5, 0, 0)), 2, 0)
+    geometry = SceneGeometry(2, ("arm",), ("dynamic",), (False,), (arm,))
+    quarter_about_z = [0.1, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    layout = lay_out(geometry, np.array([[quarter_about_z], [quarter_about_z]], np.float32))
+    np.testing.assert_allclose(layout.low, [0, 0, -0.2], atol=1e-6)
+    np.testing.assert_allclose(layout.high, [0.2, 1.0, 0.2], atol=1e-6)
+    wall = visual("wall", box_mesh((40, 0.01, 20)), 2, 0)
+    standing = SceneGeometry(2, ("wall",), ("static",), (False,), (wall,))
+    normal = plane_normal(wall, standing, np.array([[quarter_about_z]], np.float32))
+    assert normal is not None
+    np.testing.assert_allclose(normal, [-1, 0, 0], atol=1e-6)

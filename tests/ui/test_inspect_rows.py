@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,6 @@ from workbench.ui.inspect_panel import (
     LONGEST,
     METRES_AT_ONE_NEWTON,
     arrows_of,
-    contact_rows,
     inspect_html,
     joint_rows,
     leaf_rows,
@@ -81,9 +81,17 @@ PRESSED = Touching(
 
 
 def test_a_contact_is_told_in_newtons_with_its_place() -> None:
-    [row] = contact_rows([PRESSED])
-    assert (row["force"], row["impulse"], row["point"]) == ("5 N", "0.05 N s", "0.100, 0.000, 0.000")
-    assert row["note"] == "2 points, 1.00 mm deep"
+    html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(PRESSED,)), None)
+    for words in (
+        "<b>cube</b> by &lt;i&gt;table&lt;/i&gt;",
+        ">5 N<",
+        "force 0.000, 3.000, 4.000; impulse 0.05 N s",
+        "at 0.100, 0.000, 0.000; 2 points, 1.00 mm deep",
+    ):
+        assert words in html
+    apart = replace(PRESSED, separation=0.001, points=np.zeros((0, 3), np.float32))
+    html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(apart,)), None)
+    assert "<br>at ; 0 points<" in html
 
 
 def test_arrows_start_at_the_points_and_are_bounded() -> None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from viser.transforms import SO3
 
 from workbench.core.geometry import SceneGeometry, Visual
 
@@ -51,20 +52,13 @@ class EnvLayout:
         return self.low + self.offsets.min(axis=0), self.high + self.offsets.max(axis=0)
 
 
-def rotate(wxyz: NDArray, points: NDArray) -> NDArray:
-    """Turn points by unit quaternions; both broadcast over leading dimensions, last ones 4 and 3."""
-    w, axis = wxyz[..., :1], wxyz[..., 1:]
-    across = 2.0 * np.cross(axis, points)
-    return points + w * across + np.cross(axis, across)
-
-
 def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray:
     """(8, 3) corners of a box; the bits of a corner's number say at which end of x, y and z it is."""
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
     return np.where(picks == 0, low, high)
 
 
-def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDArray[np.float64] | None:
+def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDArray[np.floating] | None:
     """The normal (3,), in the env's frame, of a flat, very wide thing that never moves; else None.
 
     Floors and the walls that tasks put up as a backdrop: they are wide enough for the whole grid.
@@ -76,7 +70,7 @@ def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDA
     if extent[thin] > FLOOR_THICKNESS or np.sort(extent)[1] < FLOOR_WIDTH:
         return None
     worn = poses[visual.envs[0], visual.bodies[0]].astype(np.float64)
-    return rotate(worn[3:], np.eye(3)[thin]) if np.isfinite(worn).all() else None
+    return SO3(worn[3:]).apply(np.eye(3)[thin]) if np.isfinite(worn).all() else None
 
 
 def place_of_plane(normal: NDArray, visual: Visual, poses: NDArray, layout: EnvLayout) -> NDArray[np.float32]:
@@ -192,4 +186,4 @@ def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:
     corners = box_corners(low, high)
     worn = poses[visual.envs, visual.bodies].astype(np.float64)
     worn = worn[np.isfinite(worn).all(axis=1)]
-    return rotate(worn[:, None, 3:], corners[None]) + worn[:, None, :3]
+    return SO3(worn[:, None, 3:]).apply(corners[None]) + worn[:, None, :3]

@@ -17,11 +17,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section, Touching
+from workbench.core.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
 from workbench.session.number_text import number_text
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.fragments import counted, render
+from workbench.ui.fragments import render
 from workbench.ui.parts import Clock, DrawDue, PagePart
 from workbench.ui.selection_mark import InView
 
@@ -88,21 +88,6 @@ def joint_rows(joints: JointReadings) -> list[Row]:
     return rows
 
 
-def contact_rows(contacts: Sequence[Touching]) -> list[Row]:
-    return [
-        {
-            "first": pair.bodies[0],
-            "second": pair.bodies[1],
-            "force": f"{number_text(float(np.linalg.norm(pair.force)), '.3g')} N",
-            "vector": vector(pair.force),
-            "impulse": f"{number_text(float(np.linalg.norm(pair.impulse)), '.3g')} N s",
-            "point": vector(pair.points.mean(axis=0)) if len(pair.points) else "",
-            "note": _depth(pair),
-        }
-        for pair in contacts
-    ]
-
-
 def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
     """Of the bodies that an env has; `poses` is (B, 7), p and q (wxyz), NaN where it has none."""
     rows = []
@@ -137,9 +122,9 @@ def _place(value: float, low: float, high: float) -> float:
     return round(100 * min(max((value - low) / (high - low), 0.0), 1.0), 1)
 
 
-def _depth(pair: Touching) -> str:
-    points = counted(len(pair.points), "point")
-    return f"{points}, {1000 * -pair.separation:.2f} mm deep" if pair.separation < 0 else points
+def strength(values: NDArray) -> str:
+    """Of a force or an impulse (3,)."""
+    return number_text(float(np.linalg.norm(values)), ".3g")
 
 
 def _code(values: NDArray[np.float32]) -> str:
@@ -246,7 +231,7 @@ def inspect_html(
     no_step_yet: bool = False,
 ) -> str:
     """What the tab shows under its controls; no contacts of an env that made no step since it was set."""
-    leaves, articulations, contacts, poses = [], [], [], []
+    leaves, articulations, contacts, poses = [], [], (), []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
     if view.task is None or view.step is None:
@@ -270,7 +255,7 @@ def inspect_html(
             articulations = [{"name": a.articulation, "joints": joint_rows(a)} for a in now.joints or ()]
             note += "; bars show the position between the limits, and the target in orange"
         elif section == "contacts":
-            contacts = [] if no_step_yet else contact_rows(now.contacts or ())
+            contacts = () if no_step_yet else now.contacts or ()
             if no_step_yet:
                 note += ": what touches what is not known before the next step"
             elif not contacts:
@@ -290,6 +275,8 @@ def inspect_html(
         articulations=articulations,
         contacts=contacts,
         poses=poses,
+        vector=vector,
+        strength=strength,
     )
 
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 from numpy.typing import NDArray
+from viser.transforms import SO3
 
 from workbench.core.pictures import Picture
-from workbench.ui.env_layout import EnvLayout, box_corners, rotate
+from workbench.ui.env_layout import EnvLayout, box_corners
 from workbench.ui.scene_view import NAMES as BODIES
 from workbench.ui.scene_view import SceneView
 from workbench.ui.viser_seam import remove_nodes_but
@@ -100,7 +101,7 @@ def frame_one(
         return frame_box(low, high, aspect, covered)
     covered = float(np.clip(covered, 0.0, MOST_COVERED))
     position = picture.pose[:3].astype(np.float64)
-    forward = rotate(picture.pose[3:].astype(np.float64), np.array([1.0, 0.0, 0.0]))
+    forward = SO3(picture.pose[3:].astype(np.float64)).apply(np.array([1.0, 0.0, 0.0]))
     centre = (layout.low + layout.high) / 2
     # The page turns about what it looks at, so that has to be at the depth of the env.
     depth = max(float((centre - position) @ forward), 0.2)
