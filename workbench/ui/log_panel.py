@@ -147,31 +147,27 @@ class LogPanel(PagePart[SessionView]):
         self._clear = server.gui.add_button("Clear", icon=viser.Icon.ERASER, color="gray")
         self._vitals = server.gui.add_html("")
         self._clear.on_click(lambda _: self._on_clear(clear))
-        self._filter.on_update(self._on_filter)
-        self._wanted = ""
-        self._asked, self._drawn = 0, -1
-        """How often somebody asked for other lines, and when drawn: also while it is held."""
+        self._cleared = 0
+        self._drawn: object = None
+        """What somebody asked for when it was drawn; for another thing also while it is held."""
 
     def key(self, view: SessionView) -> object:
-        return view.printed.serial, self._hold.value, self._asked, view.vitals
+        return view.printed.serial, self._hold.value, self._filter.value, self._cleared, view.vitals
 
     def draw(self, view: SessionView) -> None:
         self._vitals.content = vitals_html(view.vitals)
-        if self._hold.value and self._drawn == self._asked:
+        wanted = self._filter.value.strip()
+        if self._hold.value and self._drawn == (wanted, self._cleared):
             return
-        self._drawn = self._asked
-        self._html.content = log_html(view.printed, self._wanted)
+        self._drawn = wanted, self._cleared
+        self._html.content = log_html(view.printed, wanted)
         # With nothing there, there is nothing to filter, to hold or to clear.
         for control in (self._filter, self._hold, self._clear):
             control.visible = bool(view.printed.lines or view.printed.dropped)
 
-    def _on_filter(self, event: viser.GuiEvent[viser.GuiTextHandle]) -> None:
-        self._wanted = event.target.value.strip()
-        self._asked += 1
-
     def _on_clear(self, clear: Callable[[], None]) -> None:
-        self._asked += 1
         clear()
+        self._cleared += 1
 
 
 def log_html(printed: Printed, wanted: str) -> str:

@@ -28,8 +28,6 @@ class RecordPanel(PagePart[SessionView]):
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._selected_env = 0
-        self._active = self._keeping = False
         self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._button = server.gui.add_button(
             RECORD,
@@ -63,18 +61,18 @@ class RecordPanel(PagePart[SessionView]):
 
     @property
     def _envs(self) -> tuple[int, ...] | None:
-        return None if self._which.value == ALL_ENVS else (self._selected_env,)
+        return None if self._which.value == ALL_ENVS else (self._session.view().selected_env,)
 
     def toggle(self) -> None:
         """Start if nothing is recorded, stop if something is."""
-        if self._active:
+        if self._session.view().recording.active:
             self._session.stop_recording()
         else:
             self._session.start_recording(self._envs)
 
     def keep(self) -> None:
         """Keep what was just seen, or give that up."""
-        if self._keeping:
+        if self._session.view().recording.keeping.active:
             self._session.keeper.stop()
         else:
             self._session.keep_past(self._envs)
@@ -90,11 +88,6 @@ class RecordPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         recording, keeping = view.recording, view.recording.keeping
-        self._selected_env, self._active, self._keeping = (
-            view.selected_env,
-            recording.active,
-            keeping.active,
-        )
         waits = recording.active and recording.waiting == len(recording.env_idx)
         self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
         self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD

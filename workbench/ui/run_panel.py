@@ -115,7 +115,6 @@ LARGEST_SEED = 2**31 - 1
 class RunPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._scene_serial = -1
         gui = server.gui
 
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
@@ -209,8 +208,7 @@ class RunPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         can_act = view.task is not None and view.state != "stopped"
-        if view.scene_serial != self._scene_serial and view.task is not None:
-            self._scene_serial = view.scene_serial
+        if view.task is not None:
             several = view.task.num_envs > 1
             self._env_folder.visible = several
             self._env.handle.max = max(1, view.task.num_envs - 1)

@@ -168,10 +168,8 @@ class RulesMark(PagePart[SessionView]):
         # all that comes after the mark of the hidden buttons, the tabs too, would be hidden.
         self._press = Presses(server).id_of("open", lambda _: self.toggle())
         self._open = False
-        self._rules: RulesBroken | None = None
 
     def draw(self, view: SessionView) -> None:
-        self._rules = view.rules
         if view.rules is None:
             self._open = False
             self._html.visible = False
@@ -182,10 +180,7 @@ class RulesMark(PagePart[SessionView]):
 
     def toggle(self) -> None:
         """Open or close the list."""
-        rules = self._rules
-        if rules is not None:
-            self._open = not self._open
-            self._html.content = rules_html(rules, self._open, self._press)
+        self._open = not self._open
 
 
 def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:

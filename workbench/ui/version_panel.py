@@ -82,13 +82,12 @@ def version_html(
         refused: why what is in the file does not.
         notices: what the author should know of it besides.
     """
-    more = [f"And {len(notices) - MOST_SHOWN} more."] if len(notices) > MOST_SHOWN else []
     return render(
         "version",
         report=report,
         loaded=loaded,
         refused=refused,
-        notices=[*notices[:MOST_SHOWN], *more],
+        notices=notices,
         most=MOST_SHOWN,
         took=took,
     )
