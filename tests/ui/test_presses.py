@@ -6,6 +6,7 @@ import asyncio
 import math
 import threading
 import time
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
 from workbench.ui.fragments import render
-from workbench.ui.presses import NUMBERS, PARTS, Presses, in_turn, place_of
+from workbench.ui.presses import NUMBERS, PARTS, Paged, Presses, in_turn, place_of
 
 
 def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an_id() -> None:
@@ -39,7 +40,7 @@ def test_what_no_page_of_ours_sends_is_no_press(panels: Panels, sent: object) ->
     came: list[object] = []
     presses = Presses(panels.server)
     presses.place_id("place", lambda *place: came.append(place))
-    presses.number_id("number", lambda *number: came.append(number))
+    presses.number_id("number", came.append)
     for name in ("place", "number"):
         panels.claim(name, sent)
     assert came == [] and len(panels.client.notices) == 2
@@ -49,7 +50,7 @@ def test_what_no_page_of_ours_sends_is_no_press(panels: Panels, sent: object) ->
 @pytest.mark.parametrize("number", [1, 8 * 99 + 3, NUMBERS - 1])
 def test_a_number_comes_back_whatever_the_running_part(panels: Panels, number: int, running: int) -> None:
     came: list[int] = []
-    Presses(panels.server).number_id("number", lambda sent, client: came.append(sent))
+    Presses(panels.server).number_id("number", came.append)
     panels.claim("number", float(running * NUMBERS + number))
     assert came == [number]
 
@@ -146,3 +147,31 @@ def test_what_fails_or_takes_long_does_not_keep_the_page_waiting() -> None:
 
     asyncio.run(ask_all())
     assert came == ["after the failure", "beside it", "True"]
+
+
+def test_a_long_list_is_shown_a_page_at_a_time_whatever_its_length_becomes() -> None:
+    pages = Paged(10)
+    made: dict[str, Callable[[], None]] = {}
+
+    def press(key: str, do: Callable[[], None]) -> str:
+        made[key] = do
+        return f"id of {key}"
+
+    assert pages.places(10) == range(10) and pages.shown(press) is None and not made
+    assert pages.places(0) == range(0)
+    assert pages.places(23) == range(10)
+    assert pages.shown(press) == {"first": 1, "last": 10, "of": 23, "back": "id of back", "on": "id of on"}
+    made["on"]()
+    assert pages.places(23) == range(10, 20)
+    made["back"]()
+    made["back"]()
+    assert pages.places(23) == range(10), "nothing is before the first"
+    pages.turn(5)
+    assert pages.places(23) == range(20, 23), "nothing is behind the last"
+    shown = pages.shown(press)
+    assert shown is not None and (shown["first"], shown["last"]) == (21, 23)
+    assert pages.places(20) == range(10, 20), "its page is gone"
+    pages.go_to(9)
+    assert pages.first == 0
+    pages.go_to(10)
+    assert pages.places(11) == range(10, 11)

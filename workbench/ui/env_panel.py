@@ -217,7 +217,7 @@ class EnvPanel(PagePart[SessionView]):
         self._presses = Presses(server)
         self._column, self._descending = "env", False
         self._filter: Filter = "all"
-        self._pages = Paged(self._presses, MOST_ROWS)
+        self._pages = Paged(MOST_ROWS)
         self._pressed = 0
         """How often something was that changes the table."""
 
@@ -225,7 +225,7 @@ class EnvPanel(PagePart[SessionView]):
         return view.task_serial, view.step_serial
 
     def urgent(self, view: SessionView) -> object:
-        return view.selected_env, self._pressed, self._pages.first
+        return view.selected_env, self._pressed
 
     def draw(self, view: SessionView) -> None:
         rows = self._session.env_rows()
@@ -251,7 +251,7 @@ class EnvPanel(PagePart[SessionView]):
                 }
                 for name, (shown_as, means, _) in FILTERS.items()
             ],
-            pages=self._pages.shown,
+            pages=self._pages.shown(self._press),
             head=self._head(rows),
             rows=[
                 {

@@ -118,9 +118,6 @@ class LibraryEdits:
     def undo_delete(self) -> None:
         self._do(self._library.undo_delete)
 
-    def notify(self, title: str, body: str) -> None:
-        tell_all(self._server, title, body, seconds=8.0)
-
     def _ask(
         self,
         title: str,
@@ -178,6 +175,6 @@ class LibraryEdits:
         try:
             work()
         except LibraryError as error:
-            self.notify("Not possible", str(error))
+            tell_all(self._server, "Not possible", str(error), seconds=8.0)
             return False
         return True

@@ -8,7 +8,7 @@ done is a button and a command with a key, of one description. Methods are calle
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
@@ -17,6 +17,7 @@ from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
 from workbench.ui.library_rows import Column, Outcome, begins_descending, chosen, ordered
+from workbench.ui.presses import Paged
 
 MOST_ROWS = 50
 """On one page of the table."""
@@ -36,8 +37,7 @@ class LibraryList:
         self.outcome: Outcome = "all"
         self.words = ""
         self.task: str | None = None
-        self.first = 0
-        """Place of the first row of the page."""
+        self.pages = Paged(MOST_ROWS)
         self.selected: frozenset[str] = frozenset()
         self.cursor: str | None = None
         """The row that was taken last, by mouse or keys."""
@@ -68,14 +68,14 @@ class LibraryList:
             self.selected &= listed
             if self.cursor not in listed:
                 self.cursor = None
-            self.first = min(self.first, self._last_page(rows))
-            return rows[self.first : self.first + MOST_ROWS]
+            places = self.pages.places(len(rows))
+            return rows[places.start : places.stop]
 
     def state(self) -> object:
         """Differs when anything here is another."""
         with self.lock:
             self.rows()
-            return self._arranged[0], self.first, self.selected, self.cursor
+            return self._arranged[0], self.pages.first, self.selected, self.cursor
 
     def selected_ids(self) -> tuple[str, ...]:
         """In the order of the list."""
@@ -115,10 +115,11 @@ class LibraryList:
             if self.cursor in order:
                 place = order.index(self.cursor) + by
             else:
-                place = max(self._place, self.first)
+                place = max(self._place, self.pages.first)
             place = min(max(place, 0), len(order) - 1)
             self._take(order, place, held)
-            self.first, self.follow = place // MOST_ROWS * MOST_ROWS, True
+            self.pages.go_to(place)
+            self.follow = True
 
     def toggle_cursor(self) -> None:
         with self.lock:
@@ -138,20 +139,17 @@ class LibraryList:
 
     # --- arranging -----------------------------------------------------------------------------------
 
-    def turn(self, by: int) -> None:
-        """Go on by so many pages."""
-        with self.lock:
-            self.first = min(max(0, self.first + by * MOST_ROWS), self._last_page(self.rows()))
-
     def sort_by(self, column: Column) -> None:
         """By another column, or the same one the other way round."""
         with self.lock:
             self.descending = not self.descending if column == self.column else begins_descending(column)
-            self.column, self.first = column, 0
+            self.column = column
+            self.pages.go_to(0)
 
     def choose(self, outcome: Outcome) -> None:
         with self.lock:
-            self.outcome, self.first = outcome, 0
+            self.outcome = outcome
+            self.pages.go_to(0)
 
     def look_for(self, words: str, task: str | None) -> None:
         """List what has these words, and is of this task, if there still is one of it."""
@@ -160,10 +158,8 @@ class LibraryList:
             words = words[:LONGEST_WORDS]
             task = task if task in known else None
             if (words, task) != (self.words, self.task):
-                self.words, self.task, self.first = words, task, 0
-
-    def _last_page(self, rows: list[LibraryRow]) -> int:
-        return max(0, (len(rows) - 1) // MOST_ROWS * MOST_ROWS)
+                self.words, self.task = words, task
+                self.pages.go_to(0)
 
 
 @dataclass(frozen=True)
@@ -192,17 +188,8 @@ def walking(listed: LibraryList) -> list[Command]:
         Command("The recording before it", move(-1), "arrowup"),
         Command("Select the next recording too", move(1, RANGE), "arrowdown", "shift"),
         Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
-        Command("The next page of recordings", lambda: listed.turn(1), "pagedown"),
-        Command("The page of recordings before it", lambda: listed.turn(-1), "pageup"),
+        Command("The next page of recordings", lambda: listed.pages.turn(1), "pagedown"),
+        Command("The page of recordings before it", lambda: listed.pages.turn(-1), "pageup"),
         Command("Select this recording, or no longer", listed.toggle_cursor, "X"),
         Command("Select all recordings that are listed", listed.select_all, "A", "cmd/ctrl"),
-    ]
-
-
-def acting(actions: Sequence[Action], run: Callable[[Action], None]) -> list[Command]:
-    """What is done with the selected ones."""
-    return [
-        Command(action.named, lambda action=action: run(action), action.key, action.modifier)
-        for action in actions
-        if action.named
     ]

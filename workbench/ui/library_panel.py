@@ -17,16 +17,18 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import viser
 
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
+from workbench.ui.controls import Control, tell_all
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import address_of_jpeg
 from workbench.ui.library_edits import LibraryEdits
-from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, Action, LibraryList, acting, walking
+from workbench.ui.library_list import RANGE, TOGGLE, Action, LibraryList, walking
 from workbench.ui.library_rows import (
     COLUMNS,
     HINTS,
@@ -66,10 +68,10 @@ class LibraryPanel(PagePart[object]):
         on_open: Callable[[tuple[str, ...]], None],
         clock: Clock = time.monotonic,
     ) -> None:
-        self._server, self._library, self._clock = server, library, clock
+        self._server, self._library = server, library
         self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._list = LibraryList(library)
-        self._edits = LibraryEdits(server, library, self._on_asking)
+        self._edits = LibraryEdits(server, library, self.leave_keys)
         self._lock = threading.RLock()
         self._actions = [
             Action(
@@ -104,10 +106,15 @@ class LibraryPanel(PagePart[object]):
             ),
         ]
         self._filters = server.gui.add_html("")
-        self._find = server.gui.add_text(
-            "Find",
-            "",
-            hint="Words in task, tags, note, name or version, all of which must be found; seed:3 for a seed",
+        self._find = Control(
+            server.gui.add_text(
+                "Find",
+                "",
+                hint="Words in task, tags, note, name or version, all of which must be found; seed:3 for a seed",
+            ),
+            send=lambda words: self._list.look_for(words, self._list.task),
+            settle=TYPING,
+            clock=clock,
         )
         self._tasks: viser.GuiDropdownHandle = server.gui.add_dropdown("Task", (ALL_TASKS,), visible=False)
         self._tools = server.gui.add_html("")
@@ -117,21 +124,18 @@ class LibraryPanel(PagePart[object]):
         self._presses = Presses(server)
         self._numbers = self._presses.number_id("rows", self._on_row)
 
-        self._typed_at: float | None = None
-        self._ids: list[str] = []
-        """By the number of its row."""
         self._number_of: dict[str, int] = {}
+        """Of a recording's row, from 1 on, in the order in which they came."""
         self._drawn: object = None
         self._filters_drawn: object = None
         """What they were counted for: of thousands of rows that takes long."""
         self._table_drawn: object = None
-        self._marked: object = None
 
         self._keys: list[viser.CommandHandle] = []
         self._escapes: list[viser.CommandHandle] = []
-        self._key_names: tuple[str, ...] = ()
+        self.keys: tuple[str, ...] = ()
+        """Of `commands`, those that are of use only where the table is seen, as `Command.combination` has them."""
         self._asking = False
-        self._find.on_update(lambda _: self._on_typed())
         self._tasks.on_update(lambda _: self._on_task())
 
     # --- for whoever hosts it --------------------------------------------------------------------------
@@ -150,8 +154,12 @@ class LibraryPanel(PagePart[object]):
             self._actions.append(action)
 
     def leave_keys(self, asking: bool) -> None:
-        """Take no keys while another part of the page asks something."""
-        self._on_asking(asking)
+        """Take no keys while something is asked, here or by another part of the page."""
+        # viser's keys come before a focused button's: Enter on Cancel would open a recording.
+        self._asking = asking
+        for key in self._keys:
+            key.disabled = asking
+        self._can_escape()
 
     def close(self) -> None:
         """Close the window with a question, if there is one. For when the page goes, and its keys with it."""
@@ -162,22 +170,17 @@ class LibraryPanel(PagePart[object]):
         """Keys of the table, for the page to register after the last action was added."""
         commands = [
             *walking(self._list),
-            *acting(self._actions, self._run),
+            *(
+                Command(action.named, partial(self._run, action), action.key, action.modifier)
+                for action in self._actions
+                if action.named
+            ),
             Command("Take back the last deletion", self._edits.undo_delete, "Z"),
         ]
-        self._key_names = tuple(command.combination for command in commands)
+        self.keys = tuple(command.combination for command in commands)
         commands = [replace(command, registered=self._keys.append) for command in commands]
         escape = Command("Cancel, or show all recordings again", self._escape, "escape")
-        return [*commands, replace(escape, registered=self._add_escape)]
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Of `commands`, those that are of use only where the table is seen, as `Command.combination` has them."""
-        return self._key_names
-
-    def _add_escape(self, handle: viser.CommandHandle) -> None:
-        handle.disabled = True  # of no use but while something is asked, or looked for
-        self._escapes.append(handle)
+        return [*commands, replace(escape, registered=self._escapes.append)]
 
     def _escape(self) -> None:
         if self._asking:
@@ -186,6 +189,7 @@ class LibraryPanel(PagePart[object]):
             self._clear_filter()
 
     def _can_escape(self) -> None:
+        """Of no use but while something is asked, or looked for."""
         listed = self._list
         of_use = self._asking or bool(listed.words or listed.task) or listed.outcome != "all"
         for handle in self._escapes:
@@ -197,9 +201,7 @@ class LibraryPanel(PagePart[object]):
         """Draw what has changed; `view` is of the page that hosts it, and not looked at."""
         view = self._library.view()
         with self._lock, self._list.lock:
-            if self._typed_at is not None and self._clock() - self._typed_at > TYPING:
-                self._typed_at = None
-                self._list.look_for(self._find.value, self._list.task)
+            self._find.show(self._list.words)
             wanted = (view.serial, self._list.state(), len(self._actions))
             if wanted == self._drawn:
                 return
@@ -208,7 +210,7 @@ class LibraryPanel(PagePart[object]):
             page = self._list.page(view)
             self._draw_filters(view)
             self._draw_table(view, page)
-            self._draw_tools(view, page)
+            self._draw_tools(view)
             self._draw_marks(page)
             empty = self._press("empty", self._edits.ask_empty)
             self._trash.content = render("library_trash", trash=view.trash, empty=empty)
@@ -225,7 +227,7 @@ class LibraryPanel(PagePart[object]):
             self._tasks.options = (ALL_TASKS, *tasks)
             self._tasks.value = ALL_TASKS if listed.task is None else listed.task
         self._tasks.visible = len(tasks) > 1
-        self._find.visible = bool(view.rows)
+        self._find.handle.visible = bool(view.rows)
         others = chosen(view.rows, listed.words, "all", listed.task)
         counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in MEANS}
         self._filters.content = render(
@@ -305,13 +307,12 @@ class LibraryPanel(PagePart[object]):
             "hint": f"{HINTS[column]}. Press to sort by it",
         }
 
-    def _draw_tools(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
+    def _draw_tools(self, view: LibraryView) -> None:
         listed, rows = self._list, self._list.rows(view)
-        count, first = len(listed.selected), listed.first
+        count = len(listed.selected)
         if not view.rows and not view.trash.files:
             self._tools.content = ""
             return
-        last = first + len(page)
         self._tools.content = render(
             "library_tools",
             tools=[
@@ -331,59 +332,35 @@ class LibraryPanel(PagePart[object]):
             all=self._press("all", listed.select_all) if count < len(rows) else "",
             none=self._press("none", lambda: self.select(())) if count else "",
             undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
-            pages=None
-            if len(rows) <= MOST_ROWS
-            else {
-                "first": first + 1,
-                "last": last,
-                "of": len(rows),
-                "back": self._press("back", lambda: listed.turn(-1)) if first else "",
-                "on": self._press("on", lambda: listed.turn(1)) if last < len(rows) else "",
-            },
+            pages=listed.pages.shown(self._press),
         )
 
     def _draw_marks(self, page: Sequence[LibraryRow]) -> None:
         listed = self._list
         selected = [self._number(row.id) for row in page if row.id in listed.selected]
         cursor = None if listed.cursor is None else self._number(listed.cursor)
-        if (selected, cursor) != self._marked:
-            self._marked = selected, cursor
-            self._marks.content = render(
-                "library_marks", selected=selected, cursor=cursor, follow=listed.follow
-            )
+        self._marks.content = render("library_marks", selected=selected, cursor=cursor, follow=listed.follow)
 
     def _number(self, id: str) -> int:
-        """Of its row, from 1 on."""
-        if id not in self._number_of:
-            self._ids.append(id)
-            self._number_of[id] = len(self._ids)
-        return self._number_of[id]
+        return self._number_of.setdefault(id, len(self._number_of) + 1)
 
     # --- what is pressed, typed and chosen ---------------------------------------------------------------
 
     def _press(self, key: object, do: Callable[[], None]) -> str:
         return self._presses.id_of(("library", key), lambda _client: do())
 
-    def _on_row(self, sent: int, _client: viser.ClientHandle | None) -> None:
+    def _on_row(self, sent: int) -> None:
         number, held = divmod(sent, 8)
         with self._lock:
-            id = self._ids[number - 1] if 1 <= number <= len(self._ids) else None
-        if id is None or not self._list.press(id, held & (TOGGLE | RANGE)):
-            return
-        if held & OPEN:
+            id = next(iter(list(self._number_of)[max(0, number - 1) : number]), "")
+        if self._list.press(id, held & (TOGGLE | RANGE)) and held & OPEN:
             self._run(self._actions[0])
-
-    def _on_typed(self) -> None:
-        with self._lock:
-            self._typed_at = self._clock()
 
     def _on_task(self) -> None:
         self._list.look_for(self._list.words, self._tasks.value)
 
     def _clear_filter(self) -> None:
-        with self._lock:
-            self._typed_at = None
-        self._find.value, self._tasks.value = "", ALL_TASKS
+        self._find.handle.value, self._tasks.value = "", ALL_TASKS
         self._list.choose("all")
         self._list.look_for("", None)
 
@@ -392,20 +369,10 @@ class LibraryPanel(PagePart[object]):
     def _run(self, action: Action) -> None:
         ids = self.selected()
         if not ids:
-            self._edits.notify(
-                "Nothing is selected",
-                f"Press a row of the library first: {action.label} is for what is selected there.",
-            )
+            body = f"Press a row of the library first: {action.label} is for what is selected there."
+            tell_all(self._server, "Nothing is selected", body, seconds=8.0)
         elif action.most is not None and len(ids) > action.most:
-            self._edits.notify(
-                f"{len(ids)} are selected", f"{action.label} takes at most {action.most} at once."
-            )
+            body = f"{action.label} takes at most {action.most} at once."
+            tell_all(self._server, f"{len(ids)} are selected", body, seconds=8.0)
         else:
             action.run(ids)
-
-    def _on_asking(self, asking: bool) -> None:
-        # viser's keys come before a focused button's: Enter on Cancel would open a recording.
-        self._asking = asking
-        for key in self._keys:
-            key.disabled = asking
-        self._can_escape()

@@ -101,27 +101,24 @@ class Presses:
         pressed = self.id_of("unfolded", lambda _: unfolded())
         self._server.gui.add_html(render("unfolded", id=pressed), order=_LAST + 2)
 
-    def number_id(self, key: Hashable, pressed: Callable[[int, viser.ClientHandle | None], None]) -> str:
+    def number_id(self, key: Hashable, pressed: Callable[[int], None]) -> str:
         """The id to put into ``data-numbers`` around ``choosable.html``; the same key is the same input for good.
 
         Args:
-            pressed: called with the number that was pressed, below `NUMBERS`, and the page that did it, on a thread of
-                viser's.
+            pressed: called with the number that was pressed, below `NUMBERS`, on a thread, in turn.
         """
-        return self._typed(key, lambda sent, client: pressed(sent % NUMBERS, client))
+        return self._typed(key, lambda sent: pressed(sent % NUMBERS))
 
-    def place_id(
-        self, key: Hashable, pressed: Callable[[float, float, viser.ClientHandle | None], None]
-    ) -> str:
+    def place_id(self, key: Hashable, pressed: Callable[[float, float], None]) -> str:
         """The id to put into ``data-place``; the same key is the same input for good.
 
         Args:
             pressed: called with the place in the picture, 0, 0 at its upper left corner and 1, 1 at its lower right
-                one, and the page that did it, on a thread, in turn.
+                one, on a thread, in turn.
         """
-        return self._typed(key, lambda sent, client: pressed(*place_of(sent), client))
+        return self._typed(key, lambda sent: pressed(*place_of(sent)))
 
-    def _typed(self, key: Hashable, take: Callable[[int, viser.ClientHandle], None]) -> str:
+    def _typed(self, key: Hashable, take: Callable[[int], None]) -> str:
         """The id of a hidden input whose number is taken."""
         if key not in self._ids:
             with self._folder:
@@ -132,7 +129,7 @@ class Presses:
                 # Read with its own message: a recording that is pressed twice is selected and opened by three.
                 sent, client = event.target.value, event.client
                 if client is not None:
-                    await in_turn(client, lambda: take(sent, client))
+                    await in_turn(client, lambda: take(sent))
 
             number.on_update(typed)
             self._ids[key] = element_id(number)
@@ -140,32 +137,35 @@ class Presses:
 
 
 class Paged:
-    """Which page of a long list is shown, and the two buttons that turn it."""
+    """Which page of a long list is shown, of `most` at a time. From any thread."""
 
-    def __init__(self, presses: Presses, most: int) -> None:
+    def __init__(self, most: int) -> None:
         self._most, self.first, self._count = most, 0, 0
-        self._turns = [
-            presses.id_of("back", lambda _: self.go_to(self.first - most)),
-            presses.id_of("on", lambda _: self.go_to(self.first + most)),
-        ]
 
     def go_to(self, place: int) -> None:
-        """To the page of a place, or the nearest that there is."""
-        last = max(0, self._count - 1)
-        self.first = min(max(place, 0), last) // self._most * self._most
+        """To the page of a place; `places` takes the nearest that there is."""
+        self.first = max(place, 0) // self._most * self._most
+
+    def turn(self, by: int) -> None:
+        """Go on by so many pages."""
+        self.go_to(self.first + by * self._most)
 
     def places(self, count: int) -> range:
         """What is shown of a list that is so long now."""
         self._count = count
-        self.go_to(self.first)
+        if self.first >= count:
+            self.go_to(count - 1)
         return range(self.first, min(self.first + self._most, count))
 
-    @property
-    def shown(self) -> dict[str, object] | None:
-        """For a template: from where to where, of how many, and the ids of the buttons; None where one page has all."""
+    def shown(self, press: Callable[[str, Callable[[], None]], str]) -> dict[str, object] | None:
+        """For a template: from where to where, of how many, and the ids of the buttons; None where one page has all.
+
+        Args:
+            press: gives what turns the page an id.
+        """
         if self._count <= self._most:
             return None
-        back, on = self._turns
+        back, on = press("back", lambda: self.turn(-1)), press("on", lambda: self.turn(1))
         last = min(self.first + self._most, self._count)
         return {"first": self.first + 1, "last": last, "of": self._count, "back": back, "on": on}
 
