@@ -22,7 +22,17 @@ from workbench.session.judging import JudgedView
 from workbench.session.review import Review
 from workbench.session.verdict import Verdict
 from workbench.ui.judged_panel import MOST_ROWS, status_html
-from workbench.ui.rescore_panel import IDLE, RescoreChoices, RescorePanel, episode_files
+from workbench.ui.rescore_panel import (
+    IDLE,
+    RECORDED,
+    TODAYS,
+    Code,
+    RescoreChoices,
+    RescorePanel,
+    episode_files,
+)
+
+AS_RECORDED, TODAYS_CODE = Code(RECORDED, "", recorded=True), Code(TODAYS, "")
 
 
 def verdict(id: str = "a", **changes: Any) -> Verdict:
@@ -138,7 +148,7 @@ class Rescoring:
 
 @pytest.fixture
 def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) -> Rescoring:
-    told, choices = Told(), RescoreChoices(True, False)
+    told, choices = Told(), RescoreChoices(AS_RECORDED)
     panel = RescorePanel(panels.server, cast(Any, told), review, library, choices)
     return Rescoring(panel, panels, clock, review, choices, told)
 
@@ -224,9 +234,9 @@ def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -
     assert rescoring.panels.control("Code").value == "as recorded"
     rescoring.panels.set("Recorded states", True)
     rescoring.panels.claim("Code", "../../etc")
-    assert rescoring.choices == RescoreChoices(True, True)
+    assert rescoring.choices == RescoreChoices(AS_RECORDED, True)
     rescoring.panels.set("Code", "today's")
-    assert rescoring.choices == RescoreChoices(False, True)
+    assert rescoring.choices == RescoreChoices(TODAYS_CODE, True)
 
 
 def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:

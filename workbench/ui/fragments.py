@@ -52,6 +52,19 @@ def percent(done: float, total: float) -> int:
     return round(100 * done / total) if total else 0
 
 
+COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
+
+
+def letter(index: int) -> str:
+    """What a recording is called on the page: A to D, then numbers."""
+    return "ABCD"[index] if index < 4 else str(index + 1)
+
+
+def colour(index: int) -> str:
+    """Of a recording that is compared, in legends, curves and the view."""
+    return COLOURS[index % len(COLOURS)]
+
+
 def short_text(text: str, longest: int = 120) -> str:
     return text if len(text) <= longest else text[: longest - 1] + "…"
 
@@ -81,7 +94,8 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    filters = (place, size, percent, counted, short_text, letter, colour)
+    environment.filters.update({filter.__name__: filter for filter in filters})
     macros = environment.get_template("can_be_pressed.html").module
-    environment.globals.update({name: getattr(macros, name) for name in ("press", "to_copy")})
-    environment.filters.update({"place": place, "size": size, "percent": percent, "counted": counted})
+    environment.globals.update({name: getattr(macros, name) for name in ("press", "to_copy", "badge")})
     return environment

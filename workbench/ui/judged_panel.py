@@ -49,7 +49,7 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
     def _add_list(self) -> None:
         self._list = self._server.gui.add_html("", visible=False)
         self._presses = Presses(self._server)
-        self._pages = Paged(self._presses, MOST_ROWS)
+        self._pages = Paged(MOST_ROWS)
 
     def _add_chart(self) -> None:
         self._chart = LineChart(self._server, self._server.gui.add_folder(None), height=160)
@@ -65,7 +65,8 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
         self._list.visible = bool(listed)
         if listed:
             rows = [self._row(place) for place in self._pages.places(len(listed))]
-            self._list.content = render("judged_list", rows=rows, more=self._pages.shown, column=self._column)
+            pages = self._pages.shown(lambda key, do: self._presses.id_of(key, lambda _: do()))
+            self._list.content = render("judged_list", rows=rows, more=pages, column=self._column)
 
     def _draw_chart(
         self, title: str, x: NDArray, old: NDArray, new: NDArray, dot: NDArray | None = None
@@ -77,7 +78,7 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
         verdict, row = self._listed[place], place % MOST_ROWS
         told = self._failed_since and verdict.why_not.startswith(self._failed_since)
         return {
-            "letter": "",
+            "badge": None,
             "changed": "not judged" if told else words.what_changed(verdict),
             "returns": "" if verdict.why_not else words.returns(verdict),
             "drift": f"drifted {words.drift(verdict)}" if verdict.drifted else "",

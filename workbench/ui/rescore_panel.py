@@ -7,7 +7,7 @@ code judges is chosen among what the server knows of, by name, and never by a pa
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ from workbench.ui.controls import tell_all
 from workbench.ui.fragments import counted, render
 from workbench.ui.judged_panel import JudgedPanel
 from workbench.ui.line_chart import part_round
-from workbench.ui.review_scene import COLOURS, letter
 
 TODAYS, RECORDED = "today's", "as recorded"
 MOST_NAMED = 3
@@ -37,10 +36,10 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Code:
-    """One choice."""
+    """One choice; what it is called does not make it another."""
 
-    label: str
-    told: str
+    label: str = field(compare=False)
+    told: str = field(compare=False)
     """What is opened, in words."""
     file: Path | None = None
     """Asked before the files that the recordings name."""
@@ -96,10 +95,8 @@ IDLE = (
 class RescoreChoices:
     """How it is judged; outlives the page, which goes and comes."""
 
-    recorded_source: bool = False
+    code: Code = Code(TODAYS, "")
     use_env_states: bool = False
-    file: Path | None = None
-    """Asked before the files that the recordings name."""
 
 
 def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
@@ -143,7 +140,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         self._code: viser.GuiDropdownHandle = gui.add_dropdown(
             "Code",
             labels,
-            initial_value=RECORDED if choices.recorded_source else TODAYS,
+            initial_value=RECORDED if choices.code.recorded else TODAYS,
             hint="Today's code of the task, the text that the recording was made with, or a task file that is open here",
         )
         self._code.on_update(lambda _: self._chosen())
@@ -175,14 +172,13 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         self._pages.go_to(0)
         self._rescorer.start(
             files,
-            file=self._choices.file,
-            recorded_source=self._choices.recorded_source,
+            file=self._choices.code.file,
+            recorded_source=self._choices.code.recorded,
             use_env_states=self._choices.use_env_states,
         )
 
     def _chosen(self) -> None:
-        code = next(code for code in self._codes if code.label == self._code.value)
-        self._choices.recorded_source, self._choices.file = code.recorded, code.file
+        self._choices.code = next(code for code in self._codes if code.label == self._code.value)
         self._choices.use_env_states = self._states.value
 
     # --- drawing -----------------------------------------------------------------------------------
@@ -193,9 +189,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
 
     def _codes_are_of(self, view: ReviewView) -> object:
         """What decides which code there is to choose from."""
-        choices = self._choices
-        opened = tuple(one.id for one in view.opened)
-        return opened, tuple(self._known()), choices.recorded_source, choices.file
+        return tuple(one.id for one in view.opened), tuple(self._known()), self._choices.code
 
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
@@ -210,13 +204,9 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
             return
         self._codes_of = wanted
         self._codes = codes_for([one.episode.info for one in view.opened], self._known())
-        choices = self._choices
-        of_choice = [
-            c for c in self._codes if (c.recorded, c.file) == (choices.recorded_source, choices.file)
-        ]
-        chosen = of_choice[0] if of_choice else self._codes[0]
         # What is not among the choices any more is not judged with, unseen.
-        choices.recorded_source, choices.file = chosen.recorded, chosen.file
+        chosen = next((code for code in self._codes if code == self._choices.code), self._codes[0])
+        self._choices.code = chosen
         labels = tuple(code.label for code in self._codes)
         if self._code.options != labels:
             self._code.options = labels
@@ -225,21 +215,15 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
 
     def _of_row(self, verdict: Verdict[Source]) -> dict[str, Any]:
         at = verdict.first_difference
+        opened = [one.id for one in self._review.view().opened]
         return {
-            **self._letter_of(verdict),
+            # As it is drawn with, if it is one of several that are open.
+            "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
             "name": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.of.name[-24:],
             "hint": f"{verdict.of.name}. Press to open it"
             + (f" at step {at}, the first that differs" if at is not None else ""),
             "selected": verdict.of.id == self._selected,
         }
-
-    def _letter_of(self, verdict: Verdict[Source]) -> dict[str, str]:
-        """As it is drawn with, if it is one of several that are open."""
-        opened = [one.id for one in self._review.view().opened]
-        if len(opened) < 2 or verdict.of.id not in opened:
-            return {"letter": "", "colour": ""}
-        index = opened.index(verdict.of.id)
-        return {"letter": letter(index), "colour": COLOURS[index % len(COLOURS)]}
 
     def _show(self, verdict: Verdict[Source]) -> None:
         self._selected = verdict.of.id
