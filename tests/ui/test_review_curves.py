@@ -37,7 +37,7 @@ def test_what_is_not_per_env_is_marked() -> None:
     other = NumberRow("phase", "", "", whole="push", hint="not per env: str")
     (row,) = table = compared([phase], [([phase], 1), ([other], 2)])
     assert (row["values"], row["whole"], row["hint"]) == (["<b>reach", "push"], True, "not per env: str")
-    html = render("review_numbers", rows=table, heads=[("A", ""), ("B", "")])
+    html = render("review_numbers", rows=table, of=(0, 1))
     assert "not per env</span>" in html and "&lt;b&gt;reach" in html
 
 

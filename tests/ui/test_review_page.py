@@ -49,7 +49,7 @@ class Shown:
         self.page.redraw()
 
     def open(self, *seeds: int) -> None:
-        rows = {row.seed: row.id for row in self.library.rows()}
+        rows = {-1 if row.seed is None else row.seed: row.id for row in self.library.rows()}
         self.review.open([rows[seed] for seed in seeds])
         until(
             lambda: len(self.review.view().opened) == len(seeds) and not self.review.view().loading,
@@ -133,6 +133,99 @@ def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pyte
     shown.draw()
     assert "B has no success" in shown.panels.part("Review").html()
     assert shown.panels.control(SLIDER).min == -7
+
+
+def strip_of(shown: Shown) -> dict[str, list[tuple[str, ...]]]:
+    """What the strip draws: extents of recordings, marks, and upright lines, with their places in per cent."""
+    html = shown.panels.html("wb-timeline")
+    extent = r'wb-length" style="left:([-\d.]+)%;width:([-\d.]+)%;background:(#\w+)"'
+    mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" title="([^"]*)"'
+    return {
+        "extents": re.findall(extent, html),
+        "marks": re.findall(mark, html),
+        "lines": re.findall(r'<line x1="([-\d.]+)" x2="\1" [^>]*class="([\w -]+)"', html),
+        "bands": re.findall(r'<rect x="([-\d.]+)" y="-14" width="([-\d.]+)"', html),
+        "legend": re.findall(r'wb-key wb-mark-(\w+)"></i>([^<]*)<', html),
+    }
+
+
+def test_the_strip_has_each_recording_where_it_is_aligned(shown: Shown) -> None:
+    shown.open(1)
+    shown.review.seek(7)
+    shown.draw()
+    strip = strip_of(shown)
+    assert strip["marks"] == [("success", "70.0", " success, step 7")] and strip["extents"] == []
+    assert strip["legend"] == [("success", "success")] and strip["bands"] == [("0.0", "100.0")]
+    assert strip["lines"] == [("70.0", "wb-cursor wb-past")]
+    html = shown.panels.html("wb-timeline")
+    assert ">step 7 / 10, 0.35 s<" in html and '<span class="wb-num">success</span>' in html
+    assert "stroke:" not in html and "aligned at" not in html
+    shown.open(1, 2)
+    shown.review.seek(8)
+    shown.draw()
+    assert strip_of(shown)["extents"] == [("0.0", "100.0", "#228be6"), ("0.0", "60.0", "#f08c00")]
+    assert ">A: step 8 / 10, 0.40 s<" in shown.panels.html("wb-timeline")
+    shown.review.select(1)
+    shown.review.align("first success")
+    shown.draw()
+    strip = strip_of(shown)
+    assert strip["extents"] == [("0.0", "76.923", "#228be6"), ("53.846", "46.154", "#f08c00")]
+    assert strip["marks"] == [("success", "53.846", "A success, step 7")]
+    assert strip["bands"] == [("53.846", "46.154")]
+    place = shown.review.view().position
+    assert strip["lines"][0] == ("53.846", "wb-zero") and len(strip["lines"]) == 2
+    assert float(strip["lines"][1][0]) == pytest.approx(100 * (place + 7) / 13, abs=1e-3)
+    shown.review.seek(-3)
+    shown.draw()
+    html = shown.panels.html("wb-timeline")
+    assert ">B: step 0 / 6, 0.00 s<" in html and "(it has no state there)" in html
+    assert "aligned at first success" in html and "stroke:#f08c00" in html
+    rows = re.findall(
+        r"<tr data-press.*?</tr>", shown.panels.part("Review").html("wb-opened-list"), re.DOTALL
+    )
+    assert len(rows) == 2 and "wb-selected" in rows[1] and "wb-selected" not in rows[0]
+    assert "background:#f08c00" in rows[1] and ">B</span>" in rows[1] and "no success" in rows[1]
+    status = shown.panels.html("wb-status")
+    assert "background:#f08c00" in status and ">B</span>" in status and "no success" in status
+
+
+def test_what_is_known_of_a_recording_is_told_and_what_is_not_is_left_out(shown: Shown, folder: Path) -> None:
+    long = "x" * 200
+    known = made(
+        2,
+        seed=31,
+        reset_options={"at": "left side"},
+        versions={"sapien": "3.0", "numpy": "2"},
+        env_kwargs={"control_mode": "pd_joint_delta_pos", "note": long},
+        side_files={"mesh.obj": "1" * 12},
+        acted_by=((0, "random"), (1, "sliders")),
+        recovered=True,
+    )
+    write(folder, known, pictures=False)
+    write(folder, made(2, seed=-1, control_mode=None), pictures=False)
+    shown.library.refresh()
+    shown.open(31)
+
+    def facts() -> dict[str, tuple[str, str]]:
+        html = shown.panels.part("Review").html("wb-facts")
+        found = re.findall(r'<tr><td>([^<]*)</td><td title="([^"]*)">([^<]*)</td></tr>', html)
+        return {name: (value, hint) for name, hint, value in found}
+
+    said = facts()
+    assert said["file"][0] == said["file"][1] and said["file"][0].startswith("Push")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", said["recorded"][0])
+    assert said["recorded"][1] == known.info.written_at
+    assert said["seed"] == ("31", "of the episode")
+    assert said["reset options"] == ("at=&#39;left side&#39;",) * 2
+    assert said["source"][1] == "push.py" and said["source"][0]
+    assert said["not held"] == ("mesh.obj", "What else the task reads, as it was named by its text: mesh.obj")
+    assert said["ran on"] == ("cpu (batched)", "sapien 3.0, numpy 2")
+    assert said["actions"] == ("random; from step 2 on: sliders",) * 2
+    assert said["control mode"] == ("pd_joint_delta_pos", "")
+    assert said["made with"] == (f"note={long[:114]}…", f"note={long}")
+    assert said["cut short"] == ("its writer ended in the middle", "")
+    shown.open(-1)
+    assert list(facts()) == ["file", "recorded", "source", "ran on"]
 
 
 def test_a_scene_is_framed_as_it_was_drawn_while_another_recording_comes(shown: Shown) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.timeline import Strip, TimelineView
 from workbench.ui.fragments import render
 from workbench.ui.timeline_panel import LINE_HEIGHT as HEIGHT
-from workbench.ui.timeline_panel import POINTS, reward_lines, strip_values
+from workbench.ui.timeline_panel import POINTS, reward_lines, strip_html
 
 
 def strip(**changes: object) -> Strip:
@@ -27,39 +29,63 @@ def past(shown: int | None = None) -> TimelineView:
     return TimelineView(100, 200, shown, 60, 3 * 1024**2, 256 * 1024**2, 101, True, None)
 
 
+def marks(html: str) -> list[tuple[float, str, str]]:
+    """Per cent from the left, style and words of each."""
+    found = re.findall(r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" title="([^"]*)"', html)
+    return [(float(place), style, words) for style, place, words in found]
+
+
+def cursor(html: str) -> float:
+    return float(re.findall(r'<line x1="([\d.]+)" x2="\1" [^>]*wb-cursor', html)[0])
+
+
 def test_marks_stand_where_they_happened_and_say_what_matters_most() -> None:
-    values = strip_values(strip(), running(4, timeline=past()))
-    marks = values["marks"]
-    assert isinstance(marks, list)
-    assert [(m["x"], m["style"], m["ago"]) for m in marks] == [
-        (0.0, "reset", 100),
-        (50.0, "success", 50),
-        (60.0, "reset", 40),
-        (80.0, "back", 20),
+    html = strip_html(strip(), running(4, timeline=past()))
+    assert marks(html) == [
+        (0.0, "reset", "reset, 100 steps ago"),
+        (50.0, "success", "success, 50 steps ago"),
+        (60.0, "reset", "reset, 40 steps ago"),
+        (80.0, "back", "went back 60 steps, 20 steps ago"),
     ]
-    assert marks[-1]["name"] == "went back 60 steps"
-    assert values["arcs"] == [{"a": 20.0, "b": 80.0, "middle": 50.0}]
-    assert values["live"] and values["cursor"] == 100.0
+    assert re.findall(r'<path d="([^"]*)"', html) == ["M 20.0 0 Q 50.0 -26 80.0 0"]
+    assert ">live<" in html and cursor(html) == 100.0
+    legend = re.findall(r'wb-key wb-mark-(\w+)"></i>([^<]*)<', html)
+    assert legend == [("success", "success"), ("back", "went back"), ("reset", "reset")]
+
+
+def test_bands_are_what_was_lived_through_without_a_jump() -> None:
+    html = strip_html(strip(), running(4, timeline=past()))
+    bands = re.findall(r'<rect x="([\d.]+)" y="-14" width="([\d.]+)" height="46" class="([^"]*)"', html)
+    assert bands == [
+        ("0.0", "59.0", "wb-band"),
+        ("60.0", "19.0", "wb-band wb-odd"),
+        ("80.0", "20.0", "wb-band wb-branch"),
+    ]
+
+
+def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> None:
+    html = strip_html(strip(branches=()), running(4, timeline=past()))
+    assert marks(html)[-1] == (80.0, "back", "from a recording, 20 steps ago") and "<path" not in html
+    html = strip_html(strip(low=150, branches=((180, 120),)), running(4, timeline=past()))
+    assert re.findall(r'<path d="([^"]*)"', html) == ["M 0.0 0 Q 30.0 -26 60.0 0"]
 
 
 def test_a_shown_moment_is_told_in_steps_ago() -> None:
-    values = strip_values(strip(), running(4, selected_env=2, timeline=past(163)))
-    assert (values["cursor"], values["ago"], values["live"]) == (63.0, 37, False)
-    html = render("timeline", **values)
+    html = strip_html(strip(), running(4, selected_env=2, timeline=past(163)))
+    assert cursor(html) == 63.0 and ">live<" not in html
     assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
     assert "history 3.0 of 256 MB, 101 steps" in html
 
 
 def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
-    values = strip_values(strip(low=160), running(4, timeline=past(120)))
-    assert values["cursor"] == 0.0
+    assert cursor(strip_html(strip(low=160), running(4, timeline=past(120)))) == 0.0
 
 
 def test_one_moment_alone_can_be_drawn() -> None:
     one = strip(
         low=100, high=100, events=((100, RESET),), reward=np.zeros(1), branches=(), stretches=((100, 100),)
     )
-    html = render("timeline", **strip_values(one, running(1, timeline=past())))
+    html = strip_html(one, running(1, timeline=past()))
     assert "nan" not in html and 'width="-' not in html
 
 
@@ -84,7 +110,7 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_no_line() -> Non
     ]
     many = np.tile(np.array([np.nan, 1, 2], np.float32), 1000)
     assert len(reward_lines(many)) == 1, "narrower than a pixel"
-    html = render("timeline", **strip_values(strip(reward=many[:101]), running(4, timeline=past())))
+    html = strip_html(strip(reward=many[:101]), running(4, timeline=past()))
     assert "nan" not in html and html.count("<polyline") > 1
 
 
@@ -98,5 +124,5 @@ def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
 
 
 def test_fail_is_drawn_before_success() -> None:
-    values = strip_values(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
-    assert isinstance(values["marks"], list) and values["marks"][0]["style"] == "fail"
+    html = strip_html(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
+    assert [style for _, style, _ in marks(html)] == ["fail"]

@@ -18,10 +18,9 @@ from workbench.session.review_compare import (
     difference,
 )
 from workbench.session.review_view import Opened, ReviewView
-from workbench.ui.fragments import render
+from workbench.ui.fragments import letter, render
 from workbench.ui.parts import PagePart
 from workbench.ui.presses import Presses
-from workbench.ui.review_scene import COLOURS, letter
 
 TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
 MOST_ROWS = 30
@@ -51,8 +50,8 @@ class ReviewComparePanel(PagePart[ReviewView]):
         )
         self._html = gui.add_html("")
         self._presses = Presses(server)
-        self._places: dict[int, int] = {}
-        """What a row of the table goes to: its position."""
+        self._differing: list[Parting] = []
+        """By the rows of the table, of which each goes to its position."""
 
     def key(self, view: ReviewView) -> object:
         return view.opened_serial, len(view.opened), view.anchors, self._other.value, self._tolerance.value
@@ -74,41 +73,34 @@ class ReviewComparePanel(PagePart[ReviewView]):
         tolerance = TOLERANCE_NAMES[self._tolerance.value]
         a, b = view.opened[0], view.opened[other]
         found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), tolerance)
-        self._html.content = self._content(view, a, b, other, found)
+        self._html.content = self._content(a, b, other, found, view)
 
-    def _content(self, view: ReviewView, a: Opened, b: Opened, other: int, found: Difference) -> str:
+    def _content(self, a: Opened, b: Opened, other: int, found: Difference, view: ReviewView) -> str:
         partings = [*([found.bodies] if found.bodies else []), *found.numbers]
-        differing = [p for p in partings if p.position is not None]
-        same = [p for p in partings if p.position is None and not p.first]
+        self._differing = [p for p in partings if p.position is not None]
+        presses = [
+            self._presses.id_of(number, lambda _, number=number: self._go(number))
+            for number in range(len(self._differing[:MOST_ROWS]))
+        ]
         one_sided = [f"{p.name} ({p.first})" for p in partings if p.position is None and p.first]
-        rows = [self._row(number, parting, view) for number, parting in enumerate(differing[:MOST_ROWS])]
         return render(
             "review_compare",
-            a=("A", COLOURS[0], a.name),
-            b=(letter(other), COLOURS[other % 4], b.name),
+            a=a,
+            b=b,
+            other=other,
+            view=view,
+            found=found,
             headline=headline(found),
             notes=notes(a, b, found),
             totals=next((p.whole for p in found.numbers if p.name == "reward"), ""),
-            rows=rows,
-            more=len(differing) - len(rows),
-            same=", ".join(p.name.removeprefix(PREFIX) for p in same),
+            rows=list(zip(self._differing, presses, strict=False)),
+            more=len(self._differing) - len(presses),
+            same=", ".join(
+                p.name.removeprefix(PREFIX) for p in partings if p.position is None and not p.first
+            ),
             one_sided=", ".join((*one_sided, *found.not_in_both)),
-            source=found.source,
-            source_is_same=found.same_source,
+            prefix=PREFIX,
         )
-
-    def _row(self, number: int, parting: Parting, view: ReviewView) -> dict[str, object]:
-        assert parting.position is not None
-        self._places[number] = parting.position
-        press = self._presses.id_of(number, lambda _, number=number: self._go(number))
-        step = parting.position if view.align == "start" else f"{parting.position:+d}"
-        return {
-            "name": parting.name.removeprefix(PREFIX),
-            "step": step,
-            "first": parting.first,
-            "most": parting.most,
-            "press": press,
-        }
 
     def _change_places(self) -> None:
         count = len(self._review.view().opened)
@@ -117,8 +109,9 @@ class ReviewComparePanel(PagePart[ReviewView]):
             self._review.exchange(0, letters.index(self._other.value))
 
     def _go(self, number: int) -> None:
-        if number in self._places:
-            self._review.seek(self._places[number])
+        place = self._differing[number].position if number < len(self._differing) else None
+        if place is not None:
+            self._review.seek(place)
 
 
 def headline(found: Difference) -> str:

@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from workbench.core.step import StepResult
 from workbench.recording.episode import Episode
-from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
 from workbench.ui.curves_panel import COLOURS as LINE_COLOURS
-from workbench.ui.fragments import render
+from workbench.ui.fragments import colour, letter, render
 from workbench.ui.line_chart import LONGEST, Line, LineChart, span_of
 from workbench.ui.numbers_panel import NumberRow, number_rows
 from workbench.ui.parts import PagePart
-from workbench.ui.review_scene import COLOURS, letter
+from workbench.ui.review_scene import shown_together
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
 """Their heights, from the top."""
@@ -48,12 +47,11 @@ class ReviewNumbers(PagePart[ReviewView]):
             return
         own = number_rows(step_of(chosen.episode, view.states[view.selected]), 0, chosen.length)
         beside = [(own, view.states[view.selected])]
-        heads = [("value", "")]
-        if len(together := shown_together(view)) > 1:
+        together = shown_together(view)
+        if len(together) > 1:
             steps = [(step_of(view.opened[i].episode, view.states[i]), view.states[i]) for i in together]
             beside = [(number_rows(step, 0, None), state) for step, state in steps]
-            heads = [(letter(i), COLOURS[i % 4]) for i in together]
-        self._html.content = render("review_numbers", rows=compared(own, beside), heads=heads)
+        self._html.content = render("review_numbers", rows=compared(own, beside), of=together)
 
 
 class ReviewCurves(PagePart[ReviewView]):
@@ -133,7 +131,7 @@ class ReviewCurves(PagePart[ReviewView]):
             states, values = lines[line] if line else next(iter(lines.values()))
             name = letter(index) if len(view.opened) > 1 else entry
             over = column_at(states, values, view.anchors[index], axis_of(view))
-            drawn.append(Line(name, over, COLOURS[index % 4], 1.7))
+            drawn.append(Line(name, over, colour(index), 1.7))
         self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
 
     def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
@@ -141,8 +139,8 @@ class ReviewCurves(PagePart[ReviewView]):
         chosen, axis = view.chosen, axis_of(view)
         lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
         drawn = [
-            Line(name, column_at(states, values, view.anchors[view.selected], axis), colour, 1.7)
-            for (name, (states, values)), colour in zip(lines.items(), LINE_COLOURS, strict=False)
+            Line(name, column_at(states, values, view.anchors[view.selected], axis), tone, 1.7)
+            for (name, (states, values)), tone in zip(lines.items(), LINE_COLOURS, strict=False)
         ]
         whose = f", {letter(view.selected)}" if len(view.opened) > 1 else ""
         self._put(chart, f"{entry}{whose}", view, drawn)
@@ -211,11 +209,6 @@ def compared(
         }
         for name, mood in moods.items()
     ]
-
-
-def shown_together(view: ReviewView) -> tuple[int, ...]:
-    """Which recordings have lines in one chart: all, or the selected one where they are too many."""
-    return tuple(range(len(view.opened))) if len(view.opened) <= MOST_COMPARED else (view.selected,)
 
 
 def axis_of(view: ReviewView) -> NDArray[np.int64]:

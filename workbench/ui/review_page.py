@@ -33,7 +33,7 @@ from workbench.ui.rescore_panel import RescorePanel
 from workbench.ui.review_compare_panel import ReviewComparePanel
 from workbench.ui.review_curves import ReviewCurves, ReviewNumbers
 from workbench.ui.review_panel import ReviewPanel
-from workbench.ui.review_scene import COLOURS, ReviewIn3D, letter
+from workbench.ui.review_scene import ReviewIn3D
 from workbench.ui.review_timeline import ReviewTimeline
 from workbench.ui.step_in import StepInPart
 from workbench.ui.view_panel import ViewPanel
@@ -196,8 +196,14 @@ class ReviewPage:
             return
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
-        keys = " ".join(self._library.keys)
-        self._status.content = status_html(view, self._place.step_in.going(), keys)
+        self._status.content = render(
+            "review_status",
+            view=view,
+            going=self._place.step_in.going(),
+            # Those that `library_keys.js` keeps from doing anything while the library is folded.
+            library_keys=" ".join(self._library.keys),
+            success_words=success_words,
+        )
         self._draw_cameras(view)
         self._parts.draw(view)
 
@@ -330,23 +336,3 @@ class ReviewPage:
     def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
         self._panel.lay_side_by_side()
         self._review.open(ids)
-
-
-def status_html(view: ReviewView, going: str = "", library_keys: str = "") -> str:
-    """
-    Args:
-        going: what is waited for on the way to the live env.
-        library_keys: those that `library_keys.js` keeps from doing anything while the library is folded.
-    """
-    chosen = view.chosen
-    return render(
-        "review_status",
-        view=view,
-        going=going,
-        word="playing" if view.playing else "paused" if view.opened else "nothing open",
-        chosen=chosen,
-        letter=letter(view.selected) if len(view.opened) > 1 else "",
-        colour=COLOURS[view.selected % len(COLOURS)],
-        library_keys=library_keys,
-        ended=None if chosen is None else success_words(chosen.episode),
-    )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime
 import shlex
 from collections.abc import Callable
-from functools import partial
 
 import viser
 
@@ -19,10 +18,9 @@ from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
 from workbench.session.step_back import ChangesOnDisk, version_of
 from workbench.ui.controls import Control
-from workbench.ui.fragments import render, short_text
+from workbench.ui.fragments import letter, render
 from workbench.ui.parts import PagePart
 from workbench.ui.presses import Presses
-from workbench.ui.review_scene import COLOURS, letter
 
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "over each other", "side by side"
@@ -83,6 +81,8 @@ class ReviewPanel(PagePart[ReviewView]):
         self._presses = Presses(server)
         self._listed: object = None
         """What the list was made of."""
+        self._told: tuple[Opened, str] | None = None
+        """What the facts are of."""
 
     @property
     def ghosts(self) -> bool:
@@ -130,32 +130,22 @@ class ReviewPanel(PagePart[ReviewView]):
             self._align.handle.options = view.alignments
         self._align.show(view.align)
         self._never.content = render("note", text=never_words(view)) if never_words(view) else ""
-        chosen = view.chosen
-        self._facts.content = (
-            ""
-            if chosen is None
-            else render("review_facts", rows=facts(chosen, self._changes.of(chosen.episode.info)))
-        )
+        told = view.chosen and (view.chosen, self._changes.of(view.chosen.episode.info))
+        if self._told != told:
+            self._told = told
+            self._facts.content = facts_html(*told) if told else ""
 
     def _list_html(self, view: ReviewView) -> str:
         if not view.opened and view.loading:
             return ""
-        rows = []
-        for index, one in enumerate(view.opened):
-            select = partial(lambda index, _: self._review.select(index), index)
-            close = partial(lambda index, _: self._review.close_one(index), index)
-            rows.append(
-                {
-                    "of": one,
-                    "letter": letter(index),
-                    "colour": COLOURS[index % len(COLOURS)],
-                    "ended": success_words(one.episode),
-                    "selected": index == view.selected,
-                    "press": self._presses.id_of(("select", index), select),
-                    "close": self._presses.id_of(("close", index), close),
-                }
+        presses = [
+            (
+                self._presses.id_of(("select", index), lambda _, index=index: self._review.select(index)),
+                self._presses.id_of(("close", index), lambda _, index=index: self._review.close_one(index)),
             )
-        return render("review_opened", rows=rows)
+            for index in range(len(view.opened))
+        ]
+        return render("review_opened", view=view, presses=presses, success_words=success_words)
 
 
 def never_words(view: ReviewView) -> str:
@@ -168,46 +158,27 @@ def never_words(view: ReviewView) -> str:
     return f"{', '.join(without)} {verb} no {name}, and {'is' if len(without) == 1 else 'are'} aligned at the start."
 
 
-def facts(one: Opened, changed: str = "") -> list[tuple[str, str, str]]:
-    """Name, value, and what to show when the pointer rests there.
+def facts_html(chosen: Opened, changed: str) -> str:
+    """What is known of a recording.
 
     Args:
         changed: what of its task is another now.
     """
-    info = one.episode.info
-    rows = [("file", one.name, one.name), ("recorded", local_time(info.written_at), info.written_at)]
-    if info.seed >= 0:
-        rows.append(("seed", str(info.seed), "of the episode"))
-    if info.reset_options:
-        rows.append(("reset options", short(info.reset_options), short(info.reset_options, 2000)))
-    if version := version_of(info) or info.source_hash:
-        rows.append(("source", version, info.source_file or ""))
-    if changed:
-        rows.append(("changed since", changed, f"In {info.source_file}, as it is now"))
-    if info.side_files:
-        names = ", ".join(info.side_files)
-        rows.append(
-            ("not held", short_text(names), f"What else the task reads, as it was named by its text: {names}")
-        )
-    rows.append(("ran on", info.backend, ", ".join(f"{k} {v}" for k, v in info.versions.items())))
-    if info.acted_by:
-        rows.append(
-            ("actions", short_text(acted_by_in_words(info.acted_by)), acted_by_in_words(info.acted_by))
-        )
-    if info.control_mode:
-        rows.append(("control mode", info.control_mode, ""))
-    kwargs = {k: v for k, v in info.env_kwargs.items() if k != "control_mode"}
-    if kwargs:
-        rows.append(("made with", short(kwargs), short(kwargs, 2000)))
-    if info.recovered:
-        rows.append(("cut short", "its writer ended in the middle", ""))
-    return rows
-
-
-def short(values: dict[str, object], longest: int = 120) -> str:
-    return short_text(
-        ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items()), longest
+    info = chosen.episode.info
+    return render(
+        "review_facts",
+        of=chosen,
+        info=info,
+        version=version_of(info) or info.source_hash,
+        changed=changed,
+        acted_by=acted_by_in_words(info.acted_by),
+        assignments=assignments,
+        local_time=local_time,
     )
+
+
+def assignments(values: dict[str, object]) -> str:
+    return ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items())
 
 
 def local_time(written: str) -> str:

@@ -18,17 +18,16 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.geometry import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import CameraTrack
-from workbench.session.review import Review
+from workbench.session.review import MOST_COMPARED, Review
 from workbench.session.review_compare import distances
 from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.camera_frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
+from workbench.ui.fragments import colour, letter
 from workbench.ui.selection_mark import SelectionMark, view_label
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.viewpoint import Stage, Viewpoint, frame_all, frame_one
 
-COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
-"""Of the recordings that are compared, in legends, curves and the view."""
 SEE_THROUGH = 0.45
 """Alpha of a ghost. Less vanishes over a white table, more hides what is behind."""
 MOST_NAMED = 16
@@ -61,9 +60,9 @@ class ReviewScene:
         return found
 
 
-def letter(index: int) -> str:
-    """What a recording is called on the page: A to D, then numbers."""
-    return "ABCD"[index] if index < 4 else str(index + 1)
+def shown_together(view: ReviewView) -> tuple[int, ...]:
+    """Which recordings have lines over each other: all, or the selected one where they are too many."""
+    return tuple(range(len(view.opened))) if len(view.opened) <= MOST_COMPARED else (view.selected,)
 
 
 def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
@@ -99,9 +98,7 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
                 name = geometry.body_names[int(body)]
                 if name in left_out:
                     continue
-                worn = (
-                    replace(visual, material=tinted(visual.material, COLOURS[index % 4])) if ghost else visual
-                )
+                worn = replace(visual, material=tinted(visual.material, colour(index))) if ghost else visual
                 # Recordings share their shapes (`SharedShapes`), and each is looked at once.
                 object_ = (id(visual.mesh), id(visual.material), index if ghost else -1)
                 if object_ not in known:
@@ -146,9 +143,9 @@ def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
     return frozenset(found)
 
 
-def tinted(material: Material, colour: str) -> Material:
+def tinted(material: Material, tone: str) -> Material:
     """Mostly that colour, half see-through, and without texture: the shape is what is compared."""
-    tint = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** 2.2
+    tint = np.array([int(tone[i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** 2.2
     own = np.array(material.base_color[:3])
     red, green, blue = (float(c) for c in 0.75 * tint + 0.25 * own)
     return Material((red, green, blue, SEE_THROUGH * material.base_color[3]), 0.0, 1.0)

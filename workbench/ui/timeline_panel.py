@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from itertools import groupby
 from typing import Any, Protocol, TypeVar
@@ -29,7 +29,7 @@ from workbench.session.view import SessionView
 from workbench.ui.commands import Command
 from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
-from workbench.ui.fragments import counted, render
+from workbench.ui.fragments import render
 from workbench.ui.parts import Clock, DrawDue, PagePart
 
 GAP = 12
@@ -235,7 +235,7 @@ class TimelinePanel(TimeBar[SessionView]):
         low, high = self._range
         strip = self._session.past.strip(low, high)
         if strip is not None:
-            self._strip.content = render("timeline", **strip_values(strip, view))
+            self._strip.content = strip_html(strip, view)
 
     def _ask_for_pictures(self, view: SessionView) -> None:
         at = (view.timeline.shown, view.selected_env)
@@ -257,62 +257,65 @@ POINTS = 240
 """Of the reward's line, each the least and the greatest of its steps: a spike of one step stays visible."""
 LINE_HEIGHT = 30.0
 """Units of the picture's height that the line has; the marks are above."""
-MARKS: tuple[tuple[int, str, str], ...] = (
-    (NOT_A_NUMBER, "odd", "reward is NaN or infinite"),
-    (FAIL, "fail", "fail"),
-    (SUCCESS, "success", "success"),
-    (TRUNCATED, "limit", "time limit"),
-    (WENT_BACK, "back", "went back"),
-    (RESET, "reset", "reset"),
-)
-"""Which of them is drawn where several happened, in this order: the flag, its style, its name."""
+FLAGS = {
+    NOT_A_NUMBER: "odd",
+    FAIL: "fail",
+    SUCCESS: "success",
+    TRUNCATED: "limit",
+    WENT_BACK: "back",
+    RESET: "reset",
+}
+"""The style of a mark; of several that happened at once the first is drawn."""
+NAMES = {
+    "odd": "reward is NaN or infinite",
+    "fail": "fail",
+    "success": "success",
+    "limit": "time limit",
+    "back": "went back",
+    "reset": "reset",
+    "other": "other event",
+}
+"""Of the styles, as the legend says them."""
 MOST_MARKS = 150
 
 
-def place_between(low: float, high: float, at: float) -> float:
-    """Per cent of the strip's width."""
-    return round(100 * (at - low) / max(high - low, 1), 3)
+def strip_values(
+    low: int, high: int, reward: NDArray[np.float32], styles: Collection[str]
+) -> dict[str, object]:
+    """What the templates of both timelines are given.
+
+    Args:
+        low: Where the strip begins.
+        high: Where it ends.
+        reward: (high - low + 1,) NaN where there is none.
+        styles: Of the marks that are on it.
+    """
+
+    def place(at: float) -> float:
+        """Per cent of the strip's width; at its ends for what is beyond them."""
+        return round(100 * (min(max(at, low), high) - low) / max(high - low, 1), 3)
+
+    kinds = [(style, name) for style, name in NAMES.items() if style in styles]
+    return {"place": place, "lines": reward_lines(reward), "kinds": kinds}
 
 
-def strip_values(strip: Strip, view: SessionView) -> dict[str, object]:
-    """What the template ``timeline`` is given; places are per cent of the strip's width."""
-    past = view.timeline
-    place = partial(place_between, strip.low, strip.high)
-    origins = dict(strip.branches)
-    marks = []
-    for serial, flags in strip.events[-MOST_MARKS:]:
-        style, name = next((style, name) for flag, style, name in MARKS if flags & flag)
-        if style == "back":
-            origin = origins.get(serial)
-            name = "from a recording" if origin is None else f"went back {counted(serial - origin, 'step')}"
-        marks.append({"x": place(serial), "style": style, "name": name, "ago": past.last - serial})
-    arcs = [
-        {
-            "a": place(max(origin, strip.low)),
-            "b": place(at),
-            "middle": (place(max(origin, strip.low)) + place(at)) / 2,
-        }
-        for at, origin in strip.branches
+def strip_html(strip: Strip, view: SessionView) -> str:
+    """The past of one env, and which moment of it is shown."""
+    marks = [
+        (serial, next(style for flag, style in FLAGS.items() if flags & flag))
+        for serial, flags in strip.events[-MOST_MARKS:]
     ]
-    bands = [
-        {"x": place(a), "width": round(place(b) - place(a), 3), "odd": number % 2, "branch": a in origins}
-        for number, (a, b) in enumerate(strip.stretches)
-    ]
-    shown = past.last if past.shown is None else past.shown
-    return {
-        "marks": marks,
-        "arcs": arcs,
-        "bands": bands,
-        "lines": reward_lines(strip.reward),
-        "cursor": place(min(max(shown, strip.low), strip.high)),
-        "live": past.shown is None,
-        "ago": past.last - shown,
-        "where": where(view),
-        "used": megabytes(past.used),
-        "limit": megabytes(past.limit),
-        "moments": past.moments,
-        "kinds": [(style, name) for _, style, name in MARKS if any(m["style"] == style for m in marks)],
-    }
+    return render(
+        "timeline",
+        strip=strip,
+        past=view.timeline,
+        marks=marks,
+        origins=dict(strip.branches),
+        names=NAMES,
+        where=where(view),
+        megabytes=megabytes,
+        **strip_values(strip.low, strip.high, strip.reward, {style for _, style in marks}),
+    )
 
 
 def step_in_words(view: SessionView) -> str:
