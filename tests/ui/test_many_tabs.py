@@ -115,7 +115,7 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
         until(lambda: house.clients() == 0, "its end")
 
     def held() -> dict[str, int]:
-        until(lambda: not house.stage.framing.followed, "the page to notice")
+        until(lambda: not house.stage.framing.pointed, "the page to notice")
         gc.collect()
         handles = sum(isinstance(thing, viser.ClientHandle) for thing in gc.get_objects())
         this = psutil.Process()

@@ -78,7 +78,6 @@ class Page:
         self._scene_serial = -1
         self._built: tuple[bool, int] | None = None
         self._waits_for_human = False
-        self._clients = 0
         stage = stage or Stage(server)
         self._scene, self._framing = stage.scene, stage.framing
 
@@ -187,9 +186,7 @@ class Page:
 
     def _count_clients(self) -> int:
         count = self._framing.follow()
-        if count != self._clients:
-            self._clients = count
-            self._session.set_clients(count)
+        self._session.set_clients(count)
         return count
 
     # --- the 3-D view ----------------------------------------------------------------------------

@@ -122,7 +122,6 @@ Frame = Callable[[float, float], Viewpoint]
 class Framing:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._followed: frozenset[int] = frozenset()
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
         self._framed: object = None
 
@@ -132,22 +131,16 @@ class Framing:
         return new
 
     def follow(self) -> int:
-        """Note which pages are open, and return how many."""
+        """Forget the pages that have gone; returns how many are open."""
         clients = self._server.get_clients()
-        if clients.keys() != self._followed:
-            self._followed = frozenset(clients)
-            self._pointed = {number: at for number, at in self._pointed.items() if number in clients}
+        for number in self._pointed.keys() - clients.keys():
+            del self._pointed[number]
         return len(clients)
 
     @property
     def pointed(self) -> frozenset[int]:
         """The open pages that were pointed at something."""
         return frozenset(self._pointed)
-
-    @property
-    def followed(self) -> frozenset[int]:
-        """The open pages, as they were at the last look."""
-        return self._followed
 
     def frame(self, frame: Frame, untouched_only: bool = False) -> None:
         """Point every open page (or those whose view nobody has moved), and those to come."""
