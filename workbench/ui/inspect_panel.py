@@ -306,7 +306,6 @@ class ForceArrows:
         look = {"shaft_radius": SHAFT, "head_radius": HEAD, "head_length": HEAD_LENGTH}
         add = partial(server.scene.add_arrows, "/forces", colors=FORCE_COLOUR, **look)
         self._arrows = InView(add, "points")
-        self._drawn: tuple[int, bytes] | None = None
 
     def draw(self, inspection: Inspection | None, offset: NDArray[np.float32]) -> None:
         """Show the contacts of this reading, or nothing.
@@ -314,10 +313,6 @@ class ForceArrows:
         Args:
             offset: (3,) where the env stands in the view.
         """
-        wanted = (id(inspection), offset.tobytes())
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
         arrows = () if inspection is None else arrows_of(inspection)
         if len(arrows):
             self._arrows.draw(arrows + offset)
