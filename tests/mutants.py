@@ -60,7 +60,7 @@ PROTECTED = {
     " authoring/camera_source/test_which_camera.py",
     "authoring/source/trace": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
     " authoring/camera_source/test_which_camera.py",
-    "authoring/source/rotations": "authoring/camera_source/test_rotations.py",
+    "authoring/source/numbers": "authoring/camera_source/test_rotations.py",
     "authoring/camera_source/plan": "authoring/camera_source/test_which_camera.py"
     " authoring/camera_source/test_round_trip.py authoring/camera_source/test_shapes.py",
     "authoring/camera_source/run_hooks": "authoring/camera_source/test_which_camera.py"

@@ -12,8 +12,8 @@ import pytest
 
 from tests.drive.session import wait_until
 from tests.session.studio import BASE, camera, moved, said
-from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Run
+from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
 from workbench.session.camera_writing import copy, not_as_written, plan
 from workbench.session.messages import TaskOptions
@@ -169,7 +169,7 @@ def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Sessi
     for task in (view.task, replace(view.task, source_files=())):
         found = plan(task, info, Wish("edit", BASE, replace(there(session, BASE), fov=0.9)), asking(session))
         assert found.stage == "refused" and not found.can_copy and "wristcam.py, line 20" in found.message
-        assert 'mount=self.robot.links_map["camera_link"],' in found.refusal.snippet
+        assert 'mount=self.robot.links_map["camera_link"],' in found.snippet
 
 
 def test_an_inherited_camera_gets_a_hook_that_keeps_the_parents_others(
@@ -205,13 +205,13 @@ class Inherits(PushCubeEnv):
         refused = plan(replace(before, class_name="Far"), info, Wish("edit", BASE, wanted), asking(session))
         assert refused.stage == "refused" and "base_camera is made by PushCubeEnv" in refused.message
         assert "the _default_sensor_configs of Far (task.py) hands it on" in refused.message
-        assert refused.refusal.snippet.startswith("CameraConfig(")
+        assert refused.snippet.startswith("CameraConfig(")
         # An installed task is not written: the whole hook is there to be copied.
         installed = replace(before, source_files=(), file="/site-packages/their_task.py")
         refused = plan(installed, info, Wish("edit", BASE, wanted), asking(session))
         assert refused.stage == "refused" and "it is made by PushCubeEnv" in refused.message
-        assert "def _default_sensor_configs(self):" in refused.refusal.snippet
-        assert 'cameras["base_camera"] = CameraConfig(' in refused.refusal.snippet
+        assert "def _default_sensor_configs(self):" in refused.snippet
+        assert 'cameras["base_camera"] = CameraConfig(' in refused.snippet
 
         session.studio.place(BASE, wanted)
         session.studio.plan(Wish("edit", BASE))
@@ -243,7 +243,7 @@ def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session
     edited = task_file.read_text() + "# more\n"
     task_file.write_text(edited)
     studio.file.undo_write()
-    view = wait_until(session, said(lambda s: s.writing.refusal is not None), "why not")
+    view = wait_until(session, said(lambda s: s.writing.message.startswith("Not done")), "why not")
     assert "was edited since" in view.studio.writing.message and view.studio.writing.stage == "checked"
     assert task_file.read_text() == edited
     studio.file.drop_plan()
@@ -282,7 +282,7 @@ def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_
     session.studio.place(BASE, replace(there(session, BASE), fov=fov))
     session.studio.plan(Wish("edit", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
-    assert why in view.studio.writing.message and f"fov={fov}" in view.studio.writing.refusal.snippet
+    assert why in view.studio.writing.message and f"fov={fov}" in view.studio.writing.snippet
     assert task_file.read_text() == before and there(session, BASE).fov == 1.0
     session.studio.file.drop_plan()
     session.studio.back_to_file(BASE)
@@ -361,14 +361,13 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
 def test_what_was_not_done_is_said_until_something_else_happens(session: Session) -> None:
     key: CameraKey = ("sensor", "base_camera")
     edit = SourceEdit("/author/task.py", "a = 1\n", "a = 2\n", (), None)
-    refused = Refusal("task.py was edited since the camera was written into it")
     for stage in ("written", "undone"):
         asker = session.studio.file._asker
         writing = StudioFile(StudioCameras(), lambda: None, lambda *_: None, asker, lambda: None)
-        message = f"Not done: {refused.reason}."
-        writing.view = Writing(stage, Wish("edit", key, None), edit, refused, message, loading=True)
+        message = "Not done: task.py was edited since the camera was written into it."
+        writing.view = Writing(stage, Wish("edit", key, None), edit, "", message, loading=True)
         writing.failed_to_load()
-        assert "does not load" in writing.view.message and writing.view.refusal is None
+        assert "does not load" in writing.view.message and "Not done" not in writing.view.message
         html = writing_html(writing.view, stale=False)
         assert "edited since" not in html and "does not load" in html
         writing.close()

@@ -25,7 +25,7 @@ from types import ModuleType
 
 from workbench.machine import DISTRIBUTION
 
-_LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
+LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
 _INSTALLED = tuple(
     {
         os.path.realpath(sysconfig.get_paths()[name]) + os.sep
@@ -53,7 +53,7 @@ def is_own_file(path: str, folder: Path) -> bool:
     if not path.startswith(root) or path.startswith(LIBRARY_ROOTS):
         return False
     return not any(
-        part in _LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep)
+        part in LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep)
     )
 
 
@@ -102,7 +102,7 @@ def search_first(folder: Path, for_good: bool = False) -> None:
     _guarded_for_good = _guarded_for_good or for_good
     name = str(folder)
     # A file of an installed package is opened with the folder of all packages: that stays the libraries'.
-    if folder.name not in _LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
+    if folder.name not in LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
         _author_folders.add(name)
     if not _is_guarded():
         sys.meta_path.insert(0, LibraryFinder())

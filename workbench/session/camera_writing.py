@@ -13,18 +13,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from workbench.authoring import camera_source
-from workbench.authoring.camera_source import Refusal, SourceEdit
+from workbench.authoring.camera_source import members
 from workbench.authoring.camera_source.cameras import Run
-from workbench.authoring.camera_source.hooks import HOOK_OF
+from workbench.authoring.camera_source.disk import SourceEdit, not_writable
+from workbench.authoring.camera_source.hooks import HOOK_OF, snippet
+from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import read_exactly
+from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
 from workbench.session.studio_view import Change, Wish, Writing
-
-Plan = SourceEdit | Refusal
 
 SENTENCES: dict[Change, tuple[str, str, str]] = {
     "edit": ("This changes {old} in {file}.", "{old} is written to {file}, and the new env has it.", ""),
@@ -57,39 +57,36 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
         info: of the live camera; None where one is added.
         run: asks the worker.
     """
-    made: Plan
-    texts, unread = _texts(task)
     placed = None if wish.what == "remove" else wish.settings
-    text = "" if placed is None else camera_source.snippet(wish.result[1], placed)
+    text = "" if placed is None else snippet(wish.result[1], placed)
     elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
-    if unread:
-        made = camera_source.Refusal(unread)
-    elif elsewhere and info is not None:
-        made = _made_of_a_parents(task, texts, info, wish, elsewhere, run)
-    elif not task.source_files:
-        where = "" if task.file is None else f" ({task.file})"
-        made = camera_source.Refusal(
-            f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
-            "folder of your own",
-            text,
-        )
-    else:
-        made = _made(task, texts, info, wish, run)
-    if isinstance(made, camera_source.SourceEdit):
-        blocked = next(
-            filter(None, (camera_source.not_writable(change.file) for change in made.changes)), None
-        )
+    try:
+        texts = _texts(task)
+        if elsewhere and info is not None:
+            edit = _made_of_a_parents(task, texts, info, wish, elsewhere, run)
+        elif not task.source_files:
+            where = "" if task.file is None else f" ({task.file})"
+            raise Refused(
+                f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
+                "folder of your own",
+                text,
+            )
+        else:
+            edit = _made(task, texts, info, wish, run)
+        blocked = next(filter(None, (not_writable(change.file) for change in edit.changes)), None)
         if blocked is not None:
-            made = camera_source.Refusal(blocked, text)
-    if isinstance(made, camera_source.Refusal):
+            raise Refused(blocked, text)
+    except Refused as refused:
         can_copy = not elsewhere and _could_be_copied(task)
-        ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
+        ways = (
+            " You can copy the text below into the file yourself." if refused.snippet and not can_copy else ""
+        )
         if elsewhere and info is not None and (not task.source_files or _is_a_robots(info)):
             ways = " The text below is for a class of your own that inherits from it."
-        message = f"Not written: {made.reason}.{ways}"
-        return Writing("refused", wish, None, made, message, can_copy)
-    message = f"{said(wish, PLANNED, made.names)} Nothing is written yet."
-    return Writing("planned", wish, made, None, message)
+        message = f"Not written: {refused.reason}.{ways}"
+        return Writing("refused", wish, None, refused.snippet, message, can_copy)
+    message = f"{said(wish, PLANNED, edit.names)} Nothing is written yet."
+    return Writing("planned", wish, edit, message=message)
 
 
 def _made_elsewhere(task: TaskDescription, info: CameraInfo) -> str:
@@ -108,35 +105,33 @@ def _is_a_robots(info: CameraInfo) -> bool:
 
 def _made_of_a_parents(
     task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str, run: Run
-) -> Plan:
+) -> SourceEdit:
     """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
     if wish.settings is None or wish.what == "remove":
-        return camera_source.Refusal(elsewhere)
+        raise Refused(elsewhere)
     (kind, _), (_, uid), site = wish.key, wish.result, info.site
     assert site is not None
     link = (info.mount or "").partition("/")[2]
     robot = "self.robot" if _is_a_robots(info) else "self.agent.robot"
     more = [f'mount={robot}.links_map["{link}"]'] if link else []
     if site.function.rpartition(".")[2] not in HOOK_OF.values():
-        return camera_source.Refusal(elsewhere, camera_source.snippet(uid, wish.settings, more=more))
-    whole = camera_source.override_text(kind, uid, wish.settings, more)
+        raise Refused(elsewhere, snippet(uid, wish.settings, more=more))
+    whole = members.override_text(kind, uid, wish.settings, more)
     if wish.what != "edit" or task.file is None or task.file not in texts:
-        return camera_source.Refusal(elsewhere, whole)
+        raise Refused(elsewhere, whole)
     if info.varies:
         reason = (
             f"{elsewhere}; the task's own code moves it besides, so one pose in the file would not place it"
         )
-        return camera_source.Refusal(reason, whole)
-    return camera_source.plan_override(
-        texts, task.file, task.class_name, kind, uid, wish.settings, site, run, more
-    )
+        raise Refused(reason, whole)
+    return members.plan_override(texts, task.file, task.class_name, kind, uid, wish.settings, site, run, more)
 
 
 def _could_be_copied(task: TaskDescription) -> bool:
     """Whether the task's file is one that is not to be edited, and is all that the task is made of."""
     if task.file is None or len(task.source_files) > 1:
         return False
-    return not task.source_files or camera_source.not_writable(task.file) is not None
+    return not task.source_files or not_writable(task.file) is not None
 
 
 def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
@@ -154,42 +149,40 @@ def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
 
 def _made(
     task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish, run: Run
-) -> Plan:
+) -> SourceEdit:
     kind, uid = wish.key
     if wish.what == "add":
         assert wish.settings is not None
         file = task.file or task.source_files[0]
-        return camera_source.plan_add(texts, file, task.class_name, wish.key, wish.settings, run, wish.target)
+        return members.plan_add(texts, file, task.class_name, wish.key, wish.settings, run, wish.target)
     if info is None or info.settings is None:
-        return camera_source.Refusal(f"there is no {kind} camera {uid!r} whose settings are known")
+        raise Refused(f"there is no {kind} camera {uid!r} whose settings are known")
     if wish.what == "remove":
-        return camera_source.plan_remove(texts, wish.key, run)
+        return members.plan_remove(texts, wish.key, run)
     if wish.what == "rename":
-        return camera_source.plan_rename(texts, wish.key, wish.name, info.settings, run)
+        return members.plan_rename(texts, wish.key, wish.name, info.settings, run)
     if wish.what == "duplicate":
-        return camera_source.plan_duplicate(texts, wish.key, wish.name, info.settings, run)
+        return members.plan_duplicate(texts, wish.key, wish.name, info.settings, run)
     assert wish.settings is not None
     if info.varies:
-        snippet = camera_source.snippet(uid, wish.settings)
-        return camera_source.Refusal(
+        raise Refused(
             f"the task's own code moves {uid!r} (it is randomised, or moved after it was made), so one pose in the "
             "file would not place it",
-            snippet,
+            snippet(uid, wish.settings),
         )
-    return camera_source.plan_edit(texts, wish.key, info.settings, wish.settings, run)
+    return plan_edit(texts, wish.key, info.settings, wish.settings, run)
 
 
-def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
-    """The author's files as they are on disk, with the line ends that they have; and why one cannot be read."""
+def _texts(task: TaskDescription) -> dict[str, str]:
+    """The author's files as they are on disk, with the line ends that they have. Raises Refused."""
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
             texts[path] = read_exactly(path)[1]
-        except OSError as error:
-            return {}, f"{path} cannot be read: {error.strerror}"
-        except SyntaxError as error:
-            return {}, f"{path} cannot be read: {error.msg}"
-    return texts, ""
+        except (OSError, SyntaxError) as error:
+            said = error.msg if isinstance(error, SyntaxError) else error.strerror
+            raise Refused(f"{path} cannot be read: {said}") from error
+    return texts
 
 
 def was_before(edit: SourceEdit) -> str:

@@ -15,9 +15,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from workbench.authoring import camera_source
-from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.camera_source.disk import SourceEdit, apply, revert
 from workbench.authoring.source.text import Refused, plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.askers import Asker
@@ -115,17 +114,17 @@ class StudioFile:
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
         message = "Written to {file}, being loaded now."
-        self._later(self._exchange, ("planned",), camera_source.apply, "written", message)
+        self._later(self._exchange, ("planned",), apply, "written", message)
 
     def undo_write(self) -> None:
         """Take the edit that was made last out of the file again."""
         message = "{file} {was} before, being loaded now."
-        self._later(self._exchange, MADE, camera_source.revert, "undone", message)
+        self._later(self._exchange, MADE, revert, "undone", message)
 
     def _exchange(
         self,
         needs: tuple[WritingStage, ...],
-        do: Callable[[SourceEdit], Refusal | None],
+        do: Callable[[SourceEdit], None],
         stage: WritingStage,
         message: str,
     ) -> None:
@@ -133,10 +132,11 @@ class StudioFile:
             view = self.view
             if view.edit is None or view.stage not in needs:
                 return
-            refusal = do(view.edit)
-            if refusal is not None:
+            try:
+                do(view.edit)
+            except Refused as refused:
                 kept = "refused" if stage == "written" else view.stage
-                self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
+                self.view = replace(view, stage=kept, message=f"Not done: {refused.reason}.")
             else:
                 told = message.format(file=view.edit.names, was=was_before(view.edit))
                 self._say(told, stage, loading=True)
@@ -267,7 +267,7 @@ class StudioFile:
             self._say(f"{edit.names} {does} not load: {told}.", self.view.stage, loading=not undone)
 
     def _say(self, message: str, stage: WritingStage, loading: bool = False) -> None:
-        self.view = replace(self.view, stage=stage, message=message, refusal=None, loading=loading)
+        self.view = replace(self.view, stage=stage, message=message, snippet="", loading=loading)
 
     def close(self) -> None:
         """Wait for what is being written."""

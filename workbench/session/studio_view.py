@@ -16,7 +16,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraInfo, Picture
 
 if TYPE_CHECKING:
-    from workbench.authoring.camera_source import Refusal, SourceEdit
+    from workbench.authoring.camera_source.disk import SourceEdit
 
 WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
 """``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what
@@ -72,8 +72,8 @@ class Writing:
     stage: WritingStage = "none"
     wish: Wish | None = None
     edit: SourceEdit | None = None
-    refusal: Refusal | None = None
-    """Why the last thing that was asked for was not done; its reason is told in `message` too."""
+    snippet: str = ""
+    """Of what was refused: what the author can copy into the file themselves."""
     message: str = ""
     """One sentence or two: what happened, and what to do next."""
     can_copy: bool = False

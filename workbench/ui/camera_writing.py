@@ -95,7 +95,7 @@ def writing_html(
         scroll_to: id of the element that is to come into sight.
         picture: address of one.
     """
-    edit, refusal = writing.edit, writing.refusal
+    edit = writing.edit
     files = [] if edit is None or writing.stage == "undone" else edit.changes
     return render(
         "camera_writing",
@@ -106,7 +106,7 @@ def writing_html(
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=writing.stage in DONE,
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
-        snippet="" if refusal is None else refusal.snippet,
+        snippet=writing.snippet,
         scroll_to=scroll_to,
     )
 

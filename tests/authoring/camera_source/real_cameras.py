@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import math
 import sys
 import tokenize
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePath
 from typing import Any
@@ -18,8 +19,8 @@ from mani_skill.utils import sapien_utils
 
 from workbench.authoring.camera_source.cameras import HOOKS as KINDS
 from workbench.authoring.camera_source.cameras import Ran, Run
+from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls, owners
-from workbench.authoring.source.rotations import unit
 from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraSettings
 
@@ -43,6 +44,19 @@ class Base:
 
 """
 HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs", "_sensor_configs")
+
+
+def unit(quaternion: Sequence[float]) -> tuple[float, float, float, float]:
+    w, x, y, z = (float(part) / math.hypot(*quaternion) for part in quaternion)
+    return w, x, y, z
+
+
+def planned(plan: Callable[..., SourceEdit], *given: object) -> SourceEdit | Refused:
+    """What comes of a plan."""
+    try:
+        return plan(*given)
+    except Refused as refused:
+        return refused
 
 
 @contextmanager

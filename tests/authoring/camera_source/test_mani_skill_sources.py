@@ -14,8 +14,9 @@ import pytest
 from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
 
 from tests.authoring.camera_source.real_cameras import close, looking, settings_of
-from workbench.authoring.camera_source import SourceEdit, plan_edit
 from workbench.authoring.camera_source.cameras import HOOKS, Ran
+from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls
 from workbench.core.camera_settings import CameraKey
 

@@ -12,22 +12,18 @@ from tests.authoring.camera_source.real_cameras import (
     close,
     comments,
     key_of,
+    planned,
     real_configs,
     run_as,
     run_class,
     settings_of,
+    unit,
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
-from workbench.authoring.camera_source import (
-    Refusal,
-    SourceEdit,
-    plan_add,
-    plan_duplicate,
-    plan_edit,
-    plan_remove,
-    plan_rename,
-)
-from workbench.authoring.source.rotations import unit
+from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
+from workbench.authoring.camera_source.plan import plan_edit
+from workbench.authoring.source.text import Refused
 from workbench.core.camera_frames import LookAt, pose_from_look_at, with_pose
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind
@@ -55,8 +51,8 @@ def same_cameras(a: dict[tuple[str, str], CameraSettings], b: dict[tuple[str, st
 @pytest.mark.parametrize("name", TOP)
 def test_a_camera_is_added_last(name: str) -> None:
     source = WRITTEN[name]
-    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    if isinstance(plan, Refusal):
+    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
+    if isinstance(plan, Refused):
         assert "branches with" in name and "2 returns" in plan.reason and plan.snippet
         return
     assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
@@ -67,33 +63,39 @@ def test_a_camera_is_added_last(name: str) -> None:
 @pytest.mark.parametrize("kind", ["sensor", "human"])
 def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
     source = "from __future__ import annotations\n\nclass Task:\n    eye = 1\n\n\nx = 2\n"
-    plan = plan_add({FILE: source}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
+    plan = planned(plan_add, {FILE: source}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
     assert isinstance(plan, SourceEdit), plan
     hook = SENSOR if kind == "sensor" else HUMAN
     assert same_cameras(cameras(plan.new_text), {(hook, "added"): NEW})
     assert len(plan.notes) == 2
-    again = plan_add({FILE: plan.new_text}, FILE, "Task", (kind, "more"), NEW, run_as("Task"))
+    again = planned(plan_add, {FILE: plan.new_text}, FILE, "Task", (kind, "more"), NEW, run_as("Task"))
     assert isinstance(again, SourceEdit) and not again.notes
     assert list(cameras(again.new_text)) == [(hook, "added"), (hook, "more")]
-    twice = plan_add({FILE: plan.new_text}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
-    assert isinstance(twice, Refusal) and "already" in twice.reason
+    twice = planned(plan_add, {FILE: plan.new_text}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
+    assert isinstance(twice, Refused) and "already" in twice.reason
 
 
 def test_what_cannot_be_added_to_is_refused() -> None:
-    plan = plan_add(
-        {FILE: REFUSED["a comprehension"][0]}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task")
+    plan = planned(
+        plan_add,
+        {FILE: REFUSED["a comprehension"][0]},
+        FILE,
+        "Task",
+        ("sensor", "added"),
+        NEW,
+        run_as("Task"),
     )
-    assert isinstance(plan, Refusal) and "neither" in plan.reason
+    assert isinstance(plan, Refused) and "neither" in plan.reason
     assert 'CameraConfig(\n    "added"' in plan.snippet
     parent = WRITTEN["a pose of nothing"] + "\n\nclass Child(Task):\n    pass\n"
-    plan = plan_add({FILE: parent}, FILE, "Child", ("sensor", "added"), NEW, run_as("Child"))
-    assert isinstance(plan, Refusal) and "inherits" in plan.reason
+    plan = planned(plan_add, {FILE: parent}, FILE, "Child", ("sensor", "added"), NEW, run_as("Child"))
+    assert isinstance(plan, Refused) and "inherits" in plan.reason
     library = "from mani_skill.envs.tasks import PickCubeEnv\n\n\nclass Task(PickCubeEnv):\n    pass\n"
-    plan = plan_add({FILE: library}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    assert isinstance(plan, Refusal) and "would take away" in plan.reason
+    plan = planned(plan_add, {FILE: library}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
+    assert isinstance(plan, Refused) and "would take away" in plan.reason
     for name in ("no name", 'x"); import os; ("', ""):
-        plan = plan_add({FILE: parent}, FILE, "Task", ("sensor", name), NEW, run_as("Task"))
-        assert isinstance(plan, Refusal) and "is not a name" in plan.reason
+        plan = planned(plan_add, {FILE: parent}, FILE, "Task", ("sensor", name), NEW, run_as("Task"))
+        assert isinstance(plan, Refused) and "is not a name" in plan.reason
 
 
 @pytest.mark.parametrize("name", WRITTEN)
@@ -101,8 +103,8 @@ def test_a_copy_stands_beside_its_original(name: str) -> None:
     source = WRITTEN[name]
     now = cameras(source)
     key = next(key for key in now if key[1] == "cam")
-    plan = plan_duplicate({FILE: source}, key_of(source), "copy", now[key], run_class)
-    if isinstance(plan, Refusal):
+    plan = planned(plan_duplicate, {FILE: source}, key_of(source), "copy", now[key], run_class)
+    if isinstance(plan, Refused):
         assert "stands alone" in plan.reason and plan.snippet
         assert name in ALONE
         return
@@ -114,20 +116,22 @@ def test_a_camera_has_another_name(name: str) -> None:
     source = WRITTEN[name]
     now = cameras(source)
     key = next(key for key in now if key[1] == "cam")
-    plan = plan_rename({FILE: source}, key_of(source), "front", now[key], run_class)
+    plan = planned(plan_rename, {FILE: source}, key_of(source), "front", now[key], run_class)
     assert isinstance(plan, SourceEdit), plan
     wanted = {(hook, "front" if uid == "cam" else uid): value for (hook, uid), value in now.items()}
     assert same_cameras(cameras(plan.new_text), wanted), plan.diff
     other = next((uid for _, uid in now if uid != "cam"), None)
     if other is not None:
-        assert isinstance(plan_rename({FILE: source}, key_of(source), other, now[key], run_class), Refusal)
+        assert isinstance(
+            planned(plan_rename, {FILE: source}, key_of(source), other, now[key], run_class), Refused
+        )
 
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_camera_is_taken_out(name: str) -> None:
     source = WRITTEN[name]
-    plan = plan_remove({FILE: source}, key_of(source), run_class)
-    if isinstance(plan, Refusal):
+    plan = planned(plan_remove, {FILE: source}, key_of(source), run_class)
+    if isinstance(plan, Refused):
         assert "by hand" in plan.reason
         assert name in ALONE
         return
@@ -139,11 +143,11 @@ def test_a_camera_is_taken_out(name: str) -> None:
 def test_what_is_made_in_a_loop_is_refused() -> None:
     source = REFUSED["a loop with a plain name"][0]
     for plan in (
-        plan_remove({FILE: source}, key_of(source), run_class),
-        plan_rename({FILE: source}, key_of(source), "front", NEW, run_class),
-        plan_duplicate({FILE: source}, key_of(source), "front", NEW, run_class),
+        planned(plan_remove, {FILE: source}, key_of(source), run_class),
+        planned(plan_rename, {FILE: source}, key_of(source), "front", NEW, run_class),
+        planned(plan_duplicate, {FILE: source}, key_of(source), "front", NEW, run_class),
     ):
-        assert isinstance(plan, Refusal) and "loop" in plan.reason
+        assert isinstance(plan, Refused) and "loop" in plan.reason
 
 
 def test_settings_are_those_that_are_written() -> None:
@@ -151,7 +155,7 @@ def test_settings_are_those_that_are_written() -> None:
     exact = dataclasses.replace(
         NEW, position=(1 / 3, 0.0, 2 / 3), quaternion=unit((1, 2, 3, 4)), fov=1.23456789
     )
-    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "added"), exact, run_as("Task"))
+    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), exact, run_as("Task"))
     assert isinstance(plan, SourceEdit) and plan.settings is not None
     assert (
         plan.settings.position == pytest.approx((0.3333, 0.0, 0.6667), abs=1e-7)
@@ -172,7 +176,8 @@ BESIDE_LOOK_AT = """\
 
 def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_does() -> None:
     wanted = with_pose(NEW, pose_from_look_at(LookAt((0.51234, 0.3, 0.6), (0.08, 0.0, 0.02))))
-    plan = plan_add(
+    plan = planned(
+        plan_add,
         {FILE: hook(BESIDE_LOOK_AT)},
         FILE,
         "Task",
@@ -200,7 +205,9 @@ def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_
 def test_straight_down_and_up_look_at_is_not_used(forward: tuple[float, float, float]) -> None:
     x, y, z = forward
     wanted = with_pose(NEW, pose_from_look_at(LookAt((0.1, 0.2, 0.9), (0.1 + x, 0.2 + y, 0.9 + z))))
-    plan = plan_add({FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", ("sensor", "side"), wanted, run_as("Task"))
+    plan = planned(
+        plan_add, {FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", ("sensor", "side"), wanted, run_as("Task")
+    )
     assert isinstance(plan, SourceEdit) and "q=[" in plan.diff
     assert close(wanted, cameras(plan.new_text)[SENSOR, "side"])
 
@@ -222,7 +229,7 @@ def test_what_stands_on_one_line_gets_a_line_each(held: str) -> None:
         camera = f'CameraConfig("{name}", sapien.Pose([0, 0, 1]), 8, 8, 1.0)'
         held = held.replace(name.upper(), camera)
     source = hook(f"        return {held}\n")
-    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
+    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
     assert isinstance(plan, SourceEdit), plan
     assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
     indents = [
@@ -238,7 +245,7 @@ def test_tidy_text_comes_of_it() -> None:
         "    def _default_sensor_configs(self):\n"
         '        return CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)\n'
     )
-    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "top"), NEW, run_as("Task"))
+    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "top"), NEW, run_as("Task"))
     assert isinstance(plan, SourceEdit)
     assert plan.new_text.endswith(
         """\
@@ -257,7 +264,7 @@ def test_tidy_text_comes_of_it() -> None:
         ]
 """
     )
-    back = plan_remove({FILE: plan.new_text}, ("sensor", "cam"), run_class)
+    back = planned(plan_remove, {FILE: plan.new_text}, ("sensor", "cam"), run_class)
     assert isinstance(back, SourceEdit)
     assert 'return [\n            CameraConfig(\n                "top"' in back.new_text
 
@@ -269,15 +276,15 @@ def test_a_file_of_windows_is_edited_as_any_other_and_keeps_its_line_ends(name: 
     after = dataclasses.replace(now, position=(0.1, 0.25, 1.1), width=320, shader_pack="default")
     key = key_of(sources[0])
     for plan in (
-        lambda source: plan_edit({FILE: source}, key, now, after, run_class),
-        lambda source: plan_add({FILE: source}, FILE, "Task", (key[0], "added"), NEW, run_class),
-        lambda source: plan_duplicate({FILE: source}, key, "copy", after, run_class),
-        lambda source: plan_rename({FILE: source}, key, "front", now, run_class),
-        lambda source: plan_remove({FILE: source}, key, run_class),
+        lambda source: planned(plan_edit, {FILE: source}, key, now, after, run_class),
+        lambda source: planned(plan_add, {FILE: source}, FILE, "Task", (key[0], "added"), NEW, run_class),
+        lambda source: planned(plan_duplicate, {FILE: source}, key, "copy", after, run_class),
+        lambda source: planned(plan_rename, {FILE: source}, key, "front", now, run_class),
+        lambda source: planned(plan_remove, {FILE: source}, key, run_class),
     ):
         one, other = (plan(source) for source in sources)
-        if isinstance(one, Refusal):
-            assert other == one
+        if isinstance(one, Refused):
+            assert isinstance(other, Refused) and vars(other) == vars(one)
         else:
             assert isinstance(other, SourceEdit) and other.old_text == sources[1]
             assert other.new_text == one.new_text.replace("\n", "\r\n")

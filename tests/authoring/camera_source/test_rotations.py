@@ -9,14 +9,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mani_skill.utils import sapien_utils
+from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
-from workbench.authoring.source.rotations import (
-    from_euler,
-    look_at,
-    to_euler,
-    unit,
-)
+from workbench.authoring.source.numbers import look_at, quaternion_texts, to_euler
 from workbench.core.camera_frames import angle_between
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)
@@ -39,9 +35,9 @@ def test_the_angle_between_two_orientations_is_that_of_the_rotation_from_one_to_
 def test_angles_of_a_quaternion_are_its_own_and_near_the_old_ones(
     roll: float, pitch: float, yaw: float, near: tuple[float, float, float]
 ) -> None:
-    quaternion = from_euler(roll, pitch, yaw)
+    quaternion = euler2quat(roll, pitch, yaw)
     found = to_euler(quaternion, near)
-    assert angle_between(from_euler(*found), quaternion) < 1e-5
+    assert angle_between(euler2quat(*found), quaternion) < 1e-5
     # Of an orientation there is no closer triple than the one that made it.
     apart = sum(abs(a - b) for a, b in zip(found, near, strict=True))
     given_apart = sum(abs(a - b) for a, b in zip((roll, pitch, yaw), near, strict=True))
@@ -54,9 +50,9 @@ def test_angles_of_a_quaternion_are_its_own_and_near_the_old_ones(
 def test_straight_up_or_down_the_yaw_stays_and_the_roll_has_the_turn(
     roll: float, side: int, yaw: float, old_yaw: float
 ) -> None:
-    quaternion = from_euler(roll, side * math.pi / 2, yaw)
+    quaternion = euler2quat(roll, side * math.pi / 2, yaw)
     found = to_euler(quaternion, (0.25, side * math.pi / 2, old_yaw))
-    assert angle_between(from_euler(*found), quaternion) < 1e-6
+    assert angle_between(euler2quat(*found), quaternion) < 1e-6
     assert found[1] == pytest.approx(side * math.pi / 2) and found[2] == pytest.approx(old_yaw)
     assert abs(found[0] - 0.25) <= math.pi + 1e-6
 
@@ -83,7 +79,8 @@ def test_along_up_there_is_no_look_at() -> None:
 
 
 def test_a_quaternion_without_direction_is_refused() -> None:
-    assert unit((0, 0, 3, 4)) == (0, 0, 0.6, 0.8)
+    assert quaternion_texts((0, 0, 3, 4)) == ["0.0", "0.0", "0.6", "0.8"]
+    assert quaternion_texts((-0.6, 0, 0, 0.8)) == ["-0.6", "0.0", "0.0", "0.8"], "on the side that it was on"
     for wrong in ((0, 0, 0, 0), (math.nan, 0, 0, 1), (math.inf, 0, 0, 1)):
-        with pytest.raises(ValueError, match="no orientation"):
-            unit(wrong)
+        with pytest.raises(ValueError, match="no rotation|not finite"):
+            quaternion_texts(wrong)

@@ -11,11 +11,21 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from mani_skill.utils import sapien_utils
 
-from tests.authoring.camera_source.real_cameras import FILE, close, key_of, looking, real_settings, run_class
+from tests.authoring.camera_source.real_cameras import (
+    FILE,
+    close,
+    key_of,
+    looking,
+    planned,
+    real_settings,
+    run_class,
+    unit,
+)
 from tests.authoring.camera_source.shapes import WRITTEN
-from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
 from workbench.authoring.camera_source.cameras import changed_fields
-from workbench.authoring.source.rotations import unit
+from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.authoring.camera_source.plan import plan_edit
+from workbench.authoring.source.text import Refused
 from workbench.core.camera_frames import angle_between
 from workbench.core.camera_settings import CameraKey, CameraSettings
 
@@ -73,8 +83,8 @@ def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
     before = _before(form)
     after = dataclasses.replace(before, position=pose[0], quaternion=pose[1], fov=fov or before.fov)
     assume(changed_fields(before, after))
-    plan = plan_edit({FILE: source}, KEY, before, after, run_class)
-    if isinstance(plan, Refusal):
+    plan = planned(plan_edit, {FILE: source}, KEY, before, after, run_class)
+    if isinstance(plan, Refused):
         assert "smaller than what is written" in plan.reason
         assume(False)
     assert isinstance(plan, SourceEdit) and plan.settings is not None
@@ -99,7 +109,7 @@ def test_a_second_edit_goes_on_from_the_first() -> None:
     before = real_settings({FILE: source}, "cam")
     for pose in (((0.4, 0.1, 0.7), (0.1, 0.2, 0.3, 0.4)), ((0.2, 0.0, 0.9), (0.5, 0.5, 0.5, -0.5))):
         after = dataclasses.replace(before, position=pose[0], quaternion=unit(pose[1]))
-        plan = plan_edit({FILE: source}, KEY, before, after, run_class)
+        plan = planned(plan_edit, {FILE: source}, KEY, before, after, run_class)
         assert isinstance(plan, SourceEdit) and plan.settings is not None
         source, before = plan.new_text, plan.settings
     assert "q=[0.5, 0.5, 0.5, -0.5]" in source
@@ -112,7 +122,7 @@ def test_a_camera_that_is_turned_keeps_the_distance_of_what_it_looks_at(name: st
     old_eye, old_target = _look_at_numbers(source)
     for eye, point in ((old_eye, (1.5, 0.25, 0.3)), ((0.5, 0.25, 0.75), (-0.5, -2.0, 0.7))):
         after = dataclasses.replace(before, position=eye, quaternion=looking(eye, point))
-        plan = plan_edit({FILE: source}, key_of(source), before, after, run_class)
+        plan = planned(plan_edit, {FILE: source}, key_of(source), before, after, run_class)
         assert isinstance(plan, SourceEdit)
         new_eye, new_target = _look_at_numbers(plan.new_text)
         assert math.dist(new_eye, eye) < 1e-4
@@ -126,7 +136,7 @@ def test_a_target_that_was_at_the_eye_comes_to_stand_before_it() -> None:
     before = real_settings({FILE: source}, "cam")
     eye = before.position
     after = dataclasses.replace(before, quaternion=looking(eye, (eye[0], 2.0, 0.5)))
-    plan = plan_edit({FILE: source}, KEY, before, after, run_class)
+    plan = planned(plan_edit, {FILE: source}, KEY, before, after, run_class)
     assert isinstance(plan, SourceEdit)
     new_eye, new_target = _look_at_numbers(plan.new_text)
     assert math.dist(new_eye, new_target) == pytest.approx(0.1, abs=2e-4)

@@ -15,14 +15,17 @@ from tests.authoring.camera_source.real_cameras import (
     comments,
     key_of,
     looking,
+    planned,
     real_configs,
     real_settings,
     run_class,
     settings_of,
+    unit,
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
-from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
-from workbench.authoring.source.rotations import unit
+from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.authoring.camera_source.plan import plan_edit
+from workbench.authoring.source.text import Refused
 from workbench.core.camera_frames import angle_between
 from workbench.core.camera_settings import CameraSettings
 
@@ -59,9 +62,9 @@ def test_what_is_written_is_what_maniskill_then_makes(name: str, edit: Edit) -> 
     source = WRITTEN[name]
     before = real_settings({FILE: source}, "cam")
     after = edit(before)
-    plan = plan_edit({FILE: source}, key_of(source), before, after, run_class)
+    plan = planned(plan_edit, {FILE: source}, key_of(source), before, after, run_class)
     if name == "more arguments by **" and edit is lens:
-        assert isinstance(plan, Refusal) and "`near` is given by * or **" in plan.reason
+        assert isinstance(plan, Refused) and "`near` is given by * or **" in plan.reason
         return
     assert isinstance(plan, SourceEdit), plan
     assert plan.settings is not None
@@ -96,8 +99,8 @@ def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: s
     source, reason = REFUSED[name]
     before = real_settings({FILE: source}, "cam")
     after = level(before)
-    plan = plan_edit({FILE: source}, key_of(source), before, after, run_class)
-    assert isinstance(plan, Refusal), plan.diff
+    plan = planned(plan_edit, {FILE: source}, key_of(source), before, after, run_class)
+    assert isinstance(plan, Refused), plan.diff
     assert reason in plan.reason
     assert ast.parse(plan.snippet)
     # What it gives to copy is the camera that was asked for.
@@ -118,5 +121,5 @@ def test_the_number_that_a_person_would_change_is_changed_and_the_rest_is_follow
 ) -> None:
     source = WRITTEN[name]
     before = real_settings({FILE: source}, "cam")
-    plan = plan_edit({FILE: source}, key_of(source), before, edit(before), run_class)
+    plan = planned(plan_edit, {FILE: source}, key_of(source), before, edit(before), run_class)
     assert isinstance(plan, SourceEdit) and text in plan.new_text

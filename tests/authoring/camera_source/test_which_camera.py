@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 
-from tests.authoring.camera_source.real_cameras import FILE, HEADER, real_settings, run_as, run_class
-from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
+from tests.authoring.camera_source.real_cameras import FILE, HEADER, planned, real_settings, run_as, run_class
 from workbench.authoring.camera_source.cameras import Ran, Run
+from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.authoring.camera_source.plan import plan_edit
+from workbench.authoring.source.text import Refused
 from workbench.authoring.source.trace import Place, Read
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings
 
@@ -46,7 +48,7 @@ def higher(now: CameraSettings) -> CameraSettings:
     return dataclasses.replace(now, position=(0.5, 0.0, 0.75))
 
 
-def edited_line(plan: SourceEdit | Refusal) -> int:
+def edited_line(plan: SourceEdit | Refused) -> int:
     assert isinstance(plan, SourceEdit), plan
     pairs = zip(plan.old_text.splitlines(), plan.new_text.splitlines(), strict=True)
     (line,) = [number for number, (old, new) in enumerate(pairs, 1) if old != new]
@@ -55,10 +57,14 @@ def edited_line(plan: SourceEdit | Refusal) -> int:
 
 def test_kind_tells_a_sensor_from_a_camera_for_people() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    assert edited_line(plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), run_class)) == LINE
+    assert (
+        edited_line(planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), run_class))
+        == LINE
+    )
     people = real_settings({FILE: TWO}, "cam", "_default_human_render_camera_configs")
     assert (
-        edited_line(plan_edit({FILE: TWO}, ("human", "cam"), people, higher(people), run_class)) == LINE + 4
+        edited_line(planned(plan_edit, {FILE: TWO}, ("human", "cam"), people, higher(people), run_class))
+        == LINE + 4
     )
 
 
@@ -66,20 +72,22 @@ def test_two_of_one_name_and_value_are_told_apart_by_the_place() -> None:
     source = TWO.replace("512, 512", "128, 128").replace('f"{name}"', '"cam"')
     before = real_settings({FILE: source}, "cam", "_default_sensor_configs")
     for class_name, line in (("Task", LINE), ("Other", LINE + 11)):
-        plan = plan_edit({FILE: source}, ("sensor", "cam"), before, higher(before), run_as(class_name))
+        plan = planned(
+            plan_edit, {FILE: source}, ("sensor", "cam"), before, higher(before), run_as(class_name)
+        )
         assert edited_line(plan) == line
 
 
 def test_a_computed_name_is_found_by_its_place() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), run_as("Other"))
+    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), run_as("Other"))
     assert edited_line(plan) == LINE + 11
 
 
 def test_remarks_above_it_since_it_ran_do_not_matter() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     moved = TWO.replace("class Task(Base):", "# more\n\n# Größe\n\nclass Task(Base):")
-    plan = plan_edit({FILE: moved}, ("sensor", "cam"), before, higher(before), run_class)
+    plan = planned(plan_edit, {FILE: moved}, ("sensor", "cam"), before, higher(before), run_class)
     assert edited_line(plan) == LINE + 4
 
 
@@ -99,8 +107,10 @@ def test_remarks_above_it_since_it_ran_do_not_matter() -> None:
 )
 def test_what_is_no_camera_never_reaches_the_file(change: dict[str, Any]) -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, dataclasses.replace(before, **change), run_class)
-    assert isinstance(plan, Refusal) and not plan.snippet
+    plan = planned(
+        plan_edit, {FILE: TWO}, ("sensor", "cam"), before, dataclasses.replace(before, **change), run_class
+    )
+    assert isinstance(plan, Refused) and not plan.snippet
 
 
 def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
@@ -109,8 +119,8 @@ def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
         "sapien.Pose([-0.5, 0, -0.5]).inv(), 128, 128, 1.0, mount=self.camera_link)",
     )
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: source}, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refusal) and "    mount=self.camera_link,\n" in plan.snippet
+    plan = planned(plan_edit, {FILE: source}, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, Refused) and "    mount=self.camera_link,\n" in plan.snippet
 
 
 def told(ran: Ran, **changes: Any) -> Run:
@@ -134,8 +144,8 @@ def told(ran: Ran, **changes: Any) -> Run:
 def test_a_place_that_is_none_is_refused(changes: dict[str, Any], reason: str) -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     run = told(run_class({FILE: TWO}), **changes)
-    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), run)
-    assert isinstance(plan, Refusal) and reason in plan.reason
+    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), run)
+    assert isinstance(plan, Refused) and reason in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet
 
 
@@ -167,23 +177,23 @@ def test_a_worker_that_lies_about_places_changes_nothing(place: Place, reason: s
         vector = dataclasses.replace(pose.parts["p"], parts={**pose.parts["p"].parts, "2": item})
         lie = dataclasses.replace(pose, parts={**pose.parts, "p": vector})
         trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
-    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), told(ran, trace=trace))
-    assert isinstance(plan, Refusal) and reason in plan.reason
+    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), told(ran, trace=trace))
+    assert isinstance(plan, Refused) and reason in plan.reason
 
 
 def test_an_installed_file_is_left_alone() -> None:
     path = "/usr/lib/python3/site-packages/mani_skill/envs/tasks/task.py"
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({path: TWO}, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refusal) and "copy the task" in plan.reason
+    plan = planned(plan_edit, {path: TWO}, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, Refused) and "copy the task" in plan.reason
 
 
 def test_what_is_not_in_the_files_or_not_python_is_refused() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: TWO}, ("sensor", "hand"), before, higher(before), run_class)
-    assert isinstance(plan, Refusal) and "'hand'" in plan.reason
-    plan = plan_edit({FILE: "cam = (\n"}, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refusal) and "not valid Python" in plan.reason
+    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "hand"), before, higher(before), run_class)
+    assert isinstance(plan, Refused) and "'hand'" in plan.reason
+    plan = planned(plan_edit, {FILE: "cam = (\n"}, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, Refused) and "not valid Python" in plan.reason
 
 
 def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None:
@@ -193,13 +203,20 @@ def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None
     )
     source = TWO.replace("from mani_skill.sensors.camera import", "from configs import")
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit(
-        {FILE: source, "/author/configs.py": own}, ("sensor", "cam"), before, higher(before), run_class
+    plan = planned(
+        plan_edit,
+        {FILE: source, "/author/configs.py": own},
+        ("sensor", "cam"),
+        before,
+        higher(before),
+        run_class,
     )
-    assert isinstance(plan, Refusal) and "is given by * or **" in plan.reason
+    assert isinstance(plan, Refused) and "is given by * or **" in plan.reason
     handed_on = TWO.replace("from mani_skill.sensors.camera import", "from mani_skill.sensors import")
     assert (
-        edited_line(plan_edit({FILE: handed_on}, ("sensor", "cam"), before, higher(before), run_class))
+        edited_line(
+            planned(plan_edit, {FILE: handed_on}, ("sensor", "cam"), before, higher(before), run_class)
+        )
         == LINE
     )
 
@@ -227,7 +244,7 @@ IMPORTING = HEADER + dedent(
 def test_a_constant_of_another_file_is_changed_there() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
-    plan = plan_edit(sources, ("sensor", "cam"), before, higher(before), run_class)
+    plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, SourceEdit), plan
     assert plan.file == "/author/places.py"
     assert "EYE = np.array([0.5, 0, 0.75])  # above the table" in plan.new_text
@@ -239,7 +256,7 @@ def test_of_however_many_files_that_only_speak_of_it_a_constant_is_changed_where
     sources = {FILE: IMPORTING, "/author/places.py": PLACES, **more}
     before = real_settings(sources, "cam")
     after = dataclasses.replace(higher(before), width=100)
-    plan = plan_edit(sources, ("sensor", "cam"), before, after, run_class)
+    plan = planned(plan_edit, sources, ("sensor", "cam"), before, after, run_class)
     assert isinstance(plan, SourceEdit), plan
     assert plan.file == "/author/places.py" and not plan.others, plan.notes
     assert "EYE = np.array([0.5, 0, 0.75])" in plan.new_text and "SIZE = 100" in plan.new_text
@@ -252,7 +269,7 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
         "/author/more.py": "from places import EYE\nx = EYE\n",
     }
     before = real_settings(sources, "cam")
-    plan = plan_edit(sources, ("sensor", "cam"), before, higher(before), run_class)
+    plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, SourceEdit) and plan.file == FILE
     assert "sapien.Pose([0.5, 0, 0.75])" in plan.new_text
     assert any("more.py" in note for note in plan.notes)
@@ -261,8 +278,8 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
 def test_a_change_that_would_not_be_seen_in_what_is_written_is_refused() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     after = dataclasses.replace(before, position=(0.5, 0.0, 0.50003))
-    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, after, run_class)
-    assert isinstance(plan, Refusal) and "smaller than what is written" in plan.reason
+    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, after, run_class)
+    assert isinstance(plan, Refused) and "smaller than what is written" in plan.reason
 
 
 SHARED = dedent(
@@ -292,7 +309,7 @@ def test_of_a_shared_pose_only_names_that_are_seen_there_go_into_the_camera(uid:
     source = HEADER + SHARED
     before = real_settings({FILE: source}, uid, "_default_sensor_configs")
     after = dataclasses.replace(before, position=(*before.position[:2], 0.75))
-    plan = plan_edit({FILE: source}, ("sensor", uid), before, after, run_class)
+    plan = planned(plan_edit, {FILE: source}, ("sensor", uid), before, after, run_class)
     assert isinstance(plan, SourceEdit), plan
     assert f'CameraConfig("{uid}", {new}, 64, 64, 1.0)' in plan.new_text
 
@@ -306,7 +323,7 @@ def test_an_angle_of_another_file_that_others_read_comes_in_radians_and_as_finel
     }
     before = real_settings(sources, "cam")
     after = dataclasses.replace(before, fov=math.radians(50.123))
-    plan = plan_edit(sources, ("sensor", "cam"), before, after, run_class)
+    plan = planned(plan_edit, sources, ("sensor", "cam"), before, after, run_class)
     assert isinstance(plan, SourceEdit) and plan.file == FILE, plan
     assert "64, 0.874759)" in plan.new_text, "50.12 degrees"
 
@@ -315,7 +332,7 @@ def test_a_change_of_two_files_is_one_plan_with_both() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     after = dataclasses.replace(higher(before), height=100)
-    plan = plan_edit(sources, ("sensor", "cam"), before, after, run_class)
+    plan = planned(plan_edit, sources, ("sensor", "cam"), before, after, run_class)
     assert isinstance(plan, SourceEdit), plan
     assert [change.file for change in plan.changes] == [FILE, "/author/places.py"]
     assert "places.SIZE, 100, 1.0" in plan.new_text and "[0.5, 0, 0.75]" in plan.others[0].new_text
@@ -329,19 +346,19 @@ def test_a_change_of_two_files_is_one_plan_with_both() -> None:
 def test_what_an_argument_of_the_env_decides_is_left_alone_and_said() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     running = dataclasses.replace(before, width=640, height=480)
-    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), running, higher(running), run_class)
+    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), running, higher(running), run_class)
     assert isinstance(plan, SourceEdit) and plan.settings is not None
     assert (plan.settings.width, plan.settings.height) == (640, 480)
     assert "left alone" in plan.notes[-1]
-    plan = plan_edit(
-        {FILE: TWO}, ("sensor", "cam"), running, dataclasses.replace(running, width=320), run_class
+    plan = planned(
+        plan_edit, {FILE: TWO}, ("sensor", "cam"), running, dataclasses.replace(running, width=320), run_class
     )
-    assert isinstance(plan, Refusal) and "gym.make" in plan.reason
+    assert isinstance(plan, Refused) and "gym.make" in plan.reason
 
 
 def test_nothing_changed_is_said() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    assert isinstance(plan_edit({FILE: TWO}, ("sensor", "cam"), before, before, run_class), Refusal)
+    assert isinstance(planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, before, run_class), Refused)
 
 
 def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
@@ -360,17 +377,17 @@ def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
     for uid in ("cam", "other"):
         before = real_settings({FILE: source}, uid)
         after = dataclasses.replace(before, fov=None, intrinsic=matrix)
-        plan = plan_edit({FILE: source}, ("sensor", uid), before, after, run_class)
+        plan = planned(plan_edit, {FILE: source}, ("sensor", uid), before, after, run_class)
         assert isinstance(plan, SourceEdit), plan
         assert real_settings({FILE: plan.new_text}, uid) == plan.settings == after
-        back = plan_edit({FILE: plan.new_text}, ("sensor", uid), after, before, run_class)
+        back = planned(plan_edit, {FILE: plan.new_text}, ("sensor", uid), after, before, run_class)
         assert isinstance(back, SourceEdit), back
         assert real_settings({FILE: back.new_text}, uid) == back.settings == before
 
 
 def test_the_server_process_gets_no_simulator_by_it(child_process: None) -> None:
     code = (
-        "import sys, workbench.authoring.camera_source\n"
+        "import sys\nfrom workbench.authoring.camera_source import members, plan\n"
         "print({'torch', 'sapien', 'mani_skill'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -395,6 +412,6 @@ def test_a_change_that_another_camera_would_make_too_is_refused() -> None:
     )
     sources = {FILE: source, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
-    plan = plan_edit(sources, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refusal) and "of the camera hand as well" in plan.reason
+    plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, Refused) and "of the camera hand as well" in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet

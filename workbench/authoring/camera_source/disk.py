@@ -1,4 +1,4 @@
-"""An edit made on disk, or taken back: whole or not at all, and never over somebody else's newer text.
+"""An edit of the author's files: shown, made on disk, taken back. Whole or not at all, and never over newer text.
 
 Where an edit is of two files, both are looked at before the first is written, and if the second then fails the first is
 taken back.
@@ -10,26 +10,80 @@ stays as it was: line ends, encoding, byte order mark, permissions, a link that 
 
 from __future__ import annotations
 
+import difflib
 import os
 import stat
-from pathlib import Path
+from dataclasses import dataclass
+from pathlib import Path, PurePath
 
-from workbench.authoring.camera_source.cameras import check_own
-from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
+from workbench.authoring.library_names import LIBRARY_FOLDERS
 from workbench.authoring.modules import read_exactly
 from workbench.authoring.source.text import Refused
+from workbench.core.camera_settings import CameraSettings
 from workbench.machine.atomic_files import replace_file
 
 
-def apply(edit: SourceEdit) -> Refusal | None:
-    """Write the edit. None when it is done; the file is as it was when there is a reason why not."""
-    return _exchange_all(edit.changes, "since the change was shown")
+@dataclass(frozen=True)
+class FileChange:
+    """What one file says, and is to say."""
+
+    file: str
+    old_text: str
+    new_text: str
+
+    @property
+    def name(self) -> str:
+        return PurePath(self.file).name
+
+    @property
+    def diff(self) -> str:
+        """As ``diff -u`` writes it, with three lines around each change."""
+        lines = difflib.unified_diff(
+            self.old_text.splitlines(), self.new_text.splitlines(), self.name, self.name, lineterm=""
+        )
+        return "\n".join(lines)
 
 
-def revert(edit: SourceEdit) -> Refusal | None:
-    """Take an applied edit back, as long as nothing else was changed in the file since."""
+@dataclass(frozen=True)
+class SourceEdit(FileChange):
+    """A change of the author's files, not made yet. It is about one of them; where a constant of another module is
+    changed too, that is one of `others`."""
+
+    notes: tuple[str, ...]
+    """Sentences for the author: what was done otherwise than they may expect."""
+    settings: CameraSettings | None
+    """What the new text gives the camera, rounded as it is written. None for a camera that was removed."""
+    others: tuple[FileChange, ...] = ()
+    """Changes of further files, which are made and taken back along with it."""
+
+    @property
+    def changes(self) -> tuple[FileChange, ...]:
+        """Of every file, the one that it is about first."""
+        return (self, *self.others)
+
+    @property
+    def names(self) -> str:
+        """Of the files, for a sentence."""
+        return " and ".join(change.name for change in self.changes)
+
+
+def apply(edit: SourceEdit) -> None:
+    """Write the edit. Raises Refused where it cannot be done; the file is as it was then."""
+    _exchange_all(edit.changes, "since the change was shown")
+
+
+def revert(edit: SourceEdit) -> None:
+    """Take an applied edit back. Raises Refused where something else was changed in the file since, too."""
     back = tuple(FileChange(change.file, change.new_text, change.old_text) for change in edit.changes)
-    return _exchange_all(back, "since the camera was written into it")
+    _exchange_all(back, "since the camera was written into it")
+
+
+def check_own(path: str) -> None:
+    """Raises `Refused` for a file of an installed package: the next installation would take the change away."""
+    if LIBRARY_FOLDERS & {*PurePath(path).parts}:
+        raise Refused(
+            f"{path} belongs to an installed package; copy the task into a folder of your own first"
+        )
 
 
 def not_writable(path: str) -> str | None:
@@ -52,41 +106,40 @@ def not_writable(path: str) -> str | None:
     return None
 
 
-def _exchange_all(changes: tuple[FileChange, ...], since: str) -> Refusal | None:
+def _exchange_all(changes: tuple[FileChange, ...], since: str) -> None:
     for change in changes if len(changes) > 1 else ():
-        refusal = _exchange(change.file, change.old_text, None, since)
-        if refusal is not None:
-            return refusal
-    done: list[FileChange] = []
-    for change in changes:
-        refusal = _exchange(change.file, change.old_text, change.new_text, since)
-        if refusal is not None:
-            left = [made.file for made in done if _exchange(made.file, made.new_text, made.old_text, since)]
-            names = " and ".join(Path(path).name for path in left)
-            told = f"; {names} could not be put back, and has the change without the other" if left else ""
-            return Refusal(f"{refusal.reason}{told}")
-        done.append(change)
-    return None
+        _exchange(change.file, change.old_text, None, since)
+    for done, change in enumerate(changes):
+        try:
+            _exchange(change.file, change.old_text, change.new_text, since)
+        except Refused as refused:
+            left = [made.name for made in changes[:done] if not _taken_back(made, since)]
+            told = f"; {' and '.join(left)} could not be put back, and has the change without the other"
+            raise Refused(f"{refused.reason}{told if left else ''}") from refused
 
 
-def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refusal | None:
+def _taken_back(change: FileChange, since: str) -> bool:
+    try:
+        _exchange(change.file, change.new_text, change.old_text, since)
+    except Refused:
+        return False
+    return True
+
+
+def _exchange(path: str, expected: str, wanted: str | None, since: str) -> None:
     """Put `wanted` in place of the text that is expected there; None only looks whether it could be."""
-    reason = not_writable(path)
-    if reason is not None:
-        return Refusal(reason)
+    if (reason := not_writable(path)) is not None:
+        raise Refused(reason)
     real = Path(path).resolve()
     try:
         raw, text, encoding = read_exactly(real)
         if text != expected:
-            return Refusal(f"{real.name} was edited {since}, so it is left as it is; ask again")
-        if wanted is None:
-            return None
-        if not replace_file(real, wanted.encode(encoding), raw):
-            return Refusal(
+            raise Refused(f"{real.name} was edited {since}, so it is left as it is; ask again")
+        if wanted is not None and not replace_file(real, wanted.encode(encoding), raw):
+            raise Refused(
                 f"{real.name} was saved by somebody else just now, so it is left as it is; ask again"
             )
     except (UnicodeError, SyntaxError) as exc:
-        return Refusal(f"{real.name} cannot be written in its encoding: {exc}")
+        raise Refused(f"{real.name} cannot be written in its encoding: {exc}") from exc
     except OSError as exc:
-        return Refusal(f"{real.name} cannot be written: {exc.strerror}")
-    return None
+        raise Refused(f"{real.name} cannot be written: {exc.strerror}") from exc

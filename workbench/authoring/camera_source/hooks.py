@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 
 from workbench.authoring.camera_source.cameras import HOOKS, Ran
-from workbench.authoring.source.names import Binding, Project
+from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import (
     list_text,
     matrix_text,
@@ -19,39 +19,16 @@ from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind
 
 HOOK_OF: dict[CameraKind, str] = {kind: hook for hook, kind in HOOKS.items() if hook.startswith("_default")}
-_CONFIG = "from mani_skill.sensors.camera import CameraConfig\n"
 
 
-def needed_imports(
-    project: Project,
-    file: SourceFile,
-    settings: CameraSettings,
-    with_sapien: bool = True,
-    more: Sequence[tuple[str, str]] = (),
-) -> tuple[list[Replacement], list[str]]:
-    """What is missing at the top of the file; `more` are names, each with its line."""
-    wanted = [("CameraConfig", _CONFIG), *more]
-    if with_sapien:
-        wanted.append(("sapien", "import sapien\n"))
+def imports_of(settings: CameraSettings, pose: str = "") -> dict[str, str]:
+    """What the text of a `snippet` needs, by the name that each line brings."""
+    lines = {"CameraConfig": "from mani_skill.sensors.camera import CameraConfig"}
+    if not pose:
+        lines["sapien"] = "import sapien"
     if settings.intrinsic is not None:
-        wanted.append(("np", "import numpy as np\n"))
-    bindings = project.bindings(file, file.module)
-    missing = [line for name, line in wanted if not _imported_as(bindings.get(name, []), name)]
-    if not missing:
-        return [], []
-    place = file.import_place()
-    text = "".join(sorted(missing, key=lambda line: line.startswith("from")))
-    return [Replacement(place, place, text)], [
-        f"`{line.strip()}` is added at the top of the file" for line in missing
-    ]
-
-
-def _imported_as(bindings: list[Binding], name: str) -> bool:
-    if bindings and not bindings[-1].dotted:
-        raise Refused(
-            f"`{name}` means something else in this file (line {bindings[-1].file.line(bindings[-1].node)})"
-        )
-    return bool(bindings)
+        lines["np"] = "import numpy as np"
+    return lines
 
 
 def returned(file: SourceFile, function: Function) -> ast.expr:
@@ -105,7 +82,7 @@ def appended(file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], s
 
 def new_hook(
     project: Project, ran: Ran, file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
-) -> list[Replacement]:
+) -> Replacement:
     """The hook, which returns the one camera that `text(indent)` is."""
     owner, where = ran.owners.get(hook, ("", ""))
     if where in project.texts:
@@ -122,7 +99,7 @@ def new_hook(
             f"{inner}    {text(inner + '    ')},\n{inner}]\n"
         )
 
-    return [at_end_of_class(file, cls, hook, whole)]
+    return at_end_of_class(file, cls, hook, whole)
 
 
 def class_named(file: SourceFile, name: str) -> ast.ClassDef:

@@ -11,33 +11,25 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from workbench.authoring.camera_source.cameras import (
-    HOOKS,
-    CameraCall,
-    Ran,
-    Run,
-    camera_call,
-    check_others,
-    check_own,
-    run_first,
-)
+from workbench.authoring.camera_source.cameras import HOOKS, CameraCall, Ran, Run
+from workbench.authoring.camera_source.disk import SourceEdit, check_own
+from workbench.authoring.camera_source.edit import CameraEdit, check_camera, planning
 from workbench.authoring.camera_source.hooks import (
     HOOK_OF,
     appended,
     at_end_of_class,
     class_named,
-    needed_imports,
+    imports_of,
     new_hook,
     repr_text,
     returned,
     snippet,
 )
-from workbench.authoring.camera_source.result import Refusal, SourceEdit
 from workbench.authoring.camera_source.write_pose import look_at_text
-from workbench.authoring.source.names import Project
 from workbench.authoring.source.text import FUNCTIONS, Refused, Replacement, SourceFile
-from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, why_no_camera
+from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind
 
 
@@ -49,48 +41,42 @@ def plan_add(
     settings: CameraSettings,
     run: Run,
     target: tuple[float, float, float] | None = None,
-) -> SourceEdit | Refusal:
+) -> SourceEdit:
     """A new camera that stands still, in the hook of `class_name`, which is made if the class has none.
 
-    Its pose is written as its siblings' is, where that can say it; `target` is the point that it looks at then.
+    Its pose is written as its siblings' is, where that can say it; `target` is the point that it looks at then. It and
+    the others raise Refused.
     """
-    why = why_no_camera(settings)
-    if why is not None:
-        return Refusal(why)
+    check_camera(settings)
     kind, uid = key
-    try:
-        project, ran = run_first(sources, run)
-        source = project.given(file)
+    with planning(sources, run, uid, settings) as edit:
+        source = edit.project.given(file)
         check_own(file)
-        _check_new(ran, key)
+        _check_new(edit.ran, key)
         cls, hook = class_named(source, class_name), HOOK_OF[kind]
-        name = _siblings_look_at(project, ran, source, kind)
+        name = _siblings_look_at(edit, source, kind)
         pose = name and look_at_text(name, settings, target) or ""
-        imports, notes = needed_imports(project, source, settings, with_sapien=not pose)
+        edit.importing(source, imports_of(settings, pose))
 
         def text(indent: str) -> str:
             return snippet(uid, settings, indent, pose=pose)
 
         functions = [node for node in cls.body if isinstance(node, ast.FunctionDef) and node.name == hook]
         if functions:
-            replacement = appended(source, returned(source, functions[-1]), uid, text)
+            edit.change(source, *appended(source, returned(source, functions[-1]), uid, text))
         else:
-            replacement = new_hook(project, ran, source, cls, hook, text)
-        new_text = source.replaced([*imports, *replacement])
-        return _proven(project, source, new_text, notes, ran, run, None, key)
-    except Refused as refused:
-        return Refusal(refused.reason, snippet(uid, settings))
+            edit.change(source, new_hook(edit.project, edit.ran, source, cls, hook, text))
+        return edit.proven(source, None, key)
 
 
 def plan_duplicate(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: Run
-) -> SourceEdit | Refusal:
+) -> SourceEdit:
     """A copy of a camera, which has `settings`, beside it: on the same mount, written alike."""
     new_key: CameraKey = (key[0], new_uid)
-    try:
-        project, ran = run_first(sources, run)
-        call = _one(project, ran, key)
-        _check_new(ran, new_key)
+    with planning(sources, run, new_uid, settings) as edit:
+        call = _one(edit, key)
+        _check_new(edit.ran, new_key)
         file, outer = call.file, call.file.parents[call.node]
         alone = not (
             (isinstance(outer, ast.Return) and _is_hooks_own(call))
@@ -109,50 +95,41 @@ def plan_duplicate(
             return "\n".join([first, *(own + r[len(indent) :] if r.startswith(indent) else r for r in rest)])
 
         value = call.node if isinstance(outer, ast.Return) else call.container
-        new_text = file.replaced(appended(file, value, new_uid, indented))
-        return _proven(project, file, new_text, [], ran, run, None, new_key)
-    except Refused as refused:
-        return Refusal(refused.reason, snippet(new_uid, settings))
+        edit.change(file, *appended(file, value, new_uid, indented))
+        return edit.proven(file, None, new_key)
 
 
 def plan_rename(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: Run
-) -> SourceEdit | Refusal:
+) -> SourceEdit:
     """The same camera under another name. Observations and `sensor_configs` know it by its name: that is said."""
-    uid = key[1]
     new_key: CameraKey = (key[0], new_uid)
-    try:
-        project, ran = run_first(sources, run)
-        call = _one(project, ran, key)
-        _check_new(ran, new_key)
-        new_text = call.file.replaced(_renaming(call, new_uid))
-        notes = [
+    with planning(sources, run, new_uid, settings) as edit:
+        call = _one(edit, key)
+        _check_new(edit.ran, new_key)
+        edit.change(call.file, *_renaming(call, new_uid))
+        edit.note(
             f"observations name this camera {new_uid!r} from now on, which a trained policy may not expect"
-        ]
-        elsewhere = len(re.findall(rf"[\"']{re.escape(uid)}[\"']", new_text))
+        )
+        planned = edit.proven(call.file, key, new_key)
+        elsewhere = len(re.findall(rf"[\"']{re.escape(key[1])}[\"']", planned.new_text))
         if elsewhere:
-            notes.append(f"{uid!r} still stands in {elsewhere} other place(s) of {call.file.name}")
-        return _proven(project, call.file, new_text, notes, ran, run, key, new_key)
-    except Refused as refused:
-        return Refusal(refused.reason, snippet(new_uid, settings))
+            edit.note(f"{key[1]!r} still stands in {elsewhere} other place(s) of {planned.name}")
+        return replace(planned, notes=tuple(edit.notes))
 
 
-def plan_remove(sources: Mapping[str, str], key: CameraKey, run: Run) -> SourceEdit | Refusal:
+def plan_remove(sources: Mapping[str, str], key: CameraKey, run: Run) -> SourceEdit:
     """The camera taken out of what its hook returns."""
-    try:
-        project, ran = run_first(sources, run)
-        call = _one(project, ran, key)
-        new_text = call.file.replaced([_removal(call)])
+    with planning(sources, run) as edit:
+        call = _one(edit, key)
+        edit.change(call.file, _removal(call))
         pose = call.arguments.get("pose")
-        notes = []
         if isinstance(pose, ast.Name):
-            notes.append(f"`{pose.id}` is left where it is; nothing may need it any more")
-        return _proven(project, call.file, new_text, notes, ran, run, key, None)
-    except Refused as refused:
-        return Refusal(refused.reason)
+            edit.note(f"`{pose.id}` is left where it is; nothing may need it any more")
+        return edit.proven(call.file, key, None)
 
 
-_PARSE = ("parse_camera_configs", "from mani_skill.sensors.camera import parse_camera_configs\n")
+_PARSE = {"parse_camera_configs": "from mani_skill.sensors.camera import parse_camera_configs"}
 
 
 def override_text(
@@ -180,58 +157,38 @@ def plan_override(
     site: CallSite,
     run: Run,
     more: Sequence[str] = (),
-) -> SourceEdit | Refusal:
+) -> SourceEdit:
     """The edit that gives `class_name` such a hook; `site` is where the parent makes the camera."""
-    why = why_no_camera(settings)
-    if why is not None:
-        return Refusal(why)
+    check_camera(settings)
     hook, parent = HOOK_OF[kind], site.function.rpartition(".")[0]
-    try:
-        project, ran = run_first(sources, run)
-        source = project.given(file)
+    with planning(sources, run, uid, settings, more) as edit:
+        source = edit.project.given(file)
         check_own(file)
         cls = class_named(source, class_name)
-        own = hook in project.bindings(source, cls)
-        owner, where = (class_name, file) if own else ran.owners.get(hook, ("", ""))
+        own = hook in edit.project.bindings(source, cls)
+        owner, where = (class_name, file) if own else edit.ran.owners.get(hook, ("", ""))
         if where in sources:
             raise Refused(
-                f"{uid} is made by {parent}, and the {hook} of {owner} ({project.file(where).name}) hands it on: put the "
-                "text below in its place there"
+                f"{uid} is made by {parent}, and the {hook} of {owner} ({edit.project.file(where).name}) hands it on: put "
+                "the text below in its place there"
             )
-        imports, notes = needed_imports(project, source, settings, more=(_PARSE,))
-        replacement = at_end_of_class(
-            source, cls, hook, lambda indent: override_text(kind, uid, settings, more, indent)
-        )
-        told = (
+        edit.note(
             f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets a {hook} of its own, with all "
             f"cameras of {parent} and this one in place of its {uid}"
         )
-        new_text = source.replaced([*imports, replacement])
-        return _proven(project, source, new_text, [told, *notes], ran, run, (kind, uid), (kind, uid))
-    except Refused as refused:
-        return Refusal(refused.reason, snippet(uid, settings, more=more))
-
-
-def _proven(
-    project: Project,
-    file: SourceFile,
-    new_text: str,
-    notes: list[str],
-    ran: Ran,
-    run: Run,
-    key: CameraKey | None,
-    expected: CameraKey | None,
-) -> SourceEdit:
-    """See `check_others`."""
-    found = check_others(ran, run({**project.texts, file.path: new_text}), key, expected)
-    return SourceEdit(file.path, file.text, new_text, tuple(notes), found)
+        edit.importing(source, imports_of(settings) | _PARSE)
+        text = at_end_of_class(
+            source, cls, hook, lambda indent: override_text(kind, uid, settings, more, indent)
+        )
+        edit.change(source, text)
+        return edit.proven(source, (kind, uid), (kind, uid))
 
 
 # --- which ---------------------------------------------------------------------------------------
 
 
-def _one(project: Project, ran: Ran, key: CameraKey) -> CameraCall:
-    call = camera_call(project, ran, key)
+def _one(edit: CameraEdit, key: CameraKey) -> CameraCall:
+    call = edit.call(key)
     check_own(call.file.path)
     if call.loop is not None:
         raise Refused(f"{key[1]!r} is made in a loop or comprehension ({call.where})")
@@ -251,15 +208,15 @@ def _is_hooks_own(call: CameraCall) -> bool:
     return isinstance(function, FUNCTIONS) and not isinstance(function, ast.Lambda) and function.name in HOOKS
 
 
-def _siblings_look_at(project: Project, ran: Ran, file: SourceFile, kind: CameraKind) -> str:
+def _siblings_look_at(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
     """How a camera of this file calls look_at, one of that kind before others; empty if none does."""
-    for key in sorted(ran.cameras, key=lambda key: key[0] != kind):
-        trace = ran.cameras[key].trace
+    for key in sorted(edit.ran.cameras, key=lambda key: key[0] != kind):
+        trace = edit.ran.cameras[key].trace
         pose = None if trace is None else trace.parts.get("pose")
         if pose is not None and pose.function == "look_at" and pose.at.file == file.path:
-            node = file.expression((pose.at.start, pose.at.end))
+            _, node = edit.find(pose.at)
             name = file.code(node.func) if isinstance(node, ast.Call) else ""
-            if name.partition(".")[0] in project.bindings(file, file.module):
+            if name.partition(".")[0] in edit.project.bindings(file, file.module):
                 return name
     return ""
 
@@ -276,7 +233,7 @@ def _renaming(call: CameraCall, new_uid: str) -> list[Replacement]:
         found.append(Replacement(start, start + len(key.arg or ""), new_uid))
     elif key is not None:
         found.append(Replacement(*file.span(key), repr_text(new_uid)))
-    if key is not None and not (isinstance(uid, ast.Constant) and uid.value == call.name):
+    if key is not None and not (isinstance(uid, ast.Constant) and uid.value == call.camera[1]):
         return found
     if uid is None:
         raise Refused(f"the name is not written in the call ({call.where})")

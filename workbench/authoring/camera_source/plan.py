@@ -9,28 +9,17 @@ camera is what it was.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
-from workbench.authoring.camera_source.cameras import (
-    FIELDS,
-    CameraCall,
-    Ran,
-    Run,
-    camera_call,
-    changed_fields,
-    check_others,
-    check_own,
-    run_first,
-    with_fields,
-)
-from workbench.authoring.camera_source.hooks import snippet
-from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
+from workbench.authoring.camera_source.cameras import FIELDS, CameraCall, Run, changed_fields, with_fields
+from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.authoring.camera_source.edit import CameraEdit, check_camera, planning
 from workbench.authoring.camera_source.write_pose import ANGLE_STEP, POSITION_STEP, why_not_a_pose, write_pose
 from workbench.authoring.source.changes import Changes
-from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import matrix_text, number_text
 from workbench.authoring.source.text import Refused, Replacement
 from workbench.core.camera_frames import angle_between
-from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
+from workbench.core.camera_settings import CameraKey, CameraSettings
 
 
 def plan_edit(
@@ -39,78 +28,59 @@ def plan_edit(
     before: CameraSettings,
     after: CameraSettings,
     run: Run,
-) -> SourceEdit | Refusal:
+) -> SourceEdit:
     """The edit that turns a camera from `before`, which the running env has, into `after`.
 
-    `sources` are the author's files by path, as they are on disk. Nothing is written.
+    `sources` are the author's files by path, as they are on disk. Nothing is written. Raises Refused.
     """
-    why = why_no_camera(after)
-    if why is not None:
-        return Refusal(why)
+    check_camera(after)
     mount: list[str] = []
-    try:
+    with planning(sources, run, key[1], after, mount) as edit:
         fields = changed_fields(before, after)
         if not fields:
             raise Refused("nothing of this camera was changed")
-        project, ran = run_first(sources, run)
-        call = camera_call(project, ran, key)
+        call = edit.call(key)
         # Without its mount the pose of a copy is one of another frame.
         names = [name for name in ("entity_uid", "mount") if name in call.arguments]
-        mount = [f"{name}={call.file.code(call.arguments[name])}" for name in names]
-        return _plan(project, call, ran, key, fields, before, after, run)
-    except Refused as refused:
-        return Refusal(refused.reason, snippet(key[1], after, more=mount))
+        mount += [f"{name}={call.file.code(call.arguments[name])}" for name in names]
+        return _plan(edit, call, fields, before, after)
 
 
 def _plan(
-    project: Project,
-    call: CameraCall,
-    ran: Ran,
-    key: CameraKey,
-    fields: list[str],
-    before: CameraSettings,
-    after: CameraSettings,
-    run: Run,
+    edit: CameraEdit, call: CameraCall, fields: list[str], before: CameraSettings, after: CameraSettings
 ) -> SourceEdit:
     if call.loop is not None:
         raise Refused(
             f"the camera is made in a loop or comprehension (line {call.file.line(call.loop)} of {call.file.name}), "
             "and a change there would be one of all its cameras"
         )
-    changes = Changes(project)
     made = call.run.made
     if made is None:
         raise Refused(f"what {call.where} makes cannot be said in numbers")
     apart = changed_fields(made, before)
     for name in fields:
-        why = call.trace.unknown.get(name) or _why_not(changes, call, name)
+        why = call.trace.unknown.get(name) or _why_not(edit, call, name)
         if name in apart and not why:
             why = _differs(name, made, before)
         if why:
             raise Refused(f"{why} ({call.where})")
     if call.hook is None:
-        changes.note(
-            f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along"
-        )
-    _write_fields(changes, project, call, fields, after)
+        edit.note(f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along")
+    _write_fields(edit, call, fields, after)
     for name in FIELDS:
         if name in call.trace.parts:
-            changes.emit(call.trace.parts[name])
-    edit = _edit(changes, call)
-    found = check_others(ran, run({**project.texts, **{c.file: c.new_text for c in edit}}), key, key)
+            edit.emit(call.trace.parts[name])
+    planned = edit.proven(call.file, call.camera, call.camera)
     left = [name for name in apart if name not in fields]
-    settings = with_fields(_check_asked(found, fields, made, after), before, left)
-    if len(edit) > 1:
-        changes.note(f"{len(edit)} files change together: {' and '.join(c.name for c in edit)}")
+    settings = with_fields(_check_asked(planned.settings, fields, made, after), before, left)
+    if planned.others:
+        edit.note(f"{len(planned.changes)} files change together: {planned.names}")
     if left:
         be = "is" if len(left) == 1 else "are"
-        changes.note(
+        edit.note(
             f"{' and '.join(left)} of the running camera {be} not what the file says, and {be} left alone there"
         )
-    first = edit[0]
-    return SourceEdit(
-        first.file, first.old_text, first.new_text, tuple(changes.notes), settings, tuple(edit[1:])
-    )
+    return replace(planned, notes=tuple(edit.notes), settings=settings)
 
 
 def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
@@ -130,15 +100,13 @@ def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
     return f"`{changes.code(part.at)}` is not a {name} that can be read"
 
 
-def _write_fields(
-    changes: Changes, project: Project, call: CameraCall, fields: list[str], after: CameraSettings
-) -> None:
+def _write_fields(changes: Changes, call: CameraCall, fields: list[str], after: CameraSettings) -> None:
     added: list[str] = []
     for name in fields:
         part = call.trace.parts.get(name)
         if name == "pose":
             assert part is not None
-            write_pose(changes, project, part, after)
+            write_pose(changes, part, after)
         elif name in ("fov", "intrinsic"):
             continue
         elif name == "shader_pack":
@@ -154,18 +122,18 @@ def _write_fields(
         else:
             added.append(f"{name}={number_text(getattr(after, name), 4)}")
     if "fov" in fields or "intrinsic" in fields:
-        added += _write_lens(changes, project, call, after)
-    changes.replacements += [(call.file, change) for change in call.file.added_arguments(call.node, added)]
+        added += _write_lens(changes, call, after)
+    changes.change(call.file, *call.file.added_arguments(call.node, added))
 
 
-def _write_lens(changes: Changes, project: Project, call: CameraCall, after: CameraSettings) -> list[str]:
+def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> list[str]:
     """`fov` or `intrinsic`, of which ManiSkill wants exactly one. Returns arguments to add."""
     file = call.file
     if after.intrinsic is None:
         assert after.fov is not None
         name, other, text = "fov", "intrinsic", number_text(after.fov, 4)
     else:
-        imported = project.bindings(file, file.module).get("np", [])
+        imported = changes.project.bindings(file, file.module).get("np", [])
         rows = matrix_text(after.intrinsic)
         has_numpy = any(binding.dotted == "numpy" for binding in imported)
         name, other, text = "intrinsic", "fov", f"np.array({rows})" if has_numpy else rows
@@ -175,7 +143,7 @@ def _write_lens(changes: Changes, project: Project, call: CameraCall, after: Cam
         outer = file.parents[unwanted]
         if outer is not call.node and given is None:
             start, end = file.inner_span(outer)[0], file.span(unwanted)[1]
-            changes.replacements.append((file, Replacement(start, end, f"{name}={text}")))
+            changes.change(file, Replacement(start, end, f"{name}={text}"))
             return []
         changes.replace(file, unwanted, "None")
     if part is not None and isinstance(part.value, float) and after.fov is not None:
@@ -189,19 +157,6 @@ def _write_lens(changes: Changes, project: Project, call: CameraCall, after: Cam
     elif given is None:
         return [f"{name}={text}"]
     return []
-
-
-def _edit(changes: Changes, call: CameraCall) -> list[FileChange]:
-    files = {file.path: file for file, _ in changes.replacements}
-    if not files:
-        raise Refused("the change is smaller than what is written (0.1 mm, 0.01 degree)")
-    made: list[FileChange] = []
-    # The file that makes the camera first: it is what the author thinks of.
-    for file in sorted(files.values(), key=lambda file: (file.path != call.file.path, file.path)):
-        check_own(file.path)
-        mine = [change for of, change in changes.replacements if of.path == file.path]
-        made.append(FileChange(file.path, file.text, file.replaced(mine)))
-    return made
 
 
 def _check_asked(

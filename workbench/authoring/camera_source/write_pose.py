@@ -12,10 +12,11 @@ import ast
 import math
 from collections.abc import Sequence
 
-from workbench.authoring.source import rotations
+from numpy.typing import ArrayLike
+from transforms3d.euler import euler2quat
+
 from workbench.authoring.source.changes import Changes, settled
-from workbench.authoring.source.names import Project
-from workbench.authoring.source.numbers import list_text, quaternion_texts
+from workbench.authoring.source.numbers import list_text, look_at, quaternion_texts, same_side, to_euler
 from workbench.authoring.source.text import Replacement, SourceFile
 from workbench.authoring.source.trace import Part
 from workbench.core.camera_frames import angle_between, rotation_matrix
@@ -68,11 +69,11 @@ def _is_vector(part: Part, length: int) -> bool:
     return isinstance(part.value, tuple) and len(part.value) == len(part.numbers) == length
 
 
-def write_pose(changes: Changes, project: Project, pose: Part, after: CameraSettings) -> None:
+def write_pose(changes: Changes, pose: Part, after: CameraSettings) -> None:
     """Change it in its form, or to one that can say where `after` stands."""
     if pose.function == "look_at":
         if not _look_at(changes, pose, after):
-            _as_quaternion(changes, project, pose, after)
+            _as_quaternion(changes, pose, after)
         return
     _position(changes, pose, after.position)
     quaternion = pose.numbers[3:]
@@ -81,7 +82,7 @@ def write_pose(changes: Changes, project: Project, pose: Part, after: CameraSett
     part = pose.parts.get("q")
     if part is not None and part.function and _euler(changes, part, after):
         return
-    texts = quaternion_texts(_same_side(after.quaternion, quaternion))
+    texts = quaternion_texts(same_side(after.quaternion, quaternion))
     if part is None:
         changes.added.setdefault(pose, []).append(f"q=[{', '.join(texts)}]")
     elif part.literal and part.parts:
@@ -134,8 +135,7 @@ def _look_at(changes: Changes, pose: Part, after: CameraSettings) -> bool:
         return False
 
     def error(a: Sequence[float], b: Sequence[float]) -> float:
-        quaternion = rotations.look_at(a, b, up)
-        return math.inf if quaternion is None else angle_between(quaternion, after.quaternion)
+        return _turned(look_at(a, b, up), after)
 
     still = error(after.position, target.numbers) <= _STILL_AT_TARGET
     for decimals in _METRES if still else ():
@@ -166,13 +166,12 @@ def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str
     for target in (ahead,) if aim is None else (aim, ahead):
         for decimals in _METRES:
             eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
-            made = rotations.look_at(eye, point)
-            if made is not None and angle_between(made, settings.quaternion) <= ANGLE_STEP:
+            if _turned(look_at(eye, point), settings) <= ANGLE_STEP:
                 return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
     return None
 
 
-def _as_quaternion(changes: Changes, project: Project, pose: Part, after: CameraSettings) -> None:
+def _as_quaternion(changes: Changes, pose: Part, after: CameraSettings) -> None:
     """A pose in place of a look_at, with the author's own expression for where the camera stands."""
     file, node = changes.find(pose.at)
     assert isinstance(node, ast.Call)
@@ -189,8 +188,8 @@ def _as_quaternion(changes: Changes, project: Project, pose: Part, after: Camera
         )
     eye = pose.parts["eye"]
     _vector(changes, eye, after.position, 4)
-    call = pose_call(changes, project, file)
-    quaternion = f"[{', '.join(quaternion_texts(_same_side(after.quaternion, (1, 0, 0, 0))))}]"
+    call = pose_call(changes, file)
+    quaternion = f"[{', '.join(quaternion_texts(same_side(after.quaternion, (1, 0, 0, 0))))}]"
     shared = any(read.others is not None for read in pose.reads)
     if len(node.args) + len(node.keywords) == 2 and not shared:
         # Word by word, so that what the author remarked between the arguments stays.
@@ -199,8 +198,8 @@ def _as_quaternion(changes: Changes, project: Project, pose: Part, after: Camera
             name = ("eye", "target")[index] if isinstance(arg, ast.expr) else arg.arg
             if isinstance(arg, ast.keyword):
                 start = file.inner_span(arg)[0]
-                new = Replacement(start, start + len(arg.arg or ""), "p" if name == "eye" else "q")
-                changes.replacements.append((file, new))
+                new = "p" if name == "eye" else "q"
+                changes.change(file, Replacement(start, start + len(arg.arg or ""), new))
             if name == "target":
                 changes.replace(file, arg.value if isinstance(arg, ast.keyword) else arg, quaternion)
         return
@@ -210,9 +209,9 @@ def _as_quaternion(changes: Changes, project: Project, pose: Part, after: Camera
     changes.texts[pose] = f"{call}(p={position}, q={quaternion})"
 
 
-def pose_call(changes: Changes, project: Project, file: SourceFile) -> str:
+def pose_call(changes: Changes, file: SourceFile) -> str:
     """How `file` calls the class of poses. Imports sapien if it has none."""
-    for name, bindings in project.bindings(file, file.module).items():
+    for name, bindings in changes.project.bindings(file, file.module).items():
         dotted = bindings[-1].dotted
         if f"{dotted}.Pose" in _SAPIEN_POSE:
             return f"{name}.Pose"
@@ -220,31 +219,25 @@ def pose_call(changes: Changes, project: Project, file: SourceFile) -> str:
             return name
         if dotted in _MANISKILL_POSE:
             return f"{name}.create_from_pq"
-    start = file.import_place()
-    if not any(change.text == "import sapien\n" for _, change in changes.replacements):
-        changes.replacements.append((file, Replacement(start, start, "import sapien\n")))
-        changes.note("`import sapien` is added at the top of the file")
+    changes.importing(file, {"sapien": "import sapien"})
     return "sapien.Pose"
 
 
-def _euler(changes: Changes, angles: Part, after: CameraSettings) -> bool:
-    items = [angles.parts[name] for name in ("ai", "aj", "ak")]
-    wanted = rotations.to_euler(after.quaternion, [item.numbers[0] for item in items])
+def _euler(changes: Changes, part: Part, after: CameraSettings) -> bool:
+    items = [part.parts[name] for name in ("ai", "aj", "ak")]
+    wanted = to_euler(after.quaternion, [item.numbers[0] for item in items])
     for decimals in (4, 5, 6):
         roll, pitch, yaw = (settled(item, w, decimals) for item, w in zip(items, wanted, strict=True))
-        if angle_between(rotations.from_euler(roll, pitch, yaw), after.quaternion) <= ANGLE_STEP:
+        if _turned(euler2quat(roll, pitch, yaw), after) <= ANGLE_STEP:
             for item, w in zip(items, wanted, strict=True):
                 changes.number(item, w, decimals)
             return True
     return False
 
 
-def _same_side(quaternion: Sequence[float], old: Sequence[float]) -> rotations.Quaternion:
-    """Of the two quaternions of one orientation the one that resembles what stood there."""
-    w, x, y, z = rotations.unit(quaternion)
-    if sum(a * b for a, b in zip((w, x, y, z), old, strict=True)) < 0:
-        return -w, -x, -y, -z
-    return w, x, y, z
+def _turned(quaternion: ArrayLike | None, wanted: CameraSettings) -> float:
+    """Radians from an orientation, if there is one, to the wanted one."""
+    return math.inf if quaternion is None else angle_between(quaternion, wanted.quaternion)
 
 
 def _cosine(a: Sequence[float], b: Sequence[float]) -> float:

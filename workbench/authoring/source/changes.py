@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import ast
 import math
+from collections.abc import Mapping
 
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import number_text
-from workbench.authoring.source.text import Replacement, SourceFile, arguments
+from workbench.authoring.source.text import Refused, Replacement, SourceFile, arguments
 from workbench.authoring.source.trace import DEGREE, Part, Place
 
 
@@ -21,7 +22,7 @@ class Changes:
     Refused."""
 
     def __init__(self, project: Project) -> None:
-        self._project = project
+        self.project = project
         self.texts: dict[Part, str] = {}
         """New text of an expression."""
         self.added: dict[Part, list[str]] = {}
@@ -34,7 +35,7 @@ class Changes:
             self.notes.append(text)
 
     def find(self, place: Place) -> tuple[SourceFile, ast.expr]:
-        file = self._project.given(place.file)
+        file = self.project.given(place.file)
         return file, file.expression((place.start, place.end))
 
     def code(self, place: Place) -> str:
@@ -46,8 +47,33 @@ class Changes:
         file, node = self.find(place)
         return file.short(node)
 
+    def change(self, file: SourceFile, *replacements: Replacement) -> None:
+        self.replacements += [(file, replacement) for replacement in replacements]
+
     def replace(self, file: SourceFile, node: ast.AST, text: str) -> None:
-        self.replacements.append((file, Replacement(*file.span(node), text)))
+        self.change(file, Replacement(*file.span(node), text))
+
+    def importing(self, file: SourceFile, lines: Mapping[str, str]) -> None:
+        """Add what is missing at the top of a file.
+
+        Args:
+            lines: by the name that each brings.
+
+        Raises:
+            Refused: a name means something else there.
+        """
+        bindings = self.project.bindings(file, file.module)
+        for name in lines:
+            if name in bindings and not bindings[name][-1].dotted:
+                line = file.line(bindings[name][-1].node)
+                raise Refused(f"`{name}` means something else in this file (line {line})")
+        missing = [line for name, line in lines.items() if name not in bindings]
+        for line in missing:
+            self.note(f"`{line}` is added at the top of the file")
+        if missing:
+            place = file.import_place()
+            text = "".join(f"{line}\n" for line in sorted(missing, key=lambda line: line.startswith("from")))
+            self.change(file, Replacement(place, place, text))
 
     # --- wanted -------------------------------------------------------------------------------------
 
@@ -90,7 +116,7 @@ class Changes:
             self.emit(part, len(value.reads))
         if value in self.added:
             assert isinstance(node, ast.Call)
-            self.replacements += [(file, change) for change in file.added_arguments(node, self.added[value])]
+            self.change(file, *file.added_arguments(node, self.added[value]))
 
     def rendered(self, value: Part, known: int, into: SourceFile) -> str:
         """`value` as a text of its own, to be written in `into`."""

@@ -35,9 +35,10 @@ _BLANK = {
 class Refused(Exception):
     """Ends a plan from anywhere inside, with the reason; its callers make a sentence for the author of it."""
 
-    @property
-    def reason(self) -> str:
-        return str(self.args[0])
+    def __init__(self, reason: str, snippet: str = "") -> None:
+        super().__init__(reason)
+        self.reason, self.snippet = reason, snippet
+        """Why the file is left alone, and what the author can copy into it themselves."""
 
 
 @dataclass(frozen=True)
