@@ -27,6 +27,8 @@ class Binding:
     """What it is, where `value` is None."""
     imported: tuple[str, str] | None = None
     """Of an import: the module, with its leading dots, and the name in it, empty for the module itself."""
+    attribute: bool = False
+    """Of an object."""
 
     @property
     def dotted(self) -> str:
@@ -73,66 +75,40 @@ class Project:
             self._bindings[scope] = found
         return self._bindings[scope]
 
-    def of_name(self, file: SourceFile, node: ast.Name) -> tuple[list[Binding], Scope | None]:
-        """The bindings that may hold where `node` is read, and their scope; none for a builtin or a starred import's name."""
+    def of_name(self, file: SourceFile, node: ast.Name) -> list[Binding]:
+        """The bindings that may hold where `node` is read; none for a builtin or a starred import's name."""
         for outer in file.ancestors(node):
             for inside in getattr(outer, "generators", ()):
                 if any(isinstance(n, ast.Name) and n.id == node.id for n in walk(inside.target)):
-                    return [
-                        Binding(file, node.id, inside.target, None, "it changes in a comprehension")
-                    ], None
+                    return [Binding(file, node.id, inside.target, None, "it changes in a comprehension")]
         for depth, scope in enumerate(file.scopes(node)):
             if isinstance(scope, ast.ClassDef) and depth > 0:
                 continue
             here = self.bindings(file, scope).get(node.id)
             if here:
-                return reaching(file, here, node if depth == 0 else None, scope), scope
-        return [], None
+                return reaching(file, here, node if depth == 0 else None, scope)
+        return []
 
     # --- readers ------------------------------------------------------------------------------------
 
-    def name_readers(self, binding: Binding, file: SourceFile, read: ast.AST) -> str | None:
-        """Who reads a plain name's `binding`, other than `read` in `file`."""
+    def readers(self, binding: Binding, reader: SourceFile, read: ast.AST) -> str | None:
+        """Who reads what a name is bound to, other than `read` in `reader`: of an attribute, whosever it is."""
         home, name = binding.file, binding.name
-        for node in home.nodes:
-            if (
-                isinstance(node, ast.Name)
-                and node.id == name
-                and isinstance(node.ctx, ast.Load)
-                and node is not read
-            ):
-                if not _other_element(home, node, read) and read not in home.ancestors(node):
-                    if binding in self.of_name(home, node)[0]:
-                        return _where(home, node, file)
-        if binding.imported is not None or not isinstance(home.scopes(binding.node)[0], ast.Module):
-            return None
-        for other in self.mentioning(name):
-            if other is home:
-                continue
-            for node in other.nodes:
-                if node is read or _other_element(other, node, read):
-                    continue
-                named = isinstance(node, ast.Name) and node.id == name
-                named = named or (isinstance(node, ast.Attribute) and node.attr == name)
-                if named or (isinstance(node, ast.alias) and other is not file and node.name == name):
-                    return _where(other, node, file)
-        return None
-
-    def attribute_readers(self, binding: Binding, reader: SourceFile, read: ast.AST) -> str | None:
-        """Who reads an attribute of that name, other than `read`."""
-        name = binding.name
-        for file in self.mentioning(name):
+        scope = home.scopes(binding.node)[0]
+        attribute = binding.attribute or isinstance(scope, ast.ClassDef)
+        everywhere = binding.imported is None and (attribute or isinstance(scope, ast.Module))
+        for file in dict.fromkeys((home, *(self.mentioning(name) if everywhere else ()))):
             for node in file.nodes:
-                if node is read or _other_element(file, node, read):
-                    continue
-                if isinstance(node, ast.Attribute):
-                    found = node.attr == name and not (isinstance(node.ctx, ast.Store))
-                elif isinstance(node, ast.Name):
-                    found = node.id == name and isinstance(node.ctx, ast.Load)
-                    found = found and binding in self.of_name(file, node)[0]
+                if isinstance(node, ast.Name) and node.id == name:
+                    loads = isinstance(node.ctx, ast.Load) and binding in self.of_name(file, node)
+                    found = loads or (file is not home and not attribute)
+                elif isinstance(node, ast.Attribute) and node.attr == name:
+                    found = not isinstance(node.ctx, ast.Store) if attribute else file is not home
+                elif isinstance(node, ast.alias) and node.name == name:
+                    found = not attribute and file not in (home, reader)
                 else:
-                    found = isinstance(node, ast.Constant) and node.value == name
-                if found:
+                    found = attribute and isinstance(node, ast.Constant) and node.value == name
+                if found and node is not read and not _other_element(file, node, read):
                     return _where(file, node, reader)
         return None
 
@@ -232,7 +208,7 @@ def _stored(file: SourceFile, node: ast.Attribute) -> Binding:
     looped = any(isinstance(o, (ast.For, ast.While, ast.If)) for o in file.ancestors(node))
     if isinstance(outer, (ast.Assign, ast.AnnAssign)) and file.code(node.value) == "self" and not looped:
         value = outer.value
-    return Binding(file, node.attr, _statement(file, node), value, "it is set")
+    return Binding(file, node.attr, _statement(file, node), value, "it is set", attribute=True)
 
 
 def reaching(file: SourceFile, bindings: list[Binding], use: ast.AST | None, scope: Scope) -> list[Binding]:

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from types import FrameType, ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,7 @@ _TESTS = (
 _TESTS += (ast.expr_context,)
 _READ = (ast.Name, ast.Attribute, ast.Subscript)
 Reads = tuple[Read, ...]
+_Made = TypeVar("_Made")
 
 
 class Unknown(Exception):
@@ -132,10 +133,16 @@ class ValueReader:
 
     def _value(self, file: SourceFile, node: ast.expr) -> Plain:
         """What an expression that is allowed is worth."""
+        return self._known(file, node, node, plain)
+
+    def _known(
+        self, file: SourceFile, node: ast.expr, whole: ast.expr, made: Callable[[Any], _Made]
+    ) -> _Made:
+        """What is made of an expression's value. Raises Unknown, of the `whole` that it is of."""
         try:
-            return plain(self._run(file, node))
+            return made(self._run(file, node))
         except Exception as exc:  # whatever the author's classes raise
-            raise self.computed(file, node) from exc
+            raise self.computed(file, whole) from exc
 
     def _run(self, file: SourceFile, node: ast.expr, at: ast.AST | None = None) -> Any:
         names, own = self._namespace(file, file.scopes(node if at is None else at)[0])
@@ -158,7 +165,7 @@ class ValueReader:
             if not self._is_a_librarys(file, node):
                 self.part(file, node)
         elif isinstance(node, ast.Call):
-            self._known(file, node)
+            self._function(file, node)
             for given in (*node.args, *(keyword.value for keyword in node.keywords)):
                 self._check(file, given)
         elif isinstance(node, (ast.List, ast.Tuple, ast.BinOp)) or (
@@ -174,10 +181,7 @@ class ValueReader:
         """Which way a choice went."""
         if not all(isinstance(inner, _TESTS) for inner in ast.walk(node)):
             raise self.computed(file, node)
-        try:
-            return bool(self._run(file, node))
-        except Exception as exc:  # whatever the author's classes raise
-            raise self.computed(file, node) from exc
+        return self._known(file, node, node, bool)
 
     def _with_a_number_in_it(self, file: SourceFile, node: ast.expr, whole: Part) -> Part:
         """With the number of the expression that is best changed, if there is one.
@@ -219,19 +223,16 @@ class ValueReader:
 
     # --- calls --------------------------------------------------------------------------------------
 
-    def _known(self, file: SourceFile, node: ast.Call) -> Known:
+    def _function(self, file: SourceFile, node: ast.Call) -> Known:
         """The function that it calls; Raises Unknown for any that is not known, and for arguments by ``*``."""
         if not is_starred(node) and _is_named(node.func):
-            try:
-                found = known_functions().get(self._run(file, node.func))
-            except Exception as exc:  # whatever the author's classes raise
-                raise self.computed(file, node) from exc
+            found = self._known(file, node.func, node, known_functions().get)
             if found is not None:
                 return found
         raise self.computed(file, node)
 
     def _call(self, file: SourceFile, node: ast.Call, place: Place, reads: Reads) -> Part:
-        known = self._known(file, node)
+        known = self._function(file, node)
         if known.same and (node.args or node.keywords):
             inner = self.part(file, node.args[0] if node.args else node.keywords[0].value, reads)
             if inner.function or isinstance(inner.value, float) or (inner.literal and inner.reads == reads):
@@ -258,7 +259,7 @@ class ValueReader:
             )
         if not isinstance(node, ast.Name):
             return False
-        found, _ = self._project.of_name(file, node)
+        found = self._project.of_name(file, node)
         if not found:  # by ``from x import *``
             return node.id in self._namespace(file, file.module)[0]
         imported = [b for b in found if b.imported is not None and b.imported[1]]
@@ -293,36 +294,22 @@ class ValueReader:
         if isinstance(node, ast.Subscript):
             return self._element(file, node)
         if isinstance(node, ast.Name):
-            bindings, scope = project.of_name(file, node)
-            names, own = self._namespace(file, scope or file.module)
-            return self._bound(
-                file,
-                node,
-                bindings,
-                project.name_readers,
-                lambda: own[node.id] if node.id in own else names[node.id],
-            )
+            return self._bound(file, node, project.of_name(file, node))
         assert isinstance(node, ast.Attribute)
         owner = self._object(file, node.value)
         if isinstance(owner, ModuleType):
             beside = project.file(owner.__file__ or "")
             inside = project.bindings(beside, beside.module).get(node.attr, [])
-            return self._bound(file, node, inside, project.name_readers, lambda: vars(owner)[node.attr])
-        bindings = self._of_attribute(file, node)
-        return self._bound(file, node, bindings, project.attribute_readers, lambda: self._run(file, node))
+            return self._bound(file, node, inside)
+        return self._bound(file, node, self._of_attribute(file, node))
 
     def _bound(
-        self,
-        file: SourceFile,
-        node: ast.expr,
-        bindings: Sequence[Binding],
-        readers: Callable[[Binding, SourceFile, ast.AST], str | None],
-        now: Callable[[], Any],
+        self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]
     ) -> tuple[SourceFile, ast.expr, str | None]:
         code = file.code(node)
         if not bindings:
             raise Unknown(f"where `{code}` gets its value cannot be read in the file")
-        binding = bindings[0] if len(bindings) == 1 else self._of_this_run(file, node, bindings, now)
+        binding = bindings[0] if len(bindings) == 1 else self._of_this_run(file, node, bindings)
         if binding.imported is not None:
             beside = self._beside(binding) if binding.imported[1] else None
             inside = (
@@ -332,29 +319,27 @@ class ValueReader:
             )
             if not inside:
                 raise Unknown(f"`{code}` comes from {binding.dotted}, which is not one of your files")
-            others = readers(binding, file, node)
-            where, value, more = self._bound(file, node, inside, self._project.name_readers, now)
+            others = self._project.readers(binding, file, node)
+            where, value, more = self._bound(file, node, inside)
             return where, value, others or more
         if binding.value is None:
             home = "the file" if binding.file is file else binding.file.name
             raise Unknown(f"`{code}` cannot be read in {home}: {binding.why}")
-        others = readers(binding, file, node)
+        others = self._project.readers(binding, file, node)
         if isinstance(binding.node, ast.Assign) and len(binding.node.targets) > 1:
             others = others or f"line {binding.file.line(binding.node)} gives it to several names"
         return binding.file, binding.value, others
 
-    def _of_this_run(
-        self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding], now: Callable[[], Any]
-    ) -> Binding:
+    def _of_this_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
         """Of several the one whose value is the running one."""
         fitting = []
         for binding in bindings:
             try:
                 if binding.value is not None and _same(
-                    self.part(binding.file, binding.value).value, plain(now())
+                    self.part(binding.file, binding.value).value, self._value(file, node)
                 ):
                     fitting.append(binding)
-            except (Unknown, LookupError, AttributeError, ValueError):
+            except (Unknown, LookupError, AttributeError):
                 continue  # of that one nothing can be said, so it is not the one
         if len(fitting) == 1:
             return fitting[0]
