@@ -101,7 +101,7 @@ class EnvArguments(BatchArguments):
 
 def imported(names: Sequence[str]) -> tuple[str, ...]:
     """Of each ``--import``: modules, which are not imported here."""
-    from workbench.authoring.named_modules import find_module, is_module_name, not_found
+    from workbench.authoring.reference import find_module, is_module_name, not_found
 
     for name in names:
         if not is_module_name(name):

@@ -13,11 +13,11 @@ from tests.authoring.conftest import Write
 from tests.authoring.refusal import refused
 from workbench.authoring import library_names
 from workbench.authoring.load import class_of_module, import_modules, load_task, take_back
-from workbench.authoring.named_modules import find_module
 from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import (
     RecordedTask,
     class_beside,
+    find_module,
     followed_folder,
     named_file,
     why_not_there,

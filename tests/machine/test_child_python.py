@@ -19,7 +19,7 @@ ITSELF = PACKAGE / "machine" / "child_python.py"
 SHOWN = {
     PACKAGE / "machine" / "doctor.py",
     PACKAGE / "authoring" / "import_problems.py",
-    PACKAGE / "authoring" / "named_modules.py",
+    PACKAGE / "authoring" / "reference.py",
 }
 """They tell a person which interpreter this is."""
 STARTERS = {

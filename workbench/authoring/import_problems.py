@@ -11,8 +11,8 @@ from pathlib import Path
 from workbench.authoring import registry
 from workbench.authoring.library_names import files_named_like_libraries, is_own_file, named_like_library
 from workbench.authoring.modules import AuthorFinder
-from workbench.authoring.named_modules import NamedModule
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.authoring.reference import NamedModule
 
 
 def import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:

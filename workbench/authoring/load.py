@@ -13,7 +13,6 @@ import dataclasses
 import difflib
 import importlib
 import inspect
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -34,28 +33,22 @@ from workbench.authoring.modules import (
     read_source,
     set_aside,
 )
-from workbench.authoring.named_modules import (
+from workbench.authoring.problem import TaskError, is_ctrl_c, refused
+from workbench.authoring.reference import (
     NamedModule,
+    RecordedTask,
+    TaskName,
+    file_and_class,
     find_module,
     is_module_name,
     not_found,
     split_reference,
 )
-from workbench.authoring.problem import TaskError, is_ctrl_c, refused
-from workbench.authoring.reference import RecordedTask, TaskName
-from workbench.authoring.task_classes import (
-    ChosenTask,
-    Robot,
-    choose_task,
-    no_such_class,
-    shown_in_a_scene,
-)
+from workbench.authoring.task_classes import Robot, choose_task, no_such_class, shown_in_a_scene
 from workbench.authoring.task_content import source_hash
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
-
-_FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^/\\]*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -136,7 +129,8 @@ class _Load:
     """The load of the same file that this one replaced."""
     aside: SetAside | None
     """What stood in ``sys.modules`` before it; None once another load has built on this one."""
-    chosen: ChosenTask | None = None
+    cls: type[BaseEnv] | None = None
+    """What it gave."""
 
 
 _loads: dict[Path, _Load] = {}
@@ -156,11 +150,11 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
     if isinstance(reference, RecordedTask):
         return _load_recorded(reference, source or {})
     given = {str(_resolve(path)): text for path, text in (source or {}).items()}
-    if registry.environment(reference) is None and (named := split_reference(reference)) is not None:
+    if registry.environment(reference) is not None:
+        return _registered(reference)
+    if (named := split_reference(reference)) is not None:
         return _load_named(*named, given)
     file, class_name = _parse(reference)
-    if file is None:
-        return _registered(reference)
     if str(file) not in given:
         _check_file(file)
     return _load_file(file, class_name, given)
@@ -168,7 +162,7 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
 
 def with_late_imports(task: LoadedTask) -> LoadedTask:
     """`task` with those modules added that it has imported since, inside its hooks."""
-    load = None if task.file is None or not task.followed else _loads.get(task.file)
+    load = _load_of(task)
     return task if load is None else dataclasses.replace(task, **_source_fields(load.finder))
 
 
@@ -177,13 +171,17 @@ def take_back(task: LoadedTask) -> bool:
 
     Only the newest load can be taken back; False for any other, and for a task that is not followed.
     """
-    load = None if task.file is None or not task.followed else _loads.get(task.file)
+    load = _load_of(task)
     if load is None or load.aside is None or sys.modules.get(load.finder.main) is None:
         return False
-    if load.chosen is None or load.chosen.cls is not task.cls:
+    if load.cls is not task.cls:
         return False
     _revert(load)
     return True
+
+
+def _load_of(task: LoadedTask) -> _Load | None:
+    return _loads.get(task.file) if task.followed and task.file is not None else None
 
 
 def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
@@ -200,7 +198,7 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
 
 
 def import_module(name: str) -> ModuleType:
-    """Import a module that a person named, as Python does it; see `named_modules` for where it is looked for.
+    """Import a module that a person named, as Python does it; see `reference` for where it is looked for.
 
     Raises TaskError.
     """
@@ -333,20 +331,17 @@ def _revert(load: _Load) -> None:
 # --- the reference -------------------------------------------------------------------------------
 
 
-def _parse(reference: str) -> tuple[Path | None, str | None]:
-    """File and class of `reference`; (None, None) for a registered id."""
+def _parse(reference: str) -> tuple[Path, str | None]:
+    """File and class of what is no registered id."""
     if not reference.strip():
         raise refused(
             "no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1"
         )
-    if registry.environment(reference) is not None:
-        return None, None
-    match = _FILE_AND_CLASS.fullmatch(reference)
-    if match is not None and not _exists(reference):
-        name = match["cls"]
+    path, name = file_and_class(reference)
+    if name is not None and not _exists(reference):
         if not name.isidentifier():
             raise refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
-        return _resolve(match["file"]), name
+        return _resolve(path), name
     if is_module_name(reference) and not _exists(reference) and find_module(reference) is not None:
         raise refused(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
     if _looks_like_path(reference):
@@ -430,30 +425,33 @@ def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
 
     If it came from a file that `load_task` read, with the texts that were executed; else with those on disk.
     """
-    spec = registry.environment(env_id)
-    limit, kwargs = (None, {}) if spec is None else (spec.max_episode_steps, dict(spec.default_kwargs))
     for load in _loads.values():
         # A class of others that the file only imports has its own file.
         registered = any(made.cls is cls and made.name == env_id for made in load.registrations.made)
         if registered or cls.__module__ in load.finder.names:
-            file, followed, fields = load.finder.file, True, _source_fields(load.finder)
-            break
-    else:
-        file, followed, fields = None, False, _fields({}, None, Path())
-        # Of a class made without a file (in a notebook, or by type()), and of one that is shipped as bytecode only,
-        # there is no text to keep.
-        with suppress(TypeError, OSError, SyntaxError):
-            file = Path(inspect.getsourcefile(cls) or "").resolve()
-            fields = _fields({str(file): read_source(file)}, file, file.parent)
+            return _task(cls, env_id, load.finder.file, followed=True, **_source_fields(load.finder))
+    # Of a class made without a file (in a notebook, or by type()), and of one that is shipped as bytecode only,
+    # there is no text to keep.
+    with suppress(TypeError, OSError, SyntaxError):
+        file = Path(inspect.getsourcefile(cls) or "").resolve()
+        return _task(cls, env_id, file, **_fields({str(file): read_source(file)}, file, file.parent))
+    return _task(cls, env_id, None, **_fields({}, None, Path()))
+
+
+def _task(
+    cls: type[BaseEnv], env_id: str | None, file: Path | None, followed: bool = False, **known: Any
+) -> LoadedTask:
+    spec = None if env_id is None else registry.environment(env_id)
+    limit, kwargs = (None, {}) if spec is None else (spec.max_episode_steps, dict(spec.default_kwargs))
     return LoadedTask(
         cls,
-        env_id,
+        env_id or cls.__name__,
         cls.__name__,
-        file if fields["source_files"] else None,
-        **fields,
+        file,
         max_episode_steps=limit,
         default_kwargs=kwargs,
         followed=followed,
+        **known,
     )
 
 
@@ -466,15 +464,12 @@ def _registered(env_id: str) -> LoadedTask:
 def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
     finder = load.finder
     text = finder.texts[str(finder.file)]
-    load.chosen = chosen = choose_task(module, wanted, finder.file, text, load.registrations)
-    spec = None if chosen.env_id is None else registry.environment(chosen.env_id)
-    return LoadedTask(
-        cls=chosen.cls,
-        env_id=chosen.env_id or chosen.cls.__name__,
-        class_name=chosen.cls.__name__,
-        file=finder.file,
-        max_episode_steps=None if spec is None else spec.max_episode_steps,
-        default_kwargs={**({} if spec is None else spec.default_kwargs), **chosen.kwargs},
+    chosen = choose_task(module, wanted, finder.file, text, load.registrations)
+    load.cls = chosen.cls
+    task = _task(
+        chosen.cls,
+        chosen.env_id,
+        finder.file,
         followed=True,
         others=chosen.others,
         alternatives=chosen.alternatives,
@@ -483,6 +478,7 @@ def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
         named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
+    return dataclasses.replace(task, default_kwargs={**task.default_kwargs, **chosen.kwargs})
 
 
 def _source_fields(finder: AuthorFinder) -> dict[str, Any]:

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import ast
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 
 from workbench.authoring.library_names import is_library, is_own_file
 from workbench.authoring.modules import module_name, read_exactly
+from workbench.authoring.reference import find_in
 from workbench.authoring.source.text import plain_line_ends
 
 MOST_MODULES = 300
@@ -55,19 +57,14 @@ class TaskContent:
     def file_sums(self) -> dict[str, str]:
         """Name, as seen from the task's folder, to what ``sha256sum`` says of the file; the task's own file first."""
         paths = [self.main, *sorted(path for path in self.texts if path != self.main)]
-        return {self.name(path): self.sums.get(path) or text_sum(self.texts[path]) for path in paths}
+        raw = {path: self.texts[path].encode("utf-8", "surrogatepass") for path in paths}
+        return {self.name(path): self.sums.get(path) or sha256(raw[path]).hexdigest() for path in paths}
 
     @property
     def hash(self) -> str:
         """sha256 over names and texts; the same wherever the files lie."""
-        digest = sha256()
-        parts = [self.name(self.main)]
-        for path in sorted(self.texts, key=self.name):
-            parts += [self.name(path), self.texts[path]]
-        for part in parts:
-            content = part.encode("utf-8", "surrogatepass")
-            digest.update(len(content).to_bytes(8, "big") + content)
-        return digest.hexdigest()
+        named = sorted((self.name(path), text) for path, text in self.texts.items())
+        return _sum([self.name(self.main), *chain.from_iterable(named)])
 
     def name(self, path: str) -> str:
         """As seen from the task's folder."""
@@ -151,16 +148,14 @@ class _Reading:
                     for path in sorted(folder.glob("*.py")):  # what its __all__ names may be modules
                         self._add(path)
                 return
-            package, module = folder / part / "__init__.py", folder / f"{part}.py"
-            if package.is_file():
-                self._add(package)
-            elif module.is_file():
-                self._add(module)
-                return
-            elif not (folder / part).is_dir():
+            file, inside = find_in([folder], part)
+            if file is not None:
+                self._add(file)
+            elif not inside:
                 self._compiled(folder, part)
+            if not inside:
                 return
-            folder = folder / part
+            (folder,) = inside
 
     def _compiled(self, folder: Path, name: str) -> None:
         for path in sorted(folder.glob(f"{name}.*")) if name.isidentifier() else ():
@@ -193,19 +188,22 @@ def read_text(path: Path) -> str:
     return _read(path)[0]
 
 
-def text_sum(text: str) -> str:
-    """What ``sha256sum`` says of a file with this text."""
-    return sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
-
-
 def source_hash(source: Mapping[str, str], folder: Path) -> str:
     """sha256 over names relative to `folder` and texts, 12 hex digits."""
-    digest = sha256()
+    parts: list[str] = []
     for path in sorted(source):
-        name = Path(path).relative_to(folder).as_posix() if Path(path).is_relative_to(folder) else path
-        for part in (name.encode("utf-8", "surrogatepass"), source[path].encode("utf-8", "surrogatepass")):
-            digest.update(len(part).to_bytes(8, "big") + part)
-    return digest.hexdigest()[:12]
+        inside = Path(path).is_relative_to(folder)
+        parts += [Path(path).relative_to(folder).as_posix() if inside else path, source[path]]
+    return _sum(parts)[:12]
+
+
+def _sum(parts: Iterable[str]) -> str:
+    """sha256 of texts one after the other, each with its length before it."""
+    digest = sha256()
+    for part in parts:
+        content = part.encode("utf-8", "surrogatepass")
+        digest.update(len(content).to_bytes(8, "big") + content)
+    return digest.hexdigest()
 
 
 def _read(path: Path) -> tuple[str, str]:
@@ -217,12 +215,6 @@ def _read(path: Path) -> tuple[str, str]:
         raise CannotRead(f"{path} is no Python text: {error.msg}") from error
     except OSError as error:
         raise CannotRead(f"{path} cannot be read: {error.strerror or error}.") from error
-
-
-def content_of_texts(main: str, texts: Mapping[str, str]) -> TaskContent:
-    """Of the texts that a recording holds, by names below one folder: nothing else is beside them when they run."""
-    ordered = {main: texts[main], **texts}
-    return TaskContent(main, ordered)
 
 
 def _dynamic(node: ast.AST) -> str | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from workbench.authoring.reference import RecordedTask, TaskName, is_like_a_file
-from workbench.authoring.task_content import CannotRead, TaskContent, content_of_texts, read_content
+from workbench.authoring.task_content import CannotRead, TaskContent, read_content
 from workbench.authoring.trust import TrustStore
 from workbench.machine.terminal_text import short_line
 from workbench.recording.episode import EpisodeInfo
@@ -354,7 +354,8 @@ def recorded_content(info: EpisodeInfo) -> TaskContent:
     """
     if not info.source or info.source_file is None:
         raise NoText("this recording does not hold the text of its task")
-    return content_of_texts(*below_one_folder(info.source_file, info.source))
+    main, texts = below_one_folder(info.source_file, info.source)
+    return TaskContent(main, {main: texts[main], **texts})
 
 
 def _approved(wanted: Wanted, content: TaskContent) -> TaskName:
