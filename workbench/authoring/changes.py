@@ -171,26 +171,21 @@ class _Comparison:
         """What may run while the file is imported or the env is built."""
         found: set[Key] = set()
         siblings = self._both.siblings(family)
-        for key, versions in self._both.of.items():
-            for symbol in versions:
-                if key in siblings or (symbol.path, symbol.owner) in siblings:
-                    continue
-                foreign_member = symbol.owner is not None and (symbol.path, symbol.owner) not in family
-                if symbol.kind in ("statements", "class") or foreign_member:
-                    # A robot is found by its uid, an enum's members by their place: nobody need name them.
-                    found.add(key)
-                elif symbol.owner is None:
-                    decorated = any(getattr(node, "decorator_list", ()) for node in symbol.nodes)
-                    found |= {key} if decorated else set()
-                else:
-                    name = symbol.short
-                    special = name.startswith("__") and name.endswith("__")
-                    inherits = special or name in self._inherited.names
-                    if name not in _RUNS_LATER | CAMERA_HOOKS:
-                        if inherits or name in self._inherited.used_at_build:
-                            found.add(key)
-                    elif symbol.kind != "function":
-                        found.add(key)
+        for symbol in self._both.symbols:
+            if symbol.key in siblings or (symbol.path, symbol.owner) in siblings:
+                continue
+            foreign_member = symbol.owner is not None and (symbol.path, symbol.owner) not in family
+            if symbol.kind in ("statements", "class") or foreign_member:
+                # A robot is found by its uid, an enum's members by their place: nobody need name them.
+                runs = True
+            elif symbol.owner is None:
+                runs = any(getattr(node, "decorator_list", ()) for node in symbol.nodes)
+            elif (name := symbol.short) in _RUNS_LATER | CAMERA_HOOKS:
+                runs = symbol.kind != "function"
+            else:
+                special = name.startswith("__") and name.endswith("__")
+                runs = special or name in self._inherited.names or name in self._inherited.used_at_build
+            found |= {symbol.key} if runs else set()
         return found
 
     def _refuse_if_built_of_it(self, family: set[Key]) -> None:
@@ -240,20 +235,16 @@ class _Comparison:
                 for name in sorted(_PECULIAR):
                     if (symbol.path, f"{symbol.name}.{name}") in self._both.of:
                         raise _Heavier(f"the class {symbol.name} has {name}")
-        for versions in self._both.of.values():
-            for symbol in versions:
-                # A library's names, whatever they are, reach nothing of the author's.
-                from_library = symbol.kind == "import" and symbol.shorts <= self._both.libraries
-                if symbol.dynamic is not None and not from_library:
-                    raise _Heavier(
-                        f"{self._say(symbol.key)} uses `{symbol.dynamic}`, which may reach anything"
-                    )
+        for symbol in self._both.symbols:
+            # A library's names, whatever they are, reach nothing of the author's.
+            from_library = symbol.kind == "import" and symbol.shorts <= self._both.libraries
+            if symbol.dynamic is not None and not from_library:
+                raise _Heavier(f"{self._say(symbol.key)} uses `{symbol.dynamic}`, which may reach anything")
 
     # --- what may outlive an exchange of the code -----------------------------------------------------
 
     def _refuse_kept_between_calls(self, family: set[Key]) -> None:
-        every = [symbol for versions in self._both.of.values() for symbol in versions]
-        found = changed_while_running(every, self._both.libraries)
+        found = changed_while_running(self._both.symbols, self._both.libraries)
         if found is not None:
             value, code = found
             raise _Heavier(
@@ -286,18 +277,18 @@ class _Comparison:
 
     def _refuse_cameras_of_the_moment(self, seen: Collection[Key]) -> None:
         """Cameras that are made now must be those that would have been made when the scene was."""
-        for key, versions in self._both.of.items():
-            for symbol in versions:
-                if key not in seen:
-                    for name in sorted(symbol.mentions & _CAMERAS_THEMSELVES):
-                        raise _Heavier(f"{self._say(key)} uses {name}, so cameras are not as configured")
-                    continue
-                for name in sorted(symbol.mentions & _DRAWS):
-                    raise _Heavier(f"{self._say(key)} uses {name}: the cameras would be drawn anew")
-                for node in (node for part in symbol.nodes for node in ast.walk(part)):
-                    moves = isinstance(node, ast.Attribute) and node.attr in _MOVES
-                    if moves and root_name(node) == "self":
-                        raise _Heavier(f"{self._say(key)} looks where something is when the scene is built")
+        for symbol in self._both.symbols:
+            said = self._say(symbol.key)
+            if symbol.key not in seen:
+                for name in sorted(symbol.mentions & _CAMERAS_THEMSELVES):
+                    raise _Heavier(f"{said} uses {name}, so cameras are not as configured")
+                continue
+            for name in sorted(symbol.mentions & _DRAWS):
+                raise _Heavier(f"{said} uses {name}: the cameras would be drawn anew")
+            for node in (node for part in symbol.nodes for node in ast.walk(part)):
+                moves = isinstance(node, ast.Attribute) and node.attr in _MOVES
+                if moves and root_name(node) == "self":
+                    raise _Heavier(f"{said} looks where something is when the scene is built")
 
     # --- words --------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ call a method on it that changes it, or take it whole to where that cannot be se
 from __future__ import annotations
 
 import ast
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Literal
 
 from workbench.authoring.remembers import changes_in_place, root_name
@@ -27,10 +27,9 @@ _DRAWS = ("random", "rng", "generator", "count", "cycle", "iter", "randomstate",
 
 
 def changed_while_running(
-    symbols: Iterable[Symbol], libraries: Collection[str]
+    symbols: Sequence[Symbol], libraries: Collection[str]
 ) -> tuple[Symbol, Symbol] | None:
     """A value that may be changed while the task runs, and the code that may; None if there is none."""
-    symbols = list(symbols)
     values = {symbol.short: symbol for symbol in symbols if symbol.kind == "value"}
     natures: dict[str, _Nature] = {}
     for symbol in symbols:

@@ -15,7 +15,7 @@ import linecache
 import re
 import traceback as tracebacks
 from bdb import BdbQuit
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -153,7 +153,9 @@ def problem_from_exception(
                 message = shorten(f"{message} (from {_message(link)})")
             break
     else:
-        place = None if cls is None else _hook_definition(cls, stage_found, own)
+        hooks = () if stage_found in ("build", "step") else hooks_of(stage_found)
+        found = None if cls is None else hook_definition(cls, hooks, own_files)
+        place = None if found is None else found[1]
     file, line = place if place is not None else (None, None)
     code = None
     if file is not None and line is not None:
@@ -212,13 +214,16 @@ def definition_line(function: object) -> tuple[str, int] | None:
     return code.co_filename, code.co_firstlineno
 
 
-def hook_definition(cls: type, name: str, own_files: Collection[Path]) -> tuple[str, int] | None:
-    """Where the author's files define the method `name` of `cls`; None when they inherit it."""
+def hook_definition(
+    cls: type, hooks: Iterable[str], own_files: Collection[Path]
+) -> tuple[str, tuple[str, int]] | None:
+    """The first of these methods of `cls` that the author's files define, and where; None when they inherit all."""
     own = {str(path) for path in own_files}
-    for base in cls.__mro__:
-        if name in vars(base):
-            place = definition_line(vars(base)[name])
-            return place if place is not None and place[0] in own else None
+    for name in hooks:
+        method = next((vars(base)[name] for base in cls.__mro__ if name in vars(base)), None)
+        place = definition_line(method)
+        if place is not None and place[0] in own:
+            return name, place
     return None
 
 
@@ -255,37 +260,18 @@ def _chain(exc: BaseException) -> Iterator[BaseException]:
             link = None if link.__suppress_context__ else link.__context__
 
 
-def _frames(exc: BaseException) -> Iterator[tuple[FrameType, int]]:
-    trace = exc.__traceback__
-    while trace is not None:
-        yield trace.tb_frame, trace.tb_lineno
-        trace = trace.tb_next
-
-
 def _innermost(exc: BaseException, own: Collection[str]) -> tuple[str, int] | None:
-    place = None
-    for frame, line in _frames(exc):
-        if frame.f_code.co_filename in own:
-            place = frame.f_code.co_filename, line
-    return place
+    places = [(frame.f_code.co_filename, line) for frame, line in tracebacks.walk_tb(exc.__traceback__)]
+    return next((place for place in reversed(places) if place[0] in own), None)
 
 
 def _stage_of(exc: BaseException, stage: str) -> str:
     for link in _chain(exc):
-        names = [frame.f_code.co_name for frame, _ in _frames(link)]
+        names = [frame.f_code.co_name for frame, _ in tracebacks.walk_tb(link.__traceback__)]
         hooks = [name for name in names if name in HOOK_STAGES]
         if hooks:
             return HOOK_STAGES[hooks[-1]]
     return stage
-
-
-def _hook_definition(cls: type, stage: str, own: Collection[str]) -> tuple[str, int] | None:
-    paths = [Path(name) for name in own]
-    for name in () if stage in ("build", "step") else hooks_of(stage):
-        place = hook_definition(cls, name, paths)
-        if place is not None:
-            return place
-    return None
 
 
 def _is_machinery(frame: FrameType) -> bool:

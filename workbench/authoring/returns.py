@@ -53,15 +53,10 @@ def problem_from_return(cls: type, hook: str, message: str, source_files: Collec
     A reward is told at the hook that the author defined: ManiSkill asks for a normalized one, and the
     author's dense one may be behind it.
     """
-    hooks = (hook,)
-    if hook in _REWARD_HOOKS:
-        hooks = (
-            tuple(name for name in _REWARD_HOOKS if hook_definition(cls, name, source_files)) or _REWARD_HOOKS
-        )
-    for hook in hooks:
-        place = hook_definition(cls, hook, source_files)
-        if place is not None:
-            file, line = place
-            code = linecache.getline(file, line).strip() or None
-            return Problem("returns", f"{hook}() {message}", file, line, code, "")
-    return Problem("returns", f"{hooks[0]}() {message}", None, None, None, "")
+    hooks = _REWARD_HOOKS if hook in _REWARD_HOOKS else (hook,)
+    found = hook_definition(cls, hooks, source_files)
+    if found is None:
+        return Problem("returns", f"{hooks[0]}() {message}", None, None, None, "")
+    name, (file, line) = found
+    code = linecache.getline(file, line).strip() or None
+    return Problem("returns", f"{name}() {message}", file, line, code, "")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 
@@ -46,22 +46,19 @@ class TrustStore:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._of_this_run: set[str] = set()
-        self._followed_in_this_run: set[tuple[str, str]] = set()
+        self._of_this_run: list[_Entry] = []
         self._told: set[str] = set()
 
     def trusts(self, content: TaskContent) -> bool:
         """Whether this very text may run."""
         with self._lock:
-            return content.hash in self._of_this_run or any(e.hash == content.hash for e in self._read())
+            return any(e.hash == content.hash for e in self._all())
 
     def follows(self, content: TaskContent) -> bool:
         """Whether what is saved to this file, beginning with this text, may run too."""
-        key = content.hash, content.main
+        key = content.hash, content.main, True
         with self._lock:
-            return key in self._followed_in_this_run or any(
-                (e.hash, e.file) == key and e.followed for e in self._read()
-            )
+            return any((e.hash, e.file, e.followed) == key for e in self._all())
 
     def trusted_before(self, content: TaskContent) -> Mapping[str, str] | None:
         """The `TaskContent.file_sums` of another text of the same file that was trusted last; None if none was.
@@ -75,14 +72,14 @@ class TrustStore:
     def trust_once(self, content: TaskContent, followed: bool = False) -> None:
         """Until the program ends."""
         with self._lock:
-            self._add_to_this_run(content, followed)
+            self._of_this_run.append(_Entry(content.hash, content.main, "", followed))
 
     def trust(self, content: TaskContent, followed: bool = False) -> None:
         """From now on, in every run."""
         now = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
         entry = _Entry(content.hash, content.main, now, followed, content.file_sums)
         with self._lock:
-            self._add_to_this_run(content, followed)
+            self._of_this_run.append(entry)
             try:
                 with locked(STORE_FILE):
                     kept = [known for known in self._read(mend=True) if known.hash != entry.hash]
@@ -90,10 +87,10 @@ class TrustStore:
             except OSError as error:
                 self._tell(f"What you trust cannot be kept, and is asked again in the next run: {error}")
 
-    def _add_to_this_run(self, content: TaskContent, followed: bool) -> None:
-        self._of_this_run.add(content.hash)
-        if followed:
-            self._followed_in_this_run.add((content.hash, content.main))
+    def _all(self) -> Iterator[_Entry]:
+        """The disk is asked last, and only for what was not said in this run."""
+        yield from self._of_this_run
+        yield from self._read()
 
     def _read(self, mend: bool = False) -> list[_Entry]:
         """What is kept; with `mend`, for writing it again: a broken store is set aside, and OSError is raised."""

@@ -35,6 +35,7 @@ class TwoVersions:
             self.of.setdefault(symbol.key, []).append(symbol)
             for name in symbol.shorts:
                 self._named.setdefault(name, set()).add(symbol.key)
+        self.symbols = [symbol for versions in self.of.values() for symbol in versions]
         self._reached: dict[Key, set[Key]] = {}
         self.changed = [
             key
@@ -102,16 +103,15 @@ class TwoVersions:
     def _imported_libraries(self, files: Collection[str]) -> frozenset[str]:
         stems = {PurePath(path).stem for path in files} | {PurePath(p).parent.name for p in files}
         found: set[str] = set()
-        for versions in self.of.values():
-            for symbol in versions:
-                for node in symbol.nodes if symbol.kind == "import" else ():
-                    if isinstance(node, ast.ImportFrom):
-                        parts = {*(node.module or "").split("."), *(alias.name for alias in node.names)}
-                        own = node.level > 0 or bool(parts & stems)
-                    else:
-                        assert isinstance(node, ast.Import)
-                        own = any(set(alias.name.split(".")) & stems for alias in node.names)
-                    found |= set() if own else symbol.shorts
+        for symbol in self.symbols:
+            for node in symbol.nodes if symbol.kind == "import" else ():
+                if isinstance(node, ast.ImportFrom):
+                    parts = {*(node.module or "").split("."), *(alias.name for alias in node.names)}
+                    own = node.level > 0 or bool(parts & stems)
+                else:
+                    assert isinstance(node, ast.Import)
+                    own = any(set(alias.name.split(".")) & stems for alias in node.names)
+                found |= set() if own else symbol.shorts
         return frozenset(found)
 
 
