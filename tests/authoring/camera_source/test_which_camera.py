@@ -275,6 +275,31 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
     assert any("more.py" in note for note in plan.notes)
 
 
+def test_a_constant_of_a_class_that_a_method_reads_too_is_left_as_it_is() -> None:
+    source = HEADER + dedent(
+        """\
+        class Task(Base):
+            EYE = [0.5, 0, 0.5]
+            POSE = sapien.Pose(EYE)
+
+            @property
+            def _default_sensor_configs(self):
+                return [CameraConfig("cam", self.POSE, 64, 64, 1.0)]
+
+            def _load_scene(self, options):
+                self.lamp.set_pose(sapien.Pose(self.EYE))
+        """
+    )
+    before = real_settings({FILE: source}, "cam")
+    plan = planned(plan_edit, {FILE: source}, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, SourceEdit), plan
+    assert "EYE = [0.5, 0, 0.5]\n" in plan.new_text and "POSE = sapien.Pose([0.5, 0, 0.75])" in plan.new_text
+    assert "also read elsewhere" in plan.notes[0]
+    alone = source[: source.index("    def _load_scene")]
+    plan = planned(plan_edit, {FILE: alone}, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, SourceEdit) and "EYE = [0.5, 0, 0.75]" in plan.new_text
+
+
 def test_a_change_that_would_not_be_seen_in_what_is_written_is_refused() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     after = dataclasses.replace(before, position=(0.5, 0.0, 0.50003))
