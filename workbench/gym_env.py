@@ -35,8 +35,8 @@ from mani_skill.envs.utils.observations import CameraObsTextures
 
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, class_of_module, load_task, task_of_class
-from workbench.authoring.reference import split_reference
 from workbench.authoring.problem import definition_line
+from workbench.authoring.reference import split_reference
 from workbench.core.backends import BackendUnavailable, find_renderer
 from workbench.core.broken_rule import class_is_installed, is_installed
 from workbench.core.rules import Degree
