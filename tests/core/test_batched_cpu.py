@@ -160,6 +160,15 @@ def test_a_pose_with_nan_is_refused_with_the_name_of_the_body(pick_cubes: BaseEn
     pick_cubes.scene._gpu_fetch_all()
 
 
+def test_a_velocity_of_what_the_task_moves_itself_is_not_given_to_physx(pick_cubes: BaseEnv) -> None:
+    pick_cubes.reset(seed=[0, 1, 2, 3])
+    for actor in (pick_cubes.goal_site, pick_cubes.cube):
+        actor.set_linear_velocity(torch.full((4, 3), 0.5))
+    pick_cubes.scene._gpu_apply_all()
+    assert not any(body.linear_velocity.any() for body in pick_cubes.goal_site._bodies)
+    assert all((body.linear_velocity == 0.5).all() for body in pick_cubes.cube._bodies)
+
+
 def test_state_may_not_be_read_while_the_scene_is_loaded() -> None:
     class ReadsTooEarly(REGISTERED_ENVS["PickCube-v1"].cls):
         def _load_scene(self, options: dict) -> None:
