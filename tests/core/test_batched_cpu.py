@@ -13,6 +13,7 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
@@ -167,6 +168,23 @@ def test_a_velocity_of_what_the_task_moves_itself_is_not_given_to_physx(pick_cub
     pick_cubes.scene._gpu_apply_all()
     assert not any(body.linear_velocity.any() for body in pick_cubes.goal_site._bodies)
     assert all((body.linear_velocity == 0.5).all() for body in pick_cubes.cube._bodies)
+
+
+def test_every_number_of_the_first_body_of_all_is_read() -> None:
+    class MarkerFirst(REGISTERED_ENVS["PickCube-v1"].cls):
+        def _load_scene(self, options: dict) -> None:
+            builder = self.scene.create_actor_builder()
+            builder.add_sphere_visual(radius=0.02)
+            builder.initial_pose = sapien.Pose([0.1, 0.2, 0.3], [0.1, 0.3, 0.5, 0.65**0.5])
+            self.marker = builder.build_kinematic(name="marker")
+            super()._load_scene(options)
+
+    env = batched_class(MarkerFirst)(num_envs=2, **STATE_ONLY)
+    env.reset(seed=[0, 1])
+    env.step(np.zeros((2, 8), np.float32))
+    expected = torch.tensor([[0.1, 0.2, 0.3, 0.1, 0.3, 0.5, 0.65**0.5]] * 2)
+    torch.testing.assert_close(env.marker.pose.raw_pose, expected)
+    env.close()
 
 
 def test_state_may_not_be_read_while_the_scene_is_loaded() -> None:

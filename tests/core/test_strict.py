@@ -288,6 +288,33 @@ def test_state_read_before_it_is_fetched_is_told_at_its_line(hook: str, read: Ho
     run(pick_cube(**{hook: fetch_and_look})).close()
 
 
+def test_state_read_between_merged_substeps_is_told_as_between_others() -> None:
+    env = build(pick_cube())
+    env.reset(seed=[0, 1, 2])
+    env.step(ACTION)
+    px = env.scene.px
+    with px.merging(5):
+        px.step()
+        with pytest.raises(BrokenRule, match="is read after the simulation moved on"):
+            _ = env.agent.robot.qpos
+    env.close()
+
+
+def test_the_velocity_of_a_robots_root_may_be_read_of_the_robot() -> None:
+    seen = []
+    keeps(pick_cube(evaluate=lambda self: seen.append(self.agent.robot.root_linear_velocity)))
+    assert seen and all(velocity.shape == (N, 3) for velocity in seen)
+
+
+def test_a_step_computes_where_links_are_after_a_qpos_that_was_applied() -> None:
+    def put(self: Any) -> None:
+        self.agent.robot.set_qpos(self.agent.robot.qpos + 0.01)
+        self.scene._gpu_apply_all()
+        self.scene._gpu_fetch_all()
+
+    keeps(pick_cube(_before_control_step=put, evaluate=lambda self: self.agent.tcp.pose and None))
+
+
 def test_a_link_read_after_qpos_was_set_is_told() -> None:
     def look(self: Any, env_idx: torch.Tensor, options: dict) -> None:
         self.agent.robot.set_qpos(torch.full((len(env_idx), 9), 0.2))

@@ -190,6 +190,7 @@ def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_dif
     assert judgement.names() == (("reward", "success", "height"), frozenset())
     judgement.add(3, replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32)))
     first, second = judgement.verdicts()
+    assert judgement.verdicts()[0] is first, "what nothing was added to is not compared again"
     assert first.of.env == 0 and first.differing == ("reward",) and np.isinf(first.largest)
     assert first.look_at is not None and first.of.at(first.look_at) == 3
     assert second.of.name == "env 1" and not second.differs
