@@ -12,6 +12,7 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.scenes import running
+from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 from workbench.session.timeline import TimelineView
 from workbench.session.view import SessionView
@@ -189,3 +190,43 @@ def test_one_moment_alone_has_nothing_to_slide_along(lived: Lived) -> None:
     assert "1 step<" in lived.strip()
     lived.step(1)
     assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)
+
+
+def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
+    lived: Lived, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lived.step(3)
+    lived.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
+    lived.session.past.seek(1)
+    assert lived.past.wants_pictures
+    asked: list[int | None] = []
+    monkeypatch.setattr(lived.session.past, "draw", lambda: asked.append(lived.past.shown))
+    lived.page.redraw()
+    lived.clock.passes(0.3)
+    lived.page.redraw()
+    lived.session.past.seek(2)
+    for _ in range(2):
+        lived.page.redraw()
+        lived.clock.passes(0.3)
+    assert asked == [], "whoever drags draws none"
+    lived.page.redraw()
+    assert asked == [2]
+
+
+def test_home_is_the_left_end_of_the_slider(lived: Lived) -> None:
+    lived.step(3)
+    lived.panels.command("The first moment")
+    assert lived.past.shown == 0
+    last = lived.past.last
+    lived.panels.command("Reset all envs")
+    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
+    lived.step(2)
+    lived.panels.choose(panel.EPISODE)
+    lived.panels.command("What is live")
+    lived.draw()
+    lived.panels.command("The first moment")
+    assert lived.past.shown == 4
+    lived.panels.command("To the event before")
+    assert lived.past.shown == 0
+    lived.panels.command("To the next event")
+    assert lived.past.shown == 4

@@ -1,16 +1,25 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.ui.scenes import running
-from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.timeline import Strip, TimelineView
 from workbench.ui.fragments import render
 from workbench.ui.timeline_panel import LINE_HEIGHT as HEIGHT
-from workbench.ui.timeline_panel import POINTS, reward_lines, strip_html
+from workbench.ui.timeline_panel import (
+    POINTS,
+    megabytes,
+    polylines,
+    reward_lines,
+    step_in_words,
+    strip_html,
+    where,
+)
 
 
 def strip(**changes: object) -> Strip:
@@ -96,7 +105,7 @@ def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     (line,) = reward_lines(reward)
     points = [tuple(map(float, point.split(","))) for point in line.split()]
     assert len(points) <= POINTS
-    assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT
+    assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT == 30.0
     assert all(0 <= x <= 100 for x, _ in points)
 
 
@@ -126,3 +135,32 @@ def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
 def test_fail_is_drawn_before_success() -> None:
     html = strip_html(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
     assert [style for _, style, _ in marks(html)] == ["fail"]
+
+
+def test_of_very_many_events_the_newest_are_drawn() -> None:
+    events = ((100, NOT_A_NUMBER), (101, FAIL), *((102 + k, RESET) for k in range(97)), *((199, RESET),) * 52)
+    html = strip_html(strip(events=events, branches=()), running(4, timeline=past()))
+    assert len(marks(html)) == 150 and [style for _, style, _ in marks(html)[:2]] == ["fail", "reset"]
+    both = strip_html(strip(events=((190, NOT_A_NUMBER | RESET),)), running(4, timeline=past()))
+    assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
+
+
+def test_where_one_is_is_said_as_far_as_it_is_known() -> None:
+    view = running(2, selected_env=1)
+    assert view.task is not None
+    assert where(view) == "env 1: step 7 / 50, 0.35 s" and step_in_words(view) == "env 1: step 7 / 50"
+    assert step_in_words(replace(view, task=replace(view.task, max_episode_steps=None))) == "env 1: step 7"
+    assert step_in_words(running(1)) == "step 7 / 50"
+    for unknown in (replace(view, task=None), replace(view, step=None), running(2, selected_env=2)):
+        assert step_in_words(unknown) == where(unknown) == ""
+
+
+def test_sizes_have_a_digit_more_below_ten() -> None:
+    sizes = (0, 0.05, 9.94, 10, 255.6)
+    assert [megabytes(round(size * 1024**2)) for size in sizes] == ["0.0", "0.1", "9.9", "10", "256"]
+
+
+def test_a_point_alone_is_a_dot() -> None:
+    points = ["1,1", None, "2,2", "3,3", None, None, "4,4"]
+    assert polylines(points) == ["1,1 1,1", "2,2 3,3", "4,4 4,4"]
+    assert polylines([None, None]) == [] == polylines([])
