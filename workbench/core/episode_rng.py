@@ -17,7 +17,7 @@ from __future__ import annotations
 import ctypes
 import random
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,8 +31,7 @@ RngState = tuple[Any, ...]
 """What ``RandomState.get_state()`` gives."""
 
 
-@dataclass(frozen=True)
-class SharedRng:
+class SharedRng(NamedTuple):
     """The generators of the process."""
 
     torch_cpu: np.ndarray

@@ -34,7 +34,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -54,8 +54,7 @@ from workbench.core.gpu_state import GpuState, read_gpu_state, write_gpu_state
 from workbench.core.task_buffers import TaskState, read_task_state, write_task_state
 
 
-@dataclass(frozen=True)
-class Memory:
+class Memory(NamedTuple):
     """What is not in the simulation: n envs of a batch of N."""
 
     elapsed_steps: NDArray[np.int32]
@@ -68,8 +67,7 @@ class Memory:
     shared_rng: SharedRng
 
 
-@dataclass(frozen=True)
-class Snapshot:
+class Snapshot(NamedTuple):
     """Chosen envs at one moment. Holds copies only: it can be pickled, and outlives its env."""
 
     num_envs: int

@@ -86,9 +86,6 @@ class Writes:
         if self._kept:
             self._kept = [write for write in self._kept if write.group != group]
 
-    def forget_all(self) -> None:
-        self._kept.clear()
-
     def frames(self, group: Group, rows: NDArray[np.int64]) -> tuple[Frame, ...]:
         """Of the last to write one of these rows, or to take the whole tensor; empty if none is known."""
         for write in reversed(self._kept):
@@ -131,7 +128,6 @@ class StrictCpuSystem(BatchedCpuSystem):
     def gpu_init(self) -> None:
         super().gpu_init()
         self._stale.clear()
-        self._writes.forget_all()
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
         # Called for every joint in every control step, and the core's own: past the guard of behind_tensors.

@@ -22,21 +22,21 @@ stay one. What cannot be carried is named, with the reason.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
-from weakref import WeakKeyDictionary
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
 
+from workbench.core.scene_index import once_a_scene
 from workbench.core.task_members import PLAIN, Found, look_over
 
 _LARGEST_OF_BATCH = 1 << 16
 """Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
 
 
-@dataclass(frozen=True)
-class Buffer:
+class Buffer(NamedTuple):
     """One value that was found, as it was."""
 
     values: Any
@@ -45,9 +45,13 @@ class Buffer:
     dtype: torch.dtype | None
     """Of a tensor; None for what is none."""
 
+    def is_as(self, other: Buffer) -> bool:
+        """Whether both are equal to the last bit."""
+        kind = self.per_env, self.dtype
+        return kind == (other.per_env, other.dtype) and _equal(self.values, other.values)
 
-@dataclass(frozen=True)
-class TaskState:
+
+class TaskState(NamedTuple):
     """What a task, its robots and their controllers remembered."""
 
     buffers: dict[str, Buffer]
@@ -63,11 +67,11 @@ class _Mark:
     """A value as it was when the scene was built."""
 
     value: Any
-    """The tensor or the plain value itself, a copy of an array or list."""
+    """Itself."""
     version: int
-    """How often the tensor had been written, as torch counts."""
-    copy: torch.Tensor | None
-    """What was in the tensor."""
+    """How often a tensor had been written, as torch counts."""
+    kept: Buffer
+    """What was in it."""
 
 
 @dataclass
@@ -77,22 +81,21 @@ class _Scene:
     marks: dict[str, _Mark] = field(default_factory=dict)
     paths: frozenset[str] = frozenset()
 
-    def add(self, leaves: list[Found]) -> None:
-        self.marks |= {leaf.path: _mark(leaf.value) for leaf in leaves}
+    def add(self, env: BaseEnv, leaves: list[Found]) -> None:
+        for leaf in leaves:
+            version = version_of(leaf.value) if isinstance(leaf.value, torch.Tensor) else 0
+            self.marks[leaf.path] = _Mark(leaf.value, version, _kept(leaf.value, env.num_envs))
         self.paths = frozenset(self.marks)
 
 
-_scenes: WeakKeyDictionary[Any, _Scene] = WeakKeyDictionary()
-
-
+@once_a_scene
 def _scene_of(env: BaseEnv) -> _Scene:
-    return _scenes.setdefault(env.scene, _Scene())
+    return _Scene()
 
 
 def note_scene(env: BaseEnv) -> None:
     """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
-    _scenes[env.scene] = scene = _Scene()
-    scene.add(look_over(env).leaves)
+    _scene_of(env).add(env, look_over(env).leaves)
 
 
 def note_constructed(env: BaseEnv) -> None:
@@ -100,43 +103,38 @@ def note_constructed(env: BaseEnv) -> None:
 
     An env made of the edited file would otherwise be given the old file's ``self.threshold = 0.02``.
     """
-    scene = _scene_of(env)
-    scene.add([leaf for leaf in look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
+    plain = [leaf for leaf in look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))]
+    _scene_of(env).add(env, plain)
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
     """Copies of what the task remembers about the envs in `env_idx`, and of what holds for the batch."""
     walk = look_over(env)
     scene = _scene_of(env)
-    chosen = np.array(env_idx, dtype=np.int64)
-    rows: Any = slice(None) if env_idx == list(range(env.num_envs)) else torch.from_numpy(chosen)
     buffers: dict[str, Buffer] = {}
     omitted = dict(walk.omitted)
+    chosen = None if env_idx == list(range(env.num_envs)) else np.array(env_idx, np.int64)
     for leaf in walk.leaves:
         value = leaf.value
         if not _changed(value, scene.marks.get(leaf.path)):
             continue
-        per_env = is_per_env(value, env.num_envs)
-        if isinstance(value, torch.Tensor):
-            if per_env:
-                kept = value.detach()[rows]
-            elif value.numel() <= _LARGEST_OF_BATCH:
-                kept = value.detach()
-            else:
-                omitted[leaf.path] = f"a tensor {tuple(value.shape)} that has no row for each env"
-                continue
-            kept = kept.float() if kept.dtype == torch.bfloat16 else kept
-            # Always a copy: `rows` may be a slice, and `.cpu()` gives the tensor itself when it is there.
-            buffers[leaf.path] = Buffer(kept.cpu().numpy().copy(), per_env, value.dtype)
-        elif isinstance(value, np.ndarray):
-            buffers[leaf.path] = Buffer(value[chosen] if per_env else value.copy(), per_env, None)
-        elif isinstance(value, list):
-            buffers[leaf.path] = Buffer(
-                [value[i] for i in env_idx] if per_env else value.copy(), per_env, None
-            )
+        whole = isinstance(value, torch.Tensor) and not is_per_env(value, env.num_envs)
+        if whole and value.numel() > _LARGEST_OF_BATCH:
+            omitted[leaf.path] = f"a tensor {tuple(value.shape)} that has no row for each env"
         else:
-            buffers[leaf.path] = Buffer(value, False, None)
+            buffers[leaf.path] = _kept(value, env.num_envs, chosen)
     return TaskState(buffers, scene.paths, omitted)
+
+
+def _kept(value: Any, num_envs: int, env_idx: NDArray[np.int64] | None = None) -> Buffer:
+    """A copy of a value; of what has a row for each env, the rows of these, or of all."""
+    per_env, dtype = is_per_env(value, num_envs), None
+    if per_env and env_idx is not None:
+        value = [value[i] for i in env_idx] if isinstance(value, list) else value[env_idx]
+    if isinstance(value, torch.Tensor):
+        value, dtype = value.detach(), value.dtype
+        value = (value.float() if dtype == torch.bfloat16 else value).cpu().numpy()
+    return Buffer(value.copy() if isinstance(value, (np.ndarray, list)) else value, per_env, dtype)
 
 
 def write_task_state(
@@ -169,7 +167,7 @@ def write_task_state(
                 if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
                     missed[leaf.path] = "the snapshot has none of this name: left as it is"
                 continue
-            kept, chosen = _as_built(mark, env.num_envs), env_idx
+            kept, chosen = mark.kept, env_idx
         if id(value) in replaced and isinstance(value, (torch.Tensor, np.ndarray)):
             leaf.put(replaced[id(value)][1])
             carried[leaf.path] = None
@@ -241,12 +239,6 @@ def _as_found(kept: Buffer, env: BaseEnv) -> Any:
     return kept.values.copy() if isinstance(kept.values, (np.ndarray, list)) else kept.values
 
 
-def _as_built(mark: _Mark, num_envs: int) -> Buffer:
-    if mark.copy is not None:
-        return Buffer(mark.copy.cpu().numpy(), is_per_env(mark.copy, num_envs), mark.copy.dtype)
-    return Buffer(mark.value, is_per_env(mark.value, num_envs), None)
-
-
 # --- comparing -------------------------------------------------------------------------------------
 
 
@@ -254,13 +246,6 @@ def is_per_env(value: Any, num_envs: int) -> bool:
     if isinstance(value, (torch.Tensor, np.ndarray)):
         return value.ndim > 0 and value.shape[0] == num_envs
     return isinstance(value, list) and len(value) == num_envs
-
-
-def _mark(value: Any) -> _Mark:
-    if isinstance(value, torch.Tensor):
-        copy = value.detach().clone()
-        return _Mark(value, version_of(value), copy.float() if copy.dtype == torch.bfloat16 else copy)
-    return _Mark(value.copy() if isinstance(value, (np.ndarray, list)) else value, 0, None)
 
 
 def _changed(value: Any, mark: _Mark | None) -> bool:
@@ -271,16 +256,17 @@ def _changed(value: Any, mark: _Mark | None) -> bool:
         return False
     if isinstance(value, torch.Tensor):
         return value is not mark.value or version_of(value) != mark.version
-    return not _equal(value, mark.value)
+    return type(value) is not type(mark.value) or not _equal(value, mark.kept.values)
 
 
 def version_of(tensor: torch.Tensor) -> int:
-    return 0 if tensor.is_inference() else tensor._version
+    """How often it was written, as torch counts; below 0 where torch does not."""
+    return -1 if tensor.is_inference() else tensor._version
 
 
 def _equal(a: Any, b: Any) -> bool:
     if type(a) is not type(b):
         return False
     if isinstance(a, np.ndarray):
-        return a.shape == b.shape and a.tobytes() == b.tobytes()
+        return (a.shape, a.dtype) == (b.shape, b.dtype) and a.tobytes() == b.tobytes()
     return a is b or a == b

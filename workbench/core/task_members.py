@@ -25,6 +25,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
 from workbench.core.seams import task_class
+from workbench.core.strict_system import TENSORS
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 """Values that cannot change, so that keeping them is a copy."""
@@ -40,14 +41,6 @@ _NOT_ENTERED = (
 )
 """Packages whose objects belong to the simulation or hold no state of an episode."""
 _DEEPEST = 8
-_SIMULATION_TENSORS = (
-    "cuda_rigid_body_data",
-    "cuda_articulation_qpos",
-    "cuda_articulation_qvel",
-    "cuda_articulation_qf",
-    "cuda_articulation_target_qpos",
-    "cuda_articulation_target_qvel",
-)
 
 
 @dataclass
@@ -82,7 +75,7 @@ def look_over(env: BaseEnv) -> Walk:
     walk.entered[id(env)] = env
     walk.simulation = frozenset(
         array.torch().untyped_storage().data_ptr()
-        for array in (getattr(env.scene.px, name, None) for name in _SIMULATION_TENSORS)
+        for array in (getattr(env.scene.px, name, None) for name in TENSORS)
         if array is not None
     )
     _enter_members(walk, env, "", base_env_members(), 0)

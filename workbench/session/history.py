@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraKind, Picture
-from workbench.core.snapshot_bytes import WholeSnapshot
+from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.curves import Columns, RecentSteps
 from workbench.session.env_table import KEPT_REWARDS, LOST_REWARD, EnvRows, EnvTable

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.recorded_run import pose_distances
-from workbench.core.snapshot_bytes import WholeSnapshot
+from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.history import History, Moment
 from workbench.session.questions import MomentToJudge

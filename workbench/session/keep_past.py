@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.core.snapshot_bytes import WholeSnapshot
+from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.recording.columns import BatchPacker
 from workbench.recording.landing import RecordingError
 from workbench.session.askers import Background
