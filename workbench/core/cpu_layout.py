@@ -61,7 +61,6 @@ class Layout:
     """(A,) likewise."""
     row_of: dict[int, int]
     index_of: dict[int, int]
-    row_count: int
 
 
 def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> Layout:
@@ -114,7 +113,6 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         articulation_names=[_IN_ENV.sub("", articulation.name) for articulation in articulations],
         row_of={id(component): row for row, component in enumerate(rows)},
         index_of={id(a): i for i, a in enumerate(articulations)},
-        row_count=len(rows),
     )
 
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from workbench.core.contacts import ContactReader, CpuArray, ImpulseQuery
 from workbench.core.cpu_layout import Layout, check_layout, lay_out
-from workbench.core.drawn_poses import Places, TensorPoses
+from workbench.core.drawn_poses import Places, bodies_elsewhere
 from workbench.core.mirrors import Group, Mirror, Mirrors, refuse_nan
 from workbench.core.stepping import Stepper
 
@@ -191,8 +191,7 @@ class BatchedCpuSystem:
         self._qacc = np.zeros_like(found.qpos.now)
         most_links = max((len(a.links) for a in layout.articulations), default=0)
         self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
-        self._tensor_poses = TensorPoses(self.scenes, layout, found.bodies.now)
-        self._force, self._torque = np.zeros((2, layout.row_count, 3), dtype=np.float32)
+        self._force, self._torque = np.zeros((2, len(layout.entities), 3), dtype=np.float32)
         self.cuda_rigid_body_data = _array(found.bodies.now)
         self.cuda_rigid_dynamic_data = self.cuda_rigid_body_data
         self.cuda_articulation_link_data = self.cuda_rigid_body_data
@@ -354,7 +353,9 @@ class BatchedCpuSystem:
     def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
         """By env: bodies that the tensor has elsewhere than SAPIEN, and where it has them; see `drawn_poses`."""
         self._catch_up()
-        return {} if self._layout is None else self._tensor_poses.elsewhere(envs)
+        if self._layout is None:
+            return {}
+        return bodies_elsewhere(self.scenes, self._layout, self._mirrors.bodies.now, envs)
 
     def replace(self, env: int, scene: sapien.Scene) -> None:
         """Another scene, over another system, has all entities of this env now, in the same order."""

@@ -25,34 +25,29 @@ Places = Mapping[int, tuple[Any, NDArray[np.float32]]]
 NOWHERE_ELSE: Places = {}
 
 
-class TensorPoses:
-    """Finds the bodies whose row of the tensor is not where SAPIEN draws them."""
+def bodies_elsewhere(
+    scenes: Sequence[sapien.Scene], layout: Layout, data: NDArray[np.float32], envs: Sequence[int]
+) -> dict[int, Places]:
+    """The bodies whose row of the tensor is not where SAPIEN draws them: of each of these envs that has such, where the
+    tensor has them.
 
-    def __init__(self, scenes: Sequence[sapien.Scene], layout: Layout, data: NDArray[np.float32]) -> None:
-        """
-        Args:
-            scenes: of the envs; looked up each time, since a restore may give an env another.
-            data: (R, 13) what ManiSkill calls ``cuda_rigid_body_data``; the array itself.
-        """
-        self._scenes, self._data = scenes, data
-        self._entities, self._pose_at, self._env = layout.entities, layout.pose_at, layout.env_of_row
-
-    def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
-        """Of each of these envs that has such bodies: which they are, and where the tensor has them."""
-        # Packed anew, though a fetch may have done it: an entity that was moved by itself is drawn by the tensor too.
-        packs = [self._scenes[env].pack_poses() for env in envs]
-        starts = np.full(len(self._scenes), -1, dtype=np.int64)
-        starts[envs] = np.cumsum([0, *(len(pack) // 4 for pack in packs[:-1])])
-        rows = np.flatnonzero(starts[self._env] >= 0) if len(envs) < len(self._scenes) else slice(None)
-        at = self._pose_at[rows] + starts[self._env[rows], None]
-        differs = np.frombuffer(b"".join(packs), dtype=np.float32)[at] != self._data[rows, :7]
-        if not differs.any():
-            return {}
-        found: dict[int, dict[int, tuple[Any, NDArray[np.float32]]]] = {}
-        for row in np.arange(len(self._data))[rows][differs.any(axis=1)]:
-            entity = self._entities[row]
-            found.setdefault(int(self._env[row]), {})[id(entity)] = entity, self._data[row, :7].copy()
-        return dict(found)
+    Args:
+        data: (R, 13) what ManiSkill calls ``cuda_rigid_body_data``.
+    """
+    # Packed anew, though a fetch may have done it: an entity that was moved by itself is drawn by the tensor too.
+    packs = [scenes[env].pack_poses() for env in envs]
+    starts = np.full(len(scenes), -1, dtype=np.int64)
+    starts[envs] = np.cumsum([0, *(len(pack) // 4 for pack in packs[:-1])])
+    rows = np.flatnonzero(starts[layout.env_of_row] >= 0) if len(envs) < len(scenes) else slice(None)
+    at = layout.pose_at[rows] + starts[layout.env_of_row[rows], None]
+    differs = np.frombuffer(b"".join(packs), dtype=np.float32)[at] != data[rows, :7]
+    if not differs.any():
+        return {}
+    found: dict[int, dict[int, tuple[Any, NDArray[np.float32]]]] = {}
+    for row in np.arange(len(data))[rows][differs.any(axis=1)]:
+        entity = layout.entities[row]
+        found.setdefault(int(layout.env_of_row[row]), {})[id(entity)] = entity, data[row, :7].copy()
+    return dict(found)
 
 
 @contextmanager

@@ -169,7 +169,7 @@ class Mirrors:
             setter: what sets a drive target of a joint, by the name of SAPIEN's method.
             later: as for `DriveTargets`.
         """
-        data, joints = _twin((layout.row_count, BODY)), layout.qpos_at.shape
+        data, joints = _twin((len(layout.entities), BODY)), layout.qpos_at.shape
         rigid = data, layout.names, layout.env_of_row
         jointed = layout.articulation_names, layout.env_of_row[layout.root_rows]
         roots, robots = layout.root_rows, layout.articulations

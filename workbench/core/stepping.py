@@ -49,12 +49,8 @@ class Stepper:
             threads: at most so many; None for one on each core that this process may use.
         """
         self._systems, self._scenes = systems, scenes
-        native = native_step()
-        self.threads = 1 if native is None else (threads or usable_cores())
-        self.step_once: list[Callable[[], None]] = [
-            system.step if native is None else partial(native.call, native.address_of(system))
-            for system in systems
-        ]
+        self.threads = 1 if native_step() is None else (threads or usable_cores())
+        self.step_once: list[Callable[[], None]] = [*map(_step_of, systems)]
         self._owed = 0
         self._in_a_row = 1
         self._writes: list[Callable[[int], None]] = []
@@ -65,10 +61,7 @@ class Stepper:
 
     def renew(self, env: int) -> None:
         """Another system stands in the list for this env."""
-        native, system = native_step(), self._systems[env]
-        self.step_once[env] = (
-            system.step if native is None else partial(native.call, native.address_of(system))
-        )
+        self.step_once[env] = _step_of(self._systems[env])
         self.forget()
 
     @property
@@ -146,3 +139,8 @@ class Stepper:
         if self._pose_packs is None:
             self._pose_packs = [scene.pack_poses() for scene in self._scenes]
         return self._pose_packs
+
+
+def _step_of(system: physx.PhysxCpuSystem) -> Callable[[], None]:
+    native = native_step()
+    return system.step if native is None else partial(native.call, native.address_of(system))

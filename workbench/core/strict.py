@@ -21,6 +21,7 @@ break a rule (``tests/core/test_strict.py`` lists them).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -57,17 +58,13 @@ class StrictMixin:
     _rule_choice: Degree | None = None
     """The degree of all rules; None for each rule's own."""
     _on_finding: Callable[[Finding], None] = staticmethod(warn_of)
-    _rules: BrokenRules | None = None
-    _reset_watch: ResetWatch | None = None
     _wrong_obs: tuple[str, str] | None = None
     """The hook, and what is wrong, of an observation that is being put together."""
 
-    @property
+    @cached_property
     def broken_rules(self) -> BrokenRules:
         """What the task broke so far; of the env, whatever becomes of its scene and its class."""
-        if self._rules is None:
-            self._rules = BrokenRules(degrees_of(self._rule_choice), self._on_finding)
-        return self._rules
+        return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
 
     def _setup_scene(self) -> None:
         super()._setup_scene()  # type: ignore[misc]
@@ -93,7 +90,7 @@ class StrictMixin:
             watch.whole = partial and self._workbench_task.reset is not BaseEnv.reset
             try:
                 if watch.whole:
-                    chosen = [i for i in range(self.num_envs) if i not in untouched]
+                    chosen = sorted(set(range(self.num_envs)).difference(untouched))
                     watch.start(self, self._workbench_task, chosen)  # type: ignore[arg-type]
                 made = super().reset(seed=seed, options=options)  # type: ignore[misc]
                 watch.tell()
@@ -102,11 +99,9 @@ class StrictMixin:
                 watch.stop()
                 watch.whole = False
 
-    @property
+    @cached_property
     def _watch(self) -> ResetWatch:
-        if self._reset_watch is None:
-            self._reset_watch = ResetWatch(self.broken_rules)
-        return self._reset_watch
+        return ResetWatch(self.broken_rules)
 
     def _clear_sim_state(self) -> None:
         reset = self.scene._reset_mask

@@ -77,11 +77,7 @@ def install_struct_access() -> None:
         setter = None if stock.fset is None else _told_writes(stock.fset, name, group)
         setattr(owner, name, property(getter, setter, doc=stock.__doc__))
     for name in TARGET_SETTERS:
-        setattr(Articulation, name, _told_targets(Articulation.__dict__[name]))
-
-
-def _strict(system: Any) -> StrictCpuSystem | None:
-    return system if type(system) is StrictCpuSystem else None
+        setattr(Articulation, name, _told_writes(Articulation.__dict__[name], "drive targets", "targets"))
 
 
 def _rows(struct: Any, group: Group) -> torch.Tensor:
@@ -108,62 +104,40 @@ def _told_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Callabl
     return get
 
 
-def _told_writes(stock: Callable[[Any, Any], None], name: str, group: Group) -> Callable[[Any, Any], None]:
-    def put(self: Any, value: Any) -> None:
+def _told_writes(stock: Callable[..., None], name: str, group: Group) -> Callable[..., None]:
+    # "targets" is what an author may call the value of `set_joint_drive_targets`.
+    def put(self: Any, targets: Any, *args: Any, **kwargs: Any) -> None:
         system = batched_system(self.scene)
         if system is None:
-            return stock(self, value)
+            return stock(self, targets, *args, **kwargs)
         if group == "bodies" and self.px_body_type == "static":
             raise RuntimeError(
                 f"'{self.name}' is static: on the GPU, and here, a static actor cannot be moved once the scene "
                 "is built. Give it its initial_pose before build_static(), or build it with build_kinematic()."
             )
         if group == "targets" and not system.laid_out:
-            raise RuntimeError(_targets_too_early(self.articulation.name))
-        strict = _strict(system)
-        if strict is not None and strict.laid_out and not (group == "bodies" and self.hidden):
-            strict.about_to_write(self, group, _rows(self, group)[_mask(self)])
+            raise RuntimeError(
+                f"A drive target of '{getattr(self, 'articulation', self).name}' was set before the simulation is "
+                "initialised: in _load_agent and _load_scene it has none yet, on the GPU or here. Set one that stays in "
+                "_after_reconfigure(self, options), and one of each episode in _initialize_episode, with "
+                "articulation.set_joint_drive_targets(targets, joints=[...])."
+            )
+        if type(system) is StrictCpuSystem and system.laid_out and not (group == "bodies" and self.hidden):
+            system.about_to_write(self, group, _rows(self, group)[_mask(self)])
         try:
-            stock(self, value)
+            stock(self, targets, *args, **kwargs)
         except (RuntimeError, IndexError) as error:
-            if group == "targets":
+            if group == "targets" and isinstance(self, ArticulationJoint):
                 _explain_single_joint(self, name, error)
-            _explain(self, value, name, error)
+            _explain(self, targets, name, error)
             raise
 
     return put
 
 
-def _told_targets(stock: Callable[..., None]) -> Callable[..., None]:
-    def set_targets(self: Any, targets: Any, joints: Any = None, joint_indices: Any = None) -> None:
-        system = batched_system(self.scene)
-        if system is None:
-            return stock(self, targets, joints, joint_indices)
-        if not system.laid_out:
-            raise RuntimeError(_targets_too_early(self.name))
-        strict = _strict(system)
-        if strict is not None:
-            strict.about_to_write(self, "targets", self._data_index[_mask(self)])
-        try:
-            stock(self, targets, joints, joint_indices)
-        except (RuntimeError, IndexError) as error:
-            _explain(self, targets, "drive targets", error)
-            raise
-
-    return set_targets
-
-
 def _mask(struct: Any) -> torch.Tensor:
     """(M,) which of the objects behind `struct` a setter writes now."""
     return struct.scene._reset_mask[struct._scene_idxs.long()]
-
-
-def _targets_too_early(name: str) -> str:
-    return (
-        f"A drive target of '{name}' was set before the simulation is initialised: in _load_agent and _load_scene it has "
-        "none yet, on the GPU or here. Set one that stays in _after_reconfigure(self, options), and one of each episode in "
-        "_initialize_episode, with articulation.set_joint_drive_targets(targets, joints=[...])."
-    )
 
 
 def _explain_single_joint(joint: ArticulationJoint, name: str, error: Exception) -> None:
@@ -222,14 +196,12 @@ GUARDED: dict[type, dict[str, str]] = {
         "drive_target": "Articulation.set_joint_drive_targets()",
         "drive_velocity_target": "Articulation.set_joint_drive_velocity_targets()",
     },
-}
-"""Properties with a setter of the same name, ``set_...``, and what to use in their place."""
-GUARDED_METHODS: dict[type, dict[str, str]] = {
     physx.PhysxRigidBodyComponent: {
         "add_force_at_point": "Actor.apply_force()",
         "add_force_torque": "Actor.apply_force()",
     },
 }
+"""Properties with a setter of the same name, ``set_...``, and methods; and what to use in their place."""
 
 _strict_systems: weakref.WeakSet[StrictCpuSystem] = weakref.WeakSet()
 """Asked for their scenes each time, since a restored snapshot gives an env another scene."""
@@ -245,17 +217,13 @@ def guard_scenes(system: StrictCpuSystem) -> None:
 def _install() -> None:
     for owner, names in GUARDED.items():
         for name, instead in names.items():
-            stock: property = owner.__dict__[name]
-            assert stock.fset is not None
-            guarded = _guarded(stock.fset, f"{owner.__name__}.{name} = ...", instead)
-            setattr(owner, name, property(stock.fget, guarded, doc=stock.__doc__))
-            setter = f"set_{name}"
-            if setter in owner.__dict__:
-                method = _guarded(owner.__dict__[setter], f"{owner.__name__}.{setter}()", instead)
-                setattr(owner, setter, method)
-    for owner, names in GUARDED_METHODS.items():
-        for name, instead in names.items():
-            setattr(owner, name, _guarded(owner.__dict__[name], f"{owner.__name__}.{name}()", instead))
+            stock = owner.__dict__[name]
+            if isinstance(stock, property):
+                guarded = _guarded(stock.fset, f"{owner.__name__}.{name} = ...", instead)
+                setattr(owner, name, property(stock.fget, guarded, doc=stock.__doc__))
+                name = f"set_{name}"
+            if name in owner.__dict__:
+                setattr(owner, name, _guarded(owner.__dict__[name], f"{owner.__name__}.{name}()", instead))
 
 
 def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
