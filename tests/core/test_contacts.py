@@ -20,7 +20,6 @@ from tests.core.by_hand import box
 from tests.core.single_env_judge import Bare, batch_of, put_in_same_state, single
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.scene_index import scene_index
-from workbench.core.task_env import TaskEnv
 
 pytestmark = pytest.mark.thorough
 
@@ -252,12 +251,6 @@ def test_a_wrong_env_is_refused(piles: tuple[Any, list[Any]]) -> None:
     for env in (-1, N):
         with pytest.raises(IndexError, match="out of range for 3 envs"):
             list_contacts(batch, env)
-
-
-def test_a_running_task_tells_its_contacts(piles: tuple[Any, list[Any]]) -> None:
-    batch, _ = piles
-    task = TaskEnv(batch)
-    assert [c.bodies for c in task.contacts(2)] == [c.bodies for c in list_contacts(batch, 2)] != []
 
 
 # --- queries ---------------------------------------------------------------------------------------

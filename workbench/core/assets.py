@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import walk_tb
 from types import TracebackType
 from typing import Any
 
@@ -191,9 +192,7 @@ def _robot_file(trace: TracebackType | None) -> Path | None:
     An agent class that was never registered has no entry in ManiSkill's table of downloads, and the look-up
     raises a bare KeyError with the robot's uid instead of a word about the file.
     """
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        if code.co_filename == base_agent.__file__ and "asset_path" in trace.tb_frame.f_locals:
-            return Path(str(trace.tb_frame.f_locals["asset_path"]))
-        trace = trace.tb_next
+    for frame, _ in walk_tb(trace):
+        if frame.f_code.co_filename == base_agent.__file__ and "asset_path" in frame.f_locals:
+            return Path(str(frame.f_locals["asset_path"]))
     return None

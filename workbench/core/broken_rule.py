@@ -313,6 +313,11 @@ def find_assignment(task: type, path: str) -> Place | None:
     return min(found, default=(0, None))[1]
 
 
+def files_of_task(task: type) -> set[str]:
+    """Where its methods are written, and those that it inherits of below BaseEnv."""
+    return {function.__code__.co_filename for _, function in _methods(task)}
+
+
 def _methods(task: type) -> Iterator[tuple[str, Any]]:
     for owner in task.__mro__:
         if not issubclass(owner, BaseEnv) or owner is BaseEnv:

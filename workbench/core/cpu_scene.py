@@ -21,7 +21,6 @@ A constructor that leaves out its parent's: found by what is missing after it, a
 from __future__ import annotations
 
 import ctypes
-import inspect
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -39,7 +38,14 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
 
-from workbench.core.broken_rule import Place, frames_of_the_task, in_brackets, place_of, warn_of
+from workbench.core.broken_rule import (
+    Place,
+    frames_of_the_task,
+    in_brackets,
+    place_of,
+    place_of_hook,
+    warn_of,
+)
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.drawn_poses import NOWHERE_ELSE, drawn_at
@@ -381,14 +387,14 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
         ForgottenInit: ``BaseEnv.__init__`` was not called, or not with the number of envs.
     """
     if env.scene is None:
-        cls, place = _culprit(task, BaseEnv)
+        cls, place = _culprit(task, BaseEnv, silent=True)
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
             f"{in_brackets(place)}. Call it there, behind what the hooks need of it: ManiSkill builds the scene and resets in it.",
             place,
         )
     if env.num_envs != num_envs:
-        cls, place = _first(task, BaseEnv)
+        cls, place = _culprit(task, BaseEnv, silent=False)
         raise ForgottenInit(
             f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on"
             f"{in_brackets(place)}. Give its keyword arguments to super().__init__(*args, **kwargs).",
@@ -404,7 +410,7 @@ def refuse_unbuilt_agent(agent: Any) -> None:
     """
     for robot in agent.agents if isinstance(agent, MultiAgent) else [agent]:
         if isinstance(robot, BaseAgent) and not hasattr(robot, "robot"):
-            cls, place = _culprit(type(robot), BaseAgent)
+            cls, place = _culprit(type(robot), BaseAgent, silent=True)
             raise ForgottenInit(
                 f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
                 f"{in_brackets(place)}. Call it there.",
@@ -412,28 +418,10 @@ def refuse_unbuilt_agent(agent: Any) -> None:
             )
 
 
-def _culprit(cls: type, base: type) -> tuple[type, Place | None]:
-    """The first class whose constructor names no other, or else the first that has one."""
-    own = _own(cls, base)
-    for owner in own:
-        if "__init__" not in vars(owner)["__init__"].__code__.co_names:
-            return owner, _place(owner)
-    return _first(cls, base)
-
-
-def _first(cls: type, base: type) -> tuple[type, Place | None]:
-    own = _own(cls, base)
-    return (own[0], _place(own[0])) if own else (cls, None)
-
-
-def _own(cls: type, base: type) -> list[type]:
-    return [
-        owner
-        for owner in cls.__mro__[: cls.__mro__.index(base)]
-        if hasattr(vars(owner).get("__init__"), "__code__")
-    ]
-
-
-def _place(owner: type) -> Place:
-    code = inspect.unwrap(vars(owner)["__init__"]).__code__
-    return code.co_filename, code.co_firstlineno, "__init__"
+def _culprit(cls: type, base: type, silent: bool) -> tuple[type, Place | None]:
+    """The first class that has a constructor; with `silent` rather the first whose constructor names no other."""
+    every = cls.__mro__[: cls.__mro__.index(base)]
+    own = [owner for owner in every if hasattr(vars(owner).get("__init__"), "__code__")]
+    named = [owner for owner in own if "__init__" in vars(owner)["__init__"].__code__.co_names]
+    at_fault = [owner for owner in own if silent and owner not in named] or own
+    return (at_fault[0], place_of_hook(at_fault[0], "__init__")) if own else (cls, None)

@@ -63,7 +63,7 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
     columns: dict[str, NDArray] = {}
     others: dict[str, OtherEntry] = {}
     left_out = 0
-    for path, value in _leaves(info):
+    for path, value in leaves(info):
         if path in _NOT_EVALUATED:
             continue
         if len(columns) + len(others) >= MOST_ENTRIES:
@@ -85,16 +85,25 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
     return columns, others
 
 
-def _leaves(
-    value: Mapping[Any, Any], prefix: str = "", above: tuple[int, ...] = ()
-) -> Iterator[tuple[str, Any]]:
+def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """The leaves of nested dicts, each with the keys that lead to it, joined by ``/``; a dict without keys, or within
+    itself, is one."""
+    # A dict that holds itself has no last leaf.
+    if (
+        not isinstance(value, Mapping)
+        or len(above) > _DEEPEST
+        or id(value) in above[1:]
+        or (above and not value)
+    ):
+        yield path, value
+        return
     for key, held in value.items():
-        path = prefix + _key(key)
-        # A dict that holds itself has no last leaf.
-        if isinstance(held, Mapping) and held and len(above) < _DEEPEST and id(held) not in above:
-            yield from _leaves(held, f"{path}/", (*above, id(held)))
-        else:
-            yield path, held
+        yield from leaves(held, f"{path}/{_key(key)}" if path else _key(key), (*above, id(value)))
+
+
+def flat_entries(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The `leaves` that are no dicts: none of an empty one; what is no dict itself is one with the name `path`."""
+    return ((name, held) for name, held in leaves(value, path) if not isinstance(held, Mapping))
 
 
 def _key(key: Any) -> str:
@@ -286,7 +295,7 @@ def wrong_observation(obs: object, num_envs: int) -> str | None:
     """Said of an observation hook: every entry of the dict that it returns is an array (N, ...)."""
     if not isinstance(obs, Mapping):
         return f"returned {_describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
-    for name, value in _entries(obs):
+    for name, value in flat_entries(obs):
         shape = getattr(value, "shape", None)
         if shape is None or len(shape) == 0 or shape[0] != num_envs:
             return (
@@ -294,14 +303,6 @@ def wrong_observation(obs: object, num_envs: int) -> str | None:
                 f"expected shape ({num_envs}, ...), a row for each env"
             )
     return None
-
-
-def _entries(returned: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[object, object]]:
-    for name, value in returned.items():
-        if isinstance(value, Mapping) and isinstance(name, str):
-            yield from _entries(value, f"{prefix}{name}/")
-        else:
-            yield (f"{prefix}{name}" if isinstance(name, str) else name), value
 
 
 def _describe(value: object) -> str:

@@ -17,7 +17,7 @@ from mani_skill.utils import common
 
 from workbench.core import seams
 from workbench.core.cpu_scene import BatchedCpuMixin, batched_class
-from workbench.core.snapshot import Snapshot, restore_memory, restore_snapshot, take_snapshot
+from workbench.core.snapshot import in_this_state, restore_memory, restore_snapshot, take_snapshot
 from workbench.core.strict import StrictMixin
 
 
@@ -103,16 +103,11 @@ def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
         own = isinstance(env, BatchedCpuMixin)
         if own:
             env.drop_writes()
-        if own and _simulation(take_snapshot(env)) == _simulation(kept):
+        if own and all(in_this_state(env, i, kept, i) for i in every):
             _, missed = restore_memory(env, kept.memory, every, every, whole=True)
         else:
             missed = restore_snapshot(env, kept).not_carried
     return missed
-
-
-def _simulation(snapshot: Snapshot) -> tuple[tuple[bytes, ...], bytes, bytes]:
-    state: Any = snapshot.simulation
-    return state.packed, state.qf.tobytes(), state.driven.tobytes()
 
 
 def keep_observation_space(env: BaseEnv, obs: Any) -> None:

@@ -16,10 +16,9 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.cpu_layout import BODY
 from workbench.core.scene_index import in_every_env, present_states, scene_index
 
-_FIXED = 13
-"""Numbers of an actor's or a root's state."""
 _JOINT_TENSORS = ("qf", "target_qpos", "target_qvel")
 """Of an articulation, beside what its ``get_state()`` has: ``px.cuda_articulation_NAME``."""
 
@@ -38,7 +37,7 @@ def read_gpu_state(env: Any, env_idx: list[int]) -> GpuState:
     """The simulation state of the envs in `env_idx`."""
     states, structs = present_states(env), scene_index(env).states
     for name, state in states.items():
-        width = _joints(structs[name])
+        width = seams.joints_of(structs[name])
         tensors = _joint_tensors(env) if width else ()
         rows = [t[seams.data_rows_of_articulation(structs[name]).long(), :width] for t in tensors]
         every = [torch.as_tensor(state), *(in_every_env(env, structs[name], row) for row in rows)]
@@ -58,11 +57,11 @@ def write_gpu_state(
         if name not in structs and not np.isnan(rows[positions]).all():
             missed[_words(name)] = "this env has none of this name"
     for name, struct in structs.items():
-        width = _joints(struct)
+        width = seams.joints_of(struct)
         kept = state.states.get(name, np.zeros((0, 0), np.float32))
         # Lowest env first, as ManiSkill's setters give the rows out.
         targets = [i for i in seams.envs_of(struct).tolist() if i in position]
-        fits = kept.shape[1] == _FIXED + (2 + len(_JOINT_TENSORS)) * width
+        fits = kept.shape[1] == BODY + (2 + len(_JOINT_TENSORS)) * width
         fitting = [i for i in targets if fits and not np.isnan(kept[position[i]]).any()]
         if len(fitting) < len(targets):
             missed[_words(name)] = "the snapshot has none of this name and shape: left as it is"
@@ -70,11 +69,11 @@ def write_gpu_state(
             continue
         carried[_words(name)] = None
         values = torch.from_numpy(kept[[position[i] for i in fitting]]).to(env.device)
-        struct.set_state(values[:, : _FIXED + 2 * width], torch.tensor(fitting, device=env.device))
+        struct.set_state(values[:, : BODY + 2 * width], torch.tensor(fitting, device=env.device))
         if width:
             own = np.flatnonzero(np.isin(seams.envs_of(struct), fitting)).tolist()
             index = seams.data_rows_of_articulation(struct).long()[own]
-            parts = values[:, _FIXED + 2 * width :].split(width, dim=1)
+            parts = values[:, BODY + 2 * width :].split(width, dim=1)
             for tensor, part in zip(_joint_tensors(env), parts, strict=True):
                 tensor[index, :width] = part
     seams.apply_and_fetch(env)
@@ -84,10 +83,6 @@ def write_gpu_state(
 def _words(name: str) -> str:
     kind, _, own = name.partition("/")
     return f"{kind.removesuffix('s')} {own}"
-
-
-def _joints(struct: Any) -> int:
-    return int(getattr(struct, "max_dof", 0))
 
 
 def _joint_tensors(env: Any) -> list[torch.Tensor]:

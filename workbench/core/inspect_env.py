@@ -13,7 +13,7 @@ once a version of the task, and everything that the task remembers is put back a
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,12 +21,13 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.contact_list import Contact
+from workbench.core.contact_list import Contact, list_contacts
+from workbench.core.entries import flat_entries
 from workbench.core.env_numbers import require_env
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Section, Touching
 from workbench.core.scene_index import scene_index
 from workbench.core.state_columns import apart, env_states, names_of_flat
-from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
+from workbench.core.task_env import TaskEnv, to_numpy
 
 MOST_VALUES = 64
 """Numbers of one array that are sent; a joint vector has fewer, a picture has more."""
@@ -72,7 +73,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
 def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
     """The last observation; a flattened one (N, D) taken apart by the names of what it was made of."""
     leaves: list[Leaf] = []
-    for name, value in flat_entries(_tree(task.obs)):
+    for name, value in flat_entries({} if task.obs is None else task.obs):
         # "state" is what ManiSkill calls the flattened part beside the pictures.
         names = names_of_flat(task, value) if name in ("", "state") else None
         if names is None:
@@ -135,7 +136,7 @@ def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
         NotImplementedError: the env is simulated on the GPU.
     """
     pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
-    for contact in task.contacts(env):
+    for contact in list_contacts(task.env, env):
         first, second = contact.bodies
         # Shapes that are near have a contact too; without a push and a gap apart they do not touch.
         if not contact.impulses.any() and not (contact.separations <= 0).any():
@@ -171,12 +172,6 @@ def _state_parts(row: NDArray) -> Iterator[tuple[str, NDArray]]:
         if width:
             yield name, row[at : at + width]
         at += width
-
-
-def _tree(obs: Any) -> Mapping[str, Any]:
-    if obs is None:
-        return {}
-    return obs if isinstance(obs, Mapping) else {"": obs}
 
 
 def _row(value: Any, env: int, num_envs: int) -> NDArray:

@@ -18,23 +18,23 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core import seams
 from workbench.core.broken_rule import (
     BrokenRules,
     Frame,
+    files_of_task,
     find_assignment,
     frames_of_the_task,
     is_installed,
     place_of_hook,
 )
+from workbench.core.seams import task_class
 from workbench.core.strict_system import envs_named
 from workbench.core.task_buffers import is_per_env, version_of
 from workbench.core.task_members import Walk, look_over
@@ -45,21 +45,6 @@ _ROUNDED = 1e-5
 """What is computed anew of the same poses differs by so much at most: 1e-7 of a rotation was seen."""
 _ITEM = re.compile(r"\[(\d+)\]")
 
-What = Literal["lost", "changed"]
-
-
-@dataclass(frozen=True)
-class RowsElsewhere:
-    """What a partial reset did to rows of envs that it did not reset."""
-
-    path: str
-    """As the task writes it, without ``self.``."""
-    what: What
-    envs: tuple[int, ...]
-    """That have other values now; none where the rows were lost."""
-    frames: tuple[Frame, ...]
-    """That led to the assignment, innermost first; none where it was not seen."""
-
 
 class KeptRows:
     """What a task keeps for each env, as it is when this is made.
@@ -67,39 +52,21 @@ class KeptRows:
     Args:
         env: In the middle of an episode.
         chosen: The envs that are about to be reset.
-        lines: Look for the lines, too, where nobody else traces.
     """
 
-    def __init__(self, env: BaseEnv, chosen: Sequence[int], lines: bool) -> None:
-        self._env, self._count = env, len(chosen)
+    def __init__(self, env: BaseEnv, chosen: Sequence[int]) -> None:
+        self.env, self._count = env, len(chosen)
         self._elsewhere = np.setdiff1d(np.arange(env.num_envs), np.asarray(chosen, dtype=np.int64))
-        self._single, self._groups = _paths(look_over(env), env.num_envs)
-        self._before = {path: _copy(value) for path, value in self._read().items()}
-        self._lines = _Lines(self, seams.files_of_task(env)) if lines and self._before else None
+        walk = look_over(env)
+        self._single, self._groups = _paths(walk, env.num_envs)
+        self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
-    @property
-    def others(self) -> int:
-        """How many envs are not being reset."""
-        return len(self._elsewhere)
-
-    def start(self) -> None:
-        """Look for lines, where that was asked for, until `stop`."""
-        if self._lines is not None:
-            self._lines.start()
-
-    def stop(self) -> None:
-        if self._lines is not None:
-            self._lines.stop()
-
-    def changes(self) -> list[RowsElsewhere]:
-        """What became of the rows of other envs since."""
-        now, found = self._read(), []
-        for path, before in self._before.items():
-            what = self._difference(before, now.get(path))
-            if what is not None:
-                frames = self._lines.found.get(path, ()) if self._lines is not None else ()
-                found.append(RowsElsewhere(path, what[0], what[1], frames))
-        return found
+    def changes(self) -> dict[str, tuple[int, ...]]:
+        """Where rows of other envs are others now, as the task writes it without ``self.``; and of which envs: none where
+        there are rows of those only that are reset, and the others are lost."""
+        now = self._read(look_over(self.env))
+        found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
+        return {path: envs for path, envs in found.items() if envs is not None}
 
     def changed(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
         """The paths whose rows elsewhere are others now.
@@ -108,61 +75,43 @@ class KeptRows:
             seen: what was at each path the last time, which is brought up to date: the same tensor, not written
                 since, is not compared again.
         """
-        now = self._read()
-        for path, before in self._before.items():
+        now = self._read(look_over(self.env))
+        for path, before in self.before.items():
             value = now.get(path)
-            version = (
-                version_of(value) if isinstance(value, torch.Tensor) and not value.is_inference() else -1
-            )
+            version = version_of(value) if isinstance(value, torch.Tensor) else -1
             last = seen.get(path)
             if version >= 0 and last is not None and last[0] is value and last[1] == version:
                 continue
             seen[path] = value, version, self._difference(before, value) is not None
         return {path for path, (_, _, differs) in seen.items() if differs}
 
-    def _read(self) -> dict[str, Any]:
-        """What is at the paths now; of what is an env's each, a list."""
-        now = {leaf.path: leaf.value for leaf in look_over(self._env).leaves}
+    def _read(self, walk: Walk) -> dict[str, Any]:
+        """What is at the paths; of what is an env's each, a list."""
+        now = {leaf.path: leaf.value for leaf in walk.leaves}
         read = {path: now[path] for path in self._single if path in now}
         for path, each in self._groups.items():
             if all(one in now for one in each):
                 read[path] = [now[one] for one in each]
         return read
 
-    def _difference(self, before: Any, now: Any) -> tuple[What, tuple[int, ...]] | None:
+    def _difference(self, before: Any, now: Any) -> tuple[int, ...] | None:
+        """Of which envs, as `changes` has it; None where nothing of other envs is another."""
+        elsewhere = self._elsewhere
         if isinstance(before, list) and isinstance(now, list):
             if len(now) == len(before):
-                differ = [i for i in self._elsewhere if not _same(before[i], now[i])]
-                return ("changed", tuple(int(i) for i in differ)) if differ else None
-            return ("lost", ()) if len(now) == self._count else None
-        if isinstance(before, torch.Tensor) and isinstance(now, torch.Tensor):
-            if now.shape == before.shape:
-                at = self._elsewhere
-                return self._named(_differ(_array(before)[at], _array(now)[at]))
-        elif isinstance(before, np.ndarray) and isinstance(now, np.ndarray):
-            if now.shape == before.shape:
-                return self._named(_differ(before[self._elsewhere], now[self._elsewhere]))
-        else:
+                return self._named([not _same(before[i], now[i]) for i in elsewhere])
+            return () if len(now) == self._count else None
+        if not isinstance(before, (torch.Tensor, np.ndarray)) or not isinstance(now, type(before)):
             return None  # another kind of thing has its name now
+        if now.shape == before.shape:
+            return self._named(_differ(_array(before)[elsewhere], _array(now)[elsewhere]))
         if now.ndim and len(now) == self._count and now.shape[1:] == before.shape[1:]:
-            return "lost", ()
-        return ("changed", tuple(int(i) for i in self._elsewhere)) if is_per_env(now, len(before)) else None
+            return ()
+        return tuple(elsewhere.tolist()) if is_per_env(now, len(before)) else None
 
-    def _named(self, differs: np.ndarray) -> tuple[What, tuple[int, ...]] | None:
-        rows = differs.reshape(len(self._elsewhere), -1).any(axis=1)
-        return ("changed", tuple(int(i) for i in self._elsewhere[rows])) if rows.any() else None
-
-
-def rows_of_tensors(env: BaseEnv) -> dict[str, int]:
-    """How many rows each tensor, array and list has that the task keeps on itself, by path."""
-    leaves = look_over(env).leaves
-    return {
-        leaf.path: len(leaf.value)
-        for leaf in leaves
-        if _is_the_tasks(leaf.path)
-        and (isinstance(leaf.value, list) or getattr(leaf.value, "ndim", 0) > 0)
-        and isinstance(leaf.value, (torch.Tensor, np.ndarray, list))
-    }
+    def _named(self, differs: Any) -> tuple[int, ...] | None:
+        rows = np.reshape(differs, (len(self._elsewhere), -1)).any(axis=1)
+        return tuple(self._elsewhere[rows].tolist()) or None
 
 
 def _is_the_tasks(path: str) -> bool:
@@ -197,9 +146,11 @@ def _copy(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    tensor = tensor.detach()
-    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).cpu().numpy()
+def _array(value: torch.Tensor | np.ndarray) -> np.ndarray:
+    if isinstance(value, np.ndarray):
+        return value
+    value = value.detach()
+    return (value.float() if value.dtype == torch.bfloat16 else value).cpu().numpy()
 
 
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -210,9 +161,8 @@ def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+    if isinstance(a, (torch.Tensor, np.ndarray)) and isinstance(b, type(a)):
         a, b = _array(a), _array(b)
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.shape == b.shape and not _differ(a, b).any()
     return type(a) is type(b) and (a is b or bool(a == b) or bool(a != a and b != b))
 
@@ -223,8 +173,9 @@ def _same(a: Any, b: Any) -> bool:
 class _Lines:
     """Looks at the rows after each line of the author's, and remembers after which they were others."""
 
-    def __init__(self, rows: KeptRows, files: Collection[str]) -> None:
-        self._rows, self._files = rows, files
+    def __init__(self, rows: KeptRows) -> None:
+        self.rows = rows
+        self._files: Collection[str] = ()
         self._left = MOST_LINES
         self._seen: dict[str, tuple[Any, int, bool]] = {}
         self._at: Frame | None = None
@@ -232,8 +183,9 @@ class _Lines:
         self.found: dict[str, tuple[Frame, ...]] = {}
 
     def start(self) -> None:
-        if sys.gettrace() is not None:
+        if sys.gettrace() is not None or not self.rows.before:
             return  # a debugger's, or that of a measurement of coverage
+        self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
         while (
             frame is not None
@@ -272,7 +224,7 @@ class _Lines:
         if self._at is None or self._left == 0:
             return
         self._left -= 1
-        changed = self._rows.changed(self._seen)
+        changed = self.rows.changed(self._seen)
         frame = self._at[0]
         for path in changed - self.found.keys():
             self.found[path] = (self._at, *frames_of_the_task(frame.f_back))
@@ -296,7 +248,7 @@ class ResetWatch:
 
     def __init__(self, rules: BrokenRules) -> None:
         self._rules = rules
-        self._rows: KeptRows | None = None
+        self._lines: _Lines | None = None
         self._chosen: tuple[int, ...] = ()
         self._task: type | None = None
         self._tries = 0
@@ -308,15 +260,16 @@ class ResetWatch:
 
     @property
     def looks(self) -> bool:
-        return self._rows is not None
+        return self._lines is not None
 
     def start(self, env: BaseEnv, task: type, chosen: Sequence[int]) -> None:
         """Envs `chosen` are about to be reset."""
         if self._task is not task:
             self._task, self._tries, self._seeks = task, _TRIES, True
         self._chosen = tuple(chosen)
-        self._rows = KeptRows(env, chosen, lines=self._seeks)
-        self._rows.start()
+        self._lines = _Lines(KeptRows(env, chosen))
+        if self._seeks:
+            self._lines.start()
 
     def go_on(self, env: BaseEnv) -> None:
         """The same reset goes on after something that it need not answer for."""
@@ -325,9 +278,9 @@ class ResetWatch:
 
     def stop(self) -> None:
         """Look no further; tells nothing."""
-        if self._rows is not None:
-            self._rows.stop()
-            self._rows = None
+        if self._lines is not None:
+            self._lines.stop()
+            self._lines = None
 
     def tell(self, over: bool = True) -> None:
         """Tell of what the reset did, or did so far where it is not over.
@@ -335,41 +288,39 @@ class ResetWatch:
         Raises:
             BrokenRule: of a rule that stops.
         """
-        rows = self._rows
-        if rows is None:
+        lines = self._lines
+        if lines is None:
             return
         self.stop()
-        found = rows.changes()
+        found = lines.rows.changes()
         if over or found:
             # Only where a line is missing need the next reset be slowed down.
             self._tries -= self._seeks
-            self._seeks = self._tries > 0 and any(not change.frames for change in found)
-        for change in found:
-            self._tell(change, rows)
+            self._seeks = self._tries > 0 and not found.keys() <= lines.found.keys()
+        for path, envs in found.items():
+            self._tell(path, envs, lines.found.get(path, ()), lines.rows.env.num_envs)
 
-    def _tell(self, change: RowsElsewhere, rows: KeptRows) -> None:
+    def _tell(self, path: str, envs: tuple[int, ...], frames: tuple[Frame, ...], total: int) -> None:
         assert self._task is not None
-        shown, total = change.path.removesuffix(".raw_pose"), len(self._chosen) + rows.others
-        if change.what == "lost":
+        shown = path.removesuffix(".raw_pose")
+        if not envs:
             rule = "rows-lost"
             message = (
                 f"self.{shown} is left with a row for each of the {len(self._chosen)} envs that are being reset, where "
-                f"it had one for each of {total}: write `self.{change.path}[env_idx] = ...` instead of replacing it."
+                f"it had one for each of {total}: write `self.{path}[env_idx] = ...` instead of replacing it."
             )
         else:
             rule = "rows-rewritten"
-            index = change.path if "[i]" in change.path else f"{change.path}[env_idx]"
-            of = " for each i of env_idx" if "[i]" in change.path else ""
+            index = path if "[i]" in path else f"{path}[env_idx]"
+            of = " for each i of env_idx" if "[i]" in path else ""
             message = (
-                f"self.{shown} is changed in {envs_named(change.envs)}, which {_are(change.envs)} not being reset and "
+                f"self.{shown} is changed in {envs_named(envs)}, which {_are(envs)} not being reset and "
                 f"in the middle of an episode. Change the rows of env_idx only: `self.{index} = ...`{of}."
             )
         place = None
-        if not change.frames:
-            place = find_assignment(self._task, change.path) or place_of_hook(
-                self._task, "_initialize_episode"
-            )
-        self._rules.breaks(rule, message, change.frames or None, place, subject=change.path)
+        if not frames:
+            place = find_assignment(self._task, path) or place_of_hook(self._task, "_initialize_episode")
+        self._rules.breaks(rule, message, frames or None, place, subject=path)
 
 
 def _are(envs: Sequence[int]) -> str:

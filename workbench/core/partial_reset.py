@@ -30,10 +30,10 @@ from mani_skill.agents.controllers.base_controller import BaseController, Combin
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 
-from workbench.core.broken_rule import BrokenRule, find_assignment
+from workbench.core.broken_rule import BrokenRule, Place, files_of_task, find_assignment
 from workbench.core.env_numbers import env_numbers, envs_of_batch
-from workbench.core.kept_rows import rows_of_tensors
-from workbench.core.seams import agents, drawing_from, files_of_task, set_episode_seeds, task_class
+from workbench.core.kept_rows import KeptRows
+from workbench.core.seams import agents, drawing_from, set_episode_seeds, task_class
 
 _CORE = str(Path(__file__).parent)
 
@@ -131,45 +131,44 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 @contextmanager
 def told_whose_fault(env: Any, untouched: list[int]) -> Iterator[None]:
     """Add a note to an exception that leaves a reset by way of the task's own code."""
-    before = rows_of_tensors(env) if untouched else {}
+    chosen = sorted(set(range(env.num_envs)).difference(untouched))
+    rows = KeptRows(env, chosen) if untouched else None
     try:
         yield
     except BrokenRule:
         raise  # says it all
     except Exception as error:
         line = _line_of_the_task(error, env)
-        now = rows_of_tensors(env) if untouched else {}
-        rows = env.num_envs - len(untouched)
-        shrunk = [path for path, count in now.items() if count == rows and before.get(path) == env.num_envs]
-        if line is not None or shrunk:
-            error.add_note(_note(env, untouched, line, shrunk))
+        lost = [] if rows is None else [path for path, envs in rows.changes().items() if not envs]
+        if line is not None or lost:
+            error.add_note(_note(env, chosen, line, lost))
         raise
 
 
-def _note(env: BaseEnv, untouched: list[int], line: traceback.FrameSummary | None, shrunk: list[str]) -> str:
-    where = "." if line is None else f": {Path(line.filename).name}:{line.lineno}, in {line.name}."
+def _note(env: BaseEnv, chosen: list[int], line: Place | None, lost: list[str]) -> str:
+    where = "." if line is None else f": {Path(line[0]).name}:{line[1]}, in {line[2]}."
     note = f"This error is {type(env).__name__}'s own, not the batched core's{where}"
-    if not untouched:
+    if len(chosen) == env.num_envs:
         return note
-    chosen = [i for i in range(env.num_envs) if i not in untouched]
     note += (
         f" Envs {chosen} of {env.num_envs} were being reset: _initialize_episode must make len(env_idx) rows, "
         "not num_envs, and write what it keeps on self as `self.x[env_idx] = ...`."
     )
-    for path in shrunk:
+    for path in lost:
         place = find_assignment(task_class(env), path)
         at = "" if place is None else f" ({Path(place[0]).name}:{place[1]})"
         note += f" It replaced self.{path}: {env.num_envs} rows before, {len(chosen)} now{at}."
     return note + " ManiSkill's GPU simulation runs the same code."
 
 
-def _line_of_the_task(error: Exception, env: BaseEnv) -> traceback.FrameSummary | None:
+def _line_of_the_task(error: Exception, env: BaseEnv) -> Place | None:
     """The innermost line in a file of the task's classes; None where the core broke below it."""
-    files = files_of_task(env)
-    found, below = None, False
-    for frame in traceback.extract_tb(error.__traceback__):
-        if frame.filename in files:
-            found, below = frame, False
-        below |= frame.filename.startswith(_CORE)
-    # A ValueError is how the core refuses what it is given; anything else from there may be its own mistake.
-    return None if below and not isinstance(error, ValueError) else found
+    files, found = files_of_task(task_class(env)), None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = frame.f_code.co_filename
+        if file in files:
+            found = file, line, frame.f_code.co_name
+        elif file.startswith(_CORE) and not isinstance(error, ValueError):
+            # A ValueError is how the core refuses what it is given; anything else from there may be its own mistake.
+            found = None
+    return found

@@ -20,15 +20,15 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.cpu_layout import BODY
 from workbench.core.cpu_state import renew_physics
+from workbench.core.entries import flat_entries
 from workbench.core.partial_reset import active_controllers
 from workbench.core.recorded_run import pose_distances
 from workbench.core.scene_index import present_states, scene_index
-from workbench.core.task_env import flat_entries, to_numpy
+from workbench.core.task_env import to_numpy
 
 _POSE = 7
-_FIXED = 13
-"""Numbers of a state that every actor and articulation has: pose, linear and angular velocity."""
 
 
 def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
@@ -43,11 +43,11 @@ def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, s
     for name, struct in structs.items():
         if env_idx not in seams.envs_of(struct):
             continue
-        value = state.get(name)
+        value, width = state.get(name), BODY + 2 * seams.joints_of(struct)
         if value is None or np.isnan(value).any():
             missed[name] = "the recording has none of this name: it is as the reset left it"
-        elif value.shape != (_width(struct),):
-            missed[name] = f"it has {_width(struct)} numbers now, and {value.shape[-1]} in the recording"
+        elif value.shape != (width,):
+            missed[name] = f"it has {width} numbers now, and {value.shape[-1]} in the recording"
     for name, value in state.items():
         kind = name.partition("/")[0]
         if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
@@ -58,13 +58,10 @@ def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, s
 def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     """Put a recorded state into each of these envs, but for its `misfits`. The others are not touched, and the
     tensors are fetched."""
+    missed = {i: misfits(env, i, state) for i, state in states.items()}
     for name, struct in scene_index(env).states.items():
-        width = _width(struct)
-        rows: dict[int, NDArray] = {}
-        for i in seams.envs_of(struct).tolist():
-            value = states[i].get(name) if i in states else None
-            if value is not None and value.shape == (width,) and not np.isnan(value).any():
-                rows[i] = value
+        fitting = [i for i in seams.envs_of(struct).tolist() if i in states and name not in missed[i]]
+        rows = {i: states[i][name] for i in fitting}
         if rows:
             values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
             struct.set_state(values, torch.tensor([*rows], device=env.device))
@@ -124,7 +121,7 @@ def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float
         return 0.0, 0.0
     metres, radians = pose_distances(*(np.stack([pair[k][:_POSE] for pair in both]) for k in (0, 1)))
     joints = [
-        np.abs(np.subtract(*pair, dtype=np.float64)[_FIXED : (_FIXED + len(pair[0])) // 2]) for pair in both
+        np.abs(np.subtract(*pair, dtype=np.float64)[BODY : (BODY + len(pair[0])) // 2]) for pair in both
     ]
     turned = np.concatenate([radians, *joints]).max()
     return float(metres.max()), float(turned) if np.isfinite(turned) else float("inf")
@@ -136,15 +133,11 @@ def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
 
 
-def _width(struct: Any) -> int:
-    return _FIXED + 2 * int(getattr(struct, "max_dof", 0))
-
-
 def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     """What controllers with a target of their own remember, where it was recorded (``controller/arm/target_qpos``)."""
     if env.agent is None:
         return
-    for name, value in flat_entries(env.agent.get_controller_state(), "controller/"):
+    for name, value in flat_entries(env.agent.get_controller_state(), "controller"):
         for i, state in states.items():
             recorded = state.get(name)
             if recorded is not None and recorded.shape == tuple(value.shape[1:]):

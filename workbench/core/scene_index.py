@@ -244,7 +244,7 @@ def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, in
             places[name], body = (struct, len(rows), None, 0), struct
         else:
             joints = row_index(seams.data_rows_of_articulation(struct))
-            places[name], body = (struct, len(rows), joints, int(struct.max_dof)), struct.root
+            places[name], body = (struct, len(rows), joints, seams.joints_of(struct)), struct.root
         rows.append(seams.data_rows_of(body).long())
     none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
     return row_index(torch.stack(rows, dim=1) if rows else none), still, places

@@ -55,17 +55,8 @@ def batched_system(scene: Any) -> BatchedCpuSystem | None:
 @cache
 def install_index_seams() -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system. Safe to call again."""
-    stock_body_index = PhysxRigidBodyComponentStruct.__dict__["_body_data_index"].func
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
-    stock_articulation_index = Articulation.__dict__["_data_index"].func
     stock_set_ee_action = PDEEPosController.set_action
-    stock_joint_index = ArticulationJoint.__dict__["_data_index"].func
-
-    def body_index(self: Any) -> torch.Tensor:
-        system = batched_system(self.scene)
-        if system is None:
-            return stock_body_index(self)
-        return torch.tensor([system.row_of(body) for body in self._bodies], device=self.device)
 
     def link_data(self: Any) -> torch.Tensor:
         # Only velocities are read this way (`Link.pose` reads the system's tensor itself), and the
@@ -75,29 +66,19 @@ def install_index_seams() -> None:
             system.fetch_link_velocities()
         return stock_body_data(self)
 
-    def articulation_index(self: Any) -> torch.Tensor:
-        system = batched_system(self.scene)
-        if system is None:
-            return stock_articulation_index(self)
-        indices = [system.index_of(articulation) for articulation in self._objs]
-        return torch.tensor(indices, device=self.device, dtype=torch.int32)
-
-    def joint_index(self: Any) -> torch.Tensor:
-        system = batched_system(self.scene)
-        if system is None:
-            return stock_joint_index(self)
-        indices = [system.index_of(articulation) for articulation in self._physx_articulations]
-        return torch.tensor(indices, device=self.device, dtype=torch.int32)
-
     def set_ee_action(self: Any, action: torch.Tensor) -> None:
         if batched_system(self.scene) is None:
             stock_set_ee_action(self, action)
         else:
             _set_ee_action_of_each_env(self, action)
 
-    _replace(PhysxRigidBodyComponentStruct, "_body_data_index", cached_property(body_index))
-    _replace(Articulation, "_data_index", cached_property(articulation_index))
-    _replace(ArticulationJoint, "_data_index", cached_property(joint_index))
+    _find_rows(
+        PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", BatchedCpuSystem.row_of, torch.int64
+    )
+    _find_rows(Articulation, "_data_index", "_objs", BatchedCpuSystem.index_of, torch.int32)
+    _find_rows(
+        ArticulationJoint, "_data_index", "_physx_articulations", BatchedCpuSystem.index_of, torch.int32
+    )
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
 
@@ -128,8 +109,21 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
         controller.set_drive_targets(controller._target_qpos)
 
 
-def _replace(owner: type, name: str, value: cached_property) -> None:
-    # A cached_property assigned after the class body has no name, and raises when it is first read.
+def _find_rows(
+    owner: type, name: str, things: str, find: Callable[[BatchedCpuSystem, Any], int], dtype: torch.dtype
+) -> None:
+    """Let the cached property `name` of a batched CPU scene's struct be where `find` has each of its `things`."""
+    stock = owner.__dict__[name].func
+
+    def rows(self: Any) -> torch.Tensor:
+        system = batched_system(self.scene)
+        if system is None:
+            return stock(self)
+        found = [find(system, thing) for thing in getattr(self, things)]
+        return torch.tensor(found, device=self.device, dtype=dtype)
+
+    value = cached_property(rows)
+    # Assigned after the class body it has no name, and raises when it is first read.
     value.__set_name__(owner, name)
     setattr(owner, name, value)
 
@@ -186,9 +180,7 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
     ``BaseEnv.reset(seed=[...], options={"env_idx": ...})`` takes the list for all envs: the seeds of a
     subset would replace, and shorten, the seeds of the whole batch.
     """
-    every = np.array(env._episode_seed, dtype=np.int64)
-    every[env_idx] = seeds
-    env._episode_seed = every
+    keep_episode_seeds(env, env_idx, seeds)
     env._batched_episode_rng[env_idx] = BatchedRNG.from_seeds(seeds, backend=env._batched_rng_backend)
     env._episode_rng = env._batched_episode_rng[0]
 
@@ -210,7 +202,7 @@ def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
         env._enhanced_determinism = draws_seeds
 
 
-def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: NDArray[np.int64]) -> None:
+def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: Any) -> None:
     """Say that these envs were reset with these seeds; their generators are left as they are."""
     every = np.array(env._episode_seed, dtype=np.int64)
     every[env_idx] = seeds
@@ -261,13 +253,6 @@ def apply_and_fetch(env: BaseEnv) -> None:
     env.scene._gpu_fetch_all()
 
 
-def files_of_task(env: BaseEnv) -> set[str]:
-    """Where the methods of the author's class, and of those that it inherits of below BaseEnv, are written."""
-    classes = [c for c in task_class(env).__mro__ if issubclass(c, BaseEnv) and c is not BaseEnv]
-    functions = [v for c in classes for v in vars(c).values() if hasattr(v, "__code__")]
-    return {function.__code__.co_filename for function in functions}
-
-
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
     """Each env's numpy generators: of its episodes, and of the seeds of its episodes."""
     return {"episode": env._batched_episode_rng.rngs, "main": env._batched_main_rng.rngs}
@@ -306,6 +291,11 @@ def agents(env: Any) -> list[Any]:
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
     """Its row of each env in the tensors of joints, ``px.cuda_articulation_qpos`` and its kin: ``_data_index``."""
     return articulation._data_index
+
+
+def joints_of(struct: Any) -> int:
+    """How many active joints an Articulation has, ``max_dof``; 0 for an Actor."""
+    return int(getattr(struct, "max_dof", 0))
 
 
 def hidden_objects(env: Any) -> list[Any]:

@@ -29,10 +29,11 @@ from mani_skill.utils import common
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.entries import flat_entries
 from workbench.core.recorded_run import OBS, STATE
 from workbench.core.scene_index import StateRows, in_every_env, scene_index, state_rows
 from workbench.core.snapshot import remembering
-from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
+from workbench.core.task_env import TaskEnv, to_numpy
 
 _PICTURES = ("sensor_data", "sensor_param", "pointcloud")
 """Parts of an observation that are made of pictures."""
@@ -102,14 +103,14 @@ def _read(env: BaseEnv) -> tuple[StateRows | None, dict[str, Any]]:
         known = scene_index(env).states
         return None, {n: in_every_env(env, known.get(n), value) for n, value in flat_entries(whole)}
     controllers: Any = {} if env.agent is None else env.agent.get_controller_state()
-    return state_rows(env), dict(flat_entries(controllers, "controller/"))
+    return state_rows(env), dict(flat_entries(controllers, "controller"))
 
 
 def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
     """The entries of the last observation that have a value an env, pictures left out: ``obs/...`` and (N, ...)."""
-    obs = task.obs if isinstance(task.obs, Mapping) else {} if task.obs is None else {"": task.obs}
-    for name, value in flat_entries({k: v for k, v in obs.items() if k not in _PICTURES}):
-        if len(getattr(value, "shape", ())) > 0 and len(value) == task.num_envs:
+    for name, value in flat_entries(task.obs):
+        shape = () if name.partition("/")[0] in _PICTURES else getattr(value, "shape", ())
+        if len(shape) > 0 and shape[0] == task.num_envs:
             yield OBS + name, value
 
 

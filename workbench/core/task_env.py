@@ -7,7 +7,7 @@ GPU simulation, and the caller need not know which.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -21,9 +21,8 @@ from workbench.core import actions
 from workbench.core.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.backends import Backend, choose_backend, keep_render_device
 from workbench.core.broken_rule import BrokenRules, warn_of
-from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class, refuse_unbuilt_env
-from workbench.core.entries import FLAGS, split_entries
+from workbench.core.entries import FLAGS, flat_entries, split_entries
 from workbench.core.env_numbers import envs_of_batch
 from workbench.core.partial_reset import in_ascending_order, seeded
 from workbench.core.rules import Degree, Finding, degrees_of
@@ -274,10 +273,6 @@ class TaskEnv:
         """What the task broke of the rules of GPU simulation; None where none is checked."""
         return getattr(self.env, "broken_rules", None)
 
-    def contacts(self, env: int) -> tuple[Contact, ...]:
-        """What touches what in one env, in its last substep; see `list_contacts`."""
-        return list_contacts(self.env, env)
-
     def close(self) -> None:
         self.env.close()
 
@@ -326,24 +321,14 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
 
 def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
     """As `StepResult.sound_obs`; what is no batch of floats is sound."""
-    leaves = [("", obs)] if not isinstance(obs, Mapping) else flat_entries(obs)
     sound = np.ones(num_envs, bool)
-    for name, value in leaves:
+    for name, value in flat_entries(obs):
         # Pictures are large, and the simulator's own.
         if name.startswith("sensor_data/") or not isinstance(value, torch.Tensor):
             continue
         if value.is_floating_point() and value.ndim and len(value) == num_envs:
             sound &= to_numpy(torch.isfinite(value.reshape(num_envs, -1)).all(dim=1))
     return sound
-
-
-def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of a nested dict, named by the keys that lead to them, joined by ``/``."""
-    for key, value in info.items():
-        if isinstance(value, Mapping):
-            yield from flat_entries(value, f"{prefix}{key}/")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
