@@ -97,7 +97,7 @@ class SnapshotPacker:
     def _what_stays(self, snapshot: Snapshot) -> dict[Any, Any]:
         """What mostly stays, by name."""
         memory, task = snapshot.memory, snapshot.memory.task
-        stays = {"contents": getattr(snapshot.simulation, "contents", ())}
+        stays: dict[Any, Any] = {"contents": getattr(snapshot.simulation, "contents", ())}
         stays |= {"built": task.built, "omitted": task.omitted, **memory.shared_rng._asdict()}
         for purpose, states in memory.rng.items():
             stays |= {(purpose, i): state for i, state in zip(snapshot.env_idx, states, strict=True)}
