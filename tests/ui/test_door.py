@@ -61,7 +61,7 @@ def a_taken_port() -> tuple[socket.socket, int]:
 def test_it_listens_on_loopback_only_unless_told_otherwise(door):
     assert DoorOptions().host == "127.0.0.1"
     assert listening_addresses(door.port) == {"127.0.0.1"}
-    assert door.warning is None and door.elsewhere == ()
+    assert door.warning is None and door.addresses() == (door.url,)
 
 
 def test_localhost_is_the_address_that_is_printed():
@@ -83,9 +83,9 @@ def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys
         # Where the machine has no way out, the page's own address is of no use to others.
         own = [address for host in psutil.net_if_addrs().values() for address in host]
         reach = [a.address for a in own if a.family == socket.AF_INET and not a.address.startswith("127.")]
-        hosts = {url.removeprefix("http://").partition(":")[0] for url in door.elsewhere}
+        hosts = {url.removeprefix("http://").partition(":")[0] for url in door.addresses()} - {"127.0.0.1"}
         assert {socket.gethostname(), *reach} - {"localhost"} >= hosts and hosts >= {*reach[:1]}
-        assert all(url.endswith(f":{door.port}/?token={token_of(door)}") for url in door.elsewhere)
+        assert all(url.endswith(f":{door.port}/?token={token_of(door)}") for url in door.addresses())
         for host in hosts:
             connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
             connection.request(
@@ -98,10 +98,10 @@ def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys
         say_addresses(door.addresses())
         printed = capsys.readouterr().out.splitlines()
         assert [line.split() for line in printed] == [
-            ["or" if i else "page", url] for i, url in enumerate(dict.fromkeys((door.url, *door.elsewhere)))
+            ["or" if i else "page", url] for i, url in enumerate(dict.fromkeys(door.addresses()))
         ]
         door.renew_token()
-        assert all(url.endswith(token_of(door)) for url in (door.url, *door.elsewhere))
+        assert all(url.endswith(token_of(door)) for url in door.addresses())
     finally:
         door.close()
 

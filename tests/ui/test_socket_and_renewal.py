@@ -203,7 +203,7 @@ def test_a_renewed_token_shuts_out_who_had_the_old_one(on_port):
     assert ask(on_port, f"/?token={old_token}", Cookie=None)[0] == 403
     assert ask(on_port, f"/?token={token_of(on_port)}", Cookie=None)[0] == 303
     assert both(on_port) == (200, 101)
-    assert on_port.address("/x/") == f"http://127.0.0.1:{on_port.port}/x/?token={token_of(on_port)}"
+    assert on_port.addresses("/x/") == (f"http://127.0.0.1:{on_port.port}/x/?token={token_of(on_port)}",)
 
 
 def test_an_answer_on_its_way_ends_with_the_token(on_port):

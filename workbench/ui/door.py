@@ -95,15 +95,10 @@ class Door:
     server: viser.ViserServer
     port: int
     """The port that is bound."""
-    url: str
-    """The address to open, with the token."""
     ssh_hint: str
     """What to type on one's own machine to reach the page over ssh."""
     warning: str | None
     """For the person at the terminal: what a wider binding means. None on loopback."""
-    elsewhere: tuple[str, ...]
-    """Addresses for browsers on other machines, with the token; empty on loopback. Which of them leads here depends on
-    the network that the other machine is in."""
     notice: str | None
     """Said once at the start: the page is on another port than usual. None if it is not."""
     _listening: Listening = field(repr=False)
@@ -135,13 +130,19 @@ class Door:
             raise ValueError(f"There is a route for {prefix} already.")
         self._routes[prefix] = (handler, dict(headers or {}))
 
-    def address(self, path: str) -> str:
-        """The address to open, with the token, for ``path`` (from the root: ``/rerun/...``) in place of the page."""
-        return _with_path(self.url, path)
+    @property
+    def url(self) -> str:
+        """The address to open, with the token."""
+        return self.addresses()[0]
 
     def addresses(self, path: str = "/") -> tuple[str, ...]:
-        """The same, and then those of `elsewhere`: each once."""
-        return tuple(dict.fromkeys(_with_path(url, path) for url in (self.url, *self.elsewhere)))
+        """The address to open, with the token, for ``path`` (from the root: ``/rerun/...``), and then those for browsers
+        on other machines, none on loopback: which of them leads here depends on the network that the other machine is
+        in."""
+        token = self._doorkeeper.gate.token
+        shown = f"?token={token}" if token else ""
+        hosts = dict.fromkeys((self._listening.host, *self._listening.hosts_elsewhere()))
+        return tuple(f"http://{host}:{self.port}{path}{shown}" for host in hosts)
 
     def renew_token(self) -> str:
         """Make a new token and return the new address: who has the old one, or its cookie, does not get in any more,
@@ -155,7 +156,6 @@ class Door:
         token = secrets.token_urlsafe(32)
         self._doorkeeper.gate = replace(self._doorkeeper.gate, token=token)
         self._gated.close_pages("the token was renewed")
-        self.url, self.elsewhere = _url(self._listening, token), _elsewhere(self._listening, token)
         return self.url
 
     def close(self) -> None:
@@ -247,7 +247,6 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         options=options,
         server=gated.server,
         port=listening.port,
-        url=_url(listening, token),
         ssh_hint=listening.ssh_hint,
         warning=None
         if listening.loopback
@@ -256,7 +255,6 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
             "door, and the token and everything on the page travel unencrypted. Whoever has the address with the "
             "token can run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
         ),
-        elsewhere=_elsewhere(listening, token),
         notice=None
         if listening.path is not None or options.port in (0, listening.port)
         else f"Port {options.port} is taken by another program, so this page is on port {listening.port}.",
@@ -275,19 +273,6 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
     keeper.tells = True
     door.add_route("/workbench/", folder_handler(web_assets_folder()))
     return door
-
-
-def _with_path(url: str, path: str) -> str:
-    root, _, token = url.partition("/?")
-    return f"{root.rstrip('/')}{path}" + (f"?{token}" if token else "")
-
-
-def _url(listening: Listening, token: str | None, host: str | None = None) -> str:
-    return f"http://{host or listening.host}:{listening.port}/" + (f"?token={token}" if token else "")
-
-
-def _elsewhere(listening: Listening, token: str | None) -> tuple[str, ...]:
-    return tuple(_url(listening, token, host) for host in listening.hosts_elsewhere())
 
 
 def _our_names(options: DoorOptions) -> frozenset[str]:

@@ -13,7 +13,9 @@ from functools import lru_cache
 
 import viser
 from rich.color import Color, ColorType
+from rich.color_triplet import ColorTriplet
 from rich.style import Style
+from rich.terminal_theme import TerminalTheme
 
 from workbench.session.kept_worker import Vitals
 from workbench.session.memory_limit import in_words
@@ -31,9 +33,10 @@ READABLE = 4.5
 """Contrast between text and background that WCAG 2.1 asks for."""
 MOST_SPANS = 1500
 """Over all lines; older ones are shown plain. A line may change its colour with each character."""
-SIXTEEN: tuple[Rgb, ...] = (
-    (0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229),
-    (102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255),
+SIXTEEN = TerminalTheme(
+    (255, 255, 255), (0, 0, 0),
+    [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
+    [(102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255)],
 )  # fmt: skip
 """Where one of them is a background, or stands on one."""
 
@@ -71,17 +74,18 @@ def _look(style: Style) -> tuple[str, str]:
             return " ".join((*classes, "wb-ansi-reverse")), ""
         colour, background = background, colour or Color.from_ansi(7)
     if background is not None:
-        behind = _rgb(background)
-        text = _rgb(colour) if colour is not None else _plain_on(behind)
+        behind = background.get_truecolor(SIXTEEN)
+        text = _plain_on(behind) if colour is None else colour.get_truecolor(SIXTEEN)
         if contrast(text, behind) < READABLE / 2:
             text = _plain_on(behind)
-        return " ".join(classes), f"color:{_hex(text)};background:{_hex(behind)}"
+        return " ".join(classes), f"color:{ColorTriplet(*text).hex};background:{behind.hex}"
     if colour is not None and colour.type is ColorType.STANDARD:
         classes.append(f"wb-ansi-{colour.number}")
     elif colour is not None:
         classes.append("wb-ansi-rgb")
-        light, dark = (readable_on(_rgb(colour), page) for page in (LIGHT_PAGE, DARK_PAGE))
-        return " ".join(classes), f"--on-light:{_hex(light)};--on-dark:{_hex(dark)}"
+        own = colour.get_truecolor(SIXTEEN)
+        light, dark = (ColorTriplet(*readable_on(own, page)) for page in (LIGHT_PAGE, DARK_PAGE))
+        return " ".join(classes), f"--on-light:{light.hex};--on-dark:{dark.hex}"
     return " ".join(classes), ""
 
 
@@ -111,17 +115,6 @@ def _luminance(colour: Rgb) -> float:
 
 def _plain_on(behind: Rgb) -> Rgb:
     return (0, 0, 0) if contrast((0, 0, 0), behind) >= contrast((255, 255, 255), behind) else (255, 255, 255)
-
-
-def _rgb(colour: Color) -> Rgb:
-    if colour.type is ColorType.STANDARD:
-        return SIXTEEN[colour.number or 0]
-    red, green, blue = colour.get_truecolor()
-    return red, green, blue
-
-
-def _hex(colour: Rgb) -> str:
-    return "#" + bytes(colour).hex()
 
 
 LINES_SHOWN = 200
