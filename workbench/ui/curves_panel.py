@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.curves import MOST, TermCurves
+from workbench.session.curves import MOST, Curves, TermCurves
 from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
@@ -25,6 +25,7 @@ COLOURS = (
     "#228be6", "#f08c00", "#2f9e44", "#be4bdb", "#e03131", "#12b886",
     "#fab005", "#7950f2", "#fd7e14", "#15aabf", "#e64980", "#868e96",
 )  # fmt: skip
+NO_CURVES = Curves(0, np.zeros(0, np.int64), np.zeros((0, 1), np.float32), np.zeros((0, 1), np.float32))
 NO_TERMS = TermCurves(np.zeros(0, np.int64), {})
 NEWEST = slice(-LONGEST, None)
 HOW_TO = (
@@ -49,32 +50,25 @@ class CurvesPanel(PagePart[SessionView]):
         self._lost = gui.add_html("", visible=False)
         self._empty = gui.add_html(render("note", text="Curves appear with the second step."))
         self._terms = LineChart(server, gui.add_folder(None), TERMS_HEIGHT)
-        self._how_to = gui.add_html(render("note", text=HOW_TO), visible=False)
-        self._no_curve = gui.add_html("", visible=False)
+        self._about_terms = gui.add_html("", visible=False)
 
     def key(self, view: SessionView) -> object:
         drawn = None if view.curves is None else view.curves.serial
         return drawn, view.task_serial, view.step_serial, view.selected_env, view.timeline.shown
 
     def draw(self, view: SessionView) -> None:
-        curves = view.curves if view.curves is not None and len(view.curves.tick) > 1 else None
-        self._empty.visible = curves is None
-        lost = "" if curves is None else said_of(curves.reward[-1])
-        self._lost.visible = bool(lost)
-        if lost:
-            self._lost.content = render("warning", text=lost)
-        if curves is None:
-            self._reward.hide()
-            self._success.hide()
-        else:
-            x = curves.tick[NEWEST]
-            for chart, title, values, span in (
-                (self._reward, "reward", curves.reward, None),
-                (self._success, "success", curves.success, YES_OR_NO),
-            ):
-                lines = env_lines(values[NEWEST], view.selected_env)
-                shown = np.where(x == view.timeline.tick, lines[-1].values, np.nan)
-                chart.draw(title, x, lines, None if view.timeline.shown is None else shown, span)
+        curves = NO_CURVES if view.curves is None else view.curves
+        self._empty.visible = len(curves.tick) < 2
+        lost = "" if self._empty.visible else said_of(curves.reward[-1])
+        self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
+        x = curves.tick[NEWEST]
+        for chart, title, values, span in (
+            (self._reward, "reward", curves.reward, None),
+            (self._success, "success", curves.success, YES_OR_NO),
+        ):
+            lines = env_lines(values[NEWEST], view.selected_env)
+            shown = np.where(x == view.timeline.tick, lines[-1].values, np.nan)
+            chart.draw(title, x, lines, None if view.timeline.shown is None else shown, span)
         self._draw_terms(view)
 
     def _draw_terms(self, view: SessionView) -> None:
@@ -82,10 +76,9 @@ class CurvesPanel(PagePart[SessionView]):
         if curves is None or len(curves.tick) < 2:
             curves = NO_TERMS
         dense = len(curves.tick) and view.task is not None and "dense" in view.task.reward_mode
-        self._how_to.visible = bool(dense) and not curves.terms and not curves.no_curve
-        self._no_curve.visible = bool(curves.no_curve)
-        if curves.no_curve:
-            self._no_curve.content = render("note", text=no_curve_text(curves.no_curve))
+        text = HOW_TO if dense and not curves.terms else ""
+        text = no_curve_text(curves.no_curve) if curves.no_curve else text
+        self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
         lines = [
             Line(name, values[NEWEST, min(env, values.shape[1] - 1)], colour, 1.6)
             for (name, values), colour in zip(curves.terms.items(), COLOURS, strict=False)
