@@ -8,25 +8,17 @@ import time
 from pathlib import Path
 from types import FrameType
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from workbench.authoring.library_names import named_like_library
-from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import TaskError
-from workbench.authoring.reference import named_file
 from workbench.core.backends import gpu_left_alone
 from workbench.jobs.pool import PoolError
 from workbench.recording.landing import try_folder
 from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
-from workbench.terminal import err, print_finding, print_problem, refuse, say, warn
+from workbench.session.rescore import hidden_in_words
+from workbench.terminal import err, print_finding, print_problem, progress_bar, refuse, say, warn
 
 
 class _Recording:
@@ -65,26 +57,18 @@ class _Recording:
 
 def record_in_terminal(what: RecordOptions) -> int:
     """Record, and say what came of it; returns the exit code."""
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
     before = set(what.out.glob("*.json"))
     try:
         try_folder(what.out)
         asked, _ = with_given_actions(what)
         if mended := mend(what.out):
             err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
-        file = named_file(what.task)
-        for hidden in () if file is None else hidden_by_libraries(file.resolve()):
-            warn(named_like_library(hidden))
+        for notice in hidden_in_words(what.task):
+            warn(notice)
         if (left_alone := gpu_left_alone(what.options.backend)) is not None:
             warn(left_alone)
-        with Bar(*columns, console=err) as bar:
+        left = (TextColumn("left"), TimeRemainingColumn())
+        with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
             with _Recording(bar, asked.successes or asked.episodes) as shown:
                 recorded = record(what, shown.say, shown.show, lambda: shown.asked, print_finding)
             shown.say("recorded", len(recorded.written))

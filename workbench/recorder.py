@@ -39,7 +39,7 @@ from workbench.core.pictures import Picture
 from workbench.core.seams import draws_its_own_seeds, last_observation, open_env, task_class
 from workbench.core.state_columns import StateReading, read_states
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import Request, step_pictures
+from workbench.core.take_pictures import Request, recorded_pictures, step_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles
@@ -50,7 +50,6 @@ from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, Gathere
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.open_task import describe
 from workbench.session.record_live import recovered_in_words
-from workbench.session.recorded_pictures import recorded_pictures
 
 logger = logging.getLogger(__name__)
 _MOST_HELD = 2048

@@ -10,8 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.padding import Padding
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
+from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 from rich.table import Table
 
 from workbench.core.backends import gpu_left_alone
@@ -23,7 +22,7 @@ from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.verdict import Verdict
-from workbench.terminal import Exit, err, out, print_finding, warn
+from workbench.terminal import Exit, out, print_finding, progress_bar, warn
 from workbench.trust_prompt import TerminalPrompt, can_ask
 
 
@@ -33,13 +32,7 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
     if (left_alone := gpu_left_alone(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Bar(*columns, console=err) as bar:
+    with progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
         row = bar.add_task("reading the recordings", total=None)
 
         def tell(now: Progress) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TimeRemainingColumn
 
 from workbench.recording.lerobot_export import DoesNotFit, ExportOptions
 from workbench.recording.sources import Source, sources_among
-from workbench.terminal import err, refuse, say
+from workbench.terminal import progress_bar, refuse, say
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
 
 SCENE, CAMERAS = "scene", "cameras"
@@ -50,9 +50,8 @@ def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], l
         return refuse(str(error))
     made: list[Made] = []
     not_made: list[str] = []
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
     try:
-        with Progress(*columns, console=err) as bar:
+        with progress_bar(TimeRemainingColumn()) as bar:
             row = bar.add_task("reading", total=len(wanted))
             for number, one in enumerate(wanted):
 

@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.segment import Segment
 
 from workbench.machine.guarded_terminal import SafeStream
@@ -72,6 +73,11 @@ _told: set[str] = set()
 def say(text: object) -> None:
     """One line to stdout, not broken where the terminal ends: it can be taken from there."""
     print(plain_text(str(text)), flush=True)
+
+
+def progress_bar(*columns: ProgressColumn) -> Progress:
+    """What is being done, how far it is, and `columns`; on stderr, so that what comes of it can be taken from stdout."""
+    return Progress(TextColumn("{task.description}", markup=False), BarColumn(), *columns, console=err)
 
 
 def say_addresses(addresses: Sequence[str]) -> None:

@@ -157,7 +157,7 @@ class ScriptedWorker:
         grey = np.full((6, 8, 3), 128, np.uint8)
         pose = np.array([1, 0, 0.5, 1, 0, 0, 0], np.float32)
         wanted = [Picture(one.name, one.kind, request.selected_env, pose, grey) for one in request.cameras]
-        self._tell(Pictures(tuple(wanted), 1.0, (len(self._lived),) * len(wanted)))
+        self._tell(Pictures(tuple(wanted), 1.0, len(self._lived)))
 
 
 def scripted(num_envs: int, evaluate: Evaluate = no_success) -> Callable[..., KeptWorker]:

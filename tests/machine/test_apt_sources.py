@@ -5,7 +5,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.machine.apt_sources import (
+from workbench.machine.apt import (
     AptSource,
     backports_source,
     parse_deb822_format,

@@ -10,7 +10,7 @@ from io import StringIO
 
 import pytest
 
-from workbench.machine.quick_imports import quick_imports
+from workbench.machine.child_python import quick_imports
 
 
 @pytest.fixture

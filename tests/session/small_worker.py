@@ -18,8 +18,7 @@ from typing import Any, get_args
 
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
-from workbench.jobs.wire import Call, Unpacker, pack_message
-from workbench.session.calls import Answer
+from workbench.jobs.wire import Answer, Call, Unpacker, pack_message
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import (
     DebuggerListens,

@@ -64,7 +64,7 @@ def test_a_snapshot_whose_parts_never_came_is_none() -> None:
 def test_pictures_belong_to_the_moment_that_they_show_and_fill_half_at_most() -> None:
     limit = 400_000
     history = filled(30, limit)
-    history.add_pictures(Pictures((picture(1),), 5.0, (12,)))
+    history.add_pictures(Pictures((picture(1),), 5.0, 12))
     moment = history.at(12)
     assert moment is not None and list(moment.pictures) == [(1, "sensor", "eye")]
     for serial in range(29):
@@ -104,7 +104,8 @@ def test_a_picture_that_takes_the_place_of_another_is_counted_once_and_with_its_
 
 def test_pictures_come_some_steps_late_and_belong_to_the_step_of_their_number() -> None:
     history = filled(300)
-    history.add_pictures(Pictures((picture(0), picture(1), picture(2)), 5.0, (299, 100, 98)))
+    for env, number in enumerate((299, 100, 98)):
+        history.add_pictures(Pictures((picture(env),), 5.0, number))
     assert [m.serial for m in history.between(0, 299) if m.pictures] == [100, 299]
     assert list(history.at(100).pictures) == [(1, "sensor", "eye")]
     history.add_pictures(PastPictures(5000, (picture(0),)))

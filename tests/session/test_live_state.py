@@ -65,7 +65,7 @@ def running(steps: int = 3) -> LiveState:
 
 
 def report(level: str) -> ReloadReport:
-    return ReloadReport(level, "", 1.0)  # type: ignore[arg-type]
+    return ReloadReport(level, "")  # type: ignore[arg-type]
 
 
 def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on() -> None:
@@ -166,7 +166,7 @@ def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
 def test_pictures_are_those_of_the_env_that_is_looked_at() -> None:
     def pictures(env: int) -> Pictures:
         rgb = np.zeros((2, 2, 3), np.uint8)
-        return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, (0,))
+        return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, 0)
 
     state = running()
     state.change(cameras=(CameraRequest("eye", "sensor"),))

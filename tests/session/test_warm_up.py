@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from workbench.session.messages import TaskOptions
-from workbench.session.warm_up import warm_up
+from workbench.session.reload import warm_up
 
 
 @pytest.mark.usefixtures("renderer")

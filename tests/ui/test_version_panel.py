@@ -22,38 +22,38 @@ class StillSession:
 
 
 def test_level_reason_and_time_are_said() -> None:
-    html = version_html(ReloadReport("patched", "only evaluate changed", 43.2), loaded=True)
+    html = version_html(ReloadReport("patched", "only evaluate changed"), 43.2, loaded=True)
     assert "patched" in html and "43 ms" in html and "only evaluate changed" in html and "go on" in html
 
 
 def test_what_a_build_could_not_carry_is_named_up_to_a_number() -> None:
     missing = {f"actor cube_{i}": "this env has none of this name" for i in range(MOST_SHOWN + 3)}
     html = version_html(
-        ReloadReport("rebuilt", "_load_scene changed", 1500.0, ("actor goal",), missing), True
+        ReloadReport("rebuilt", "_load_scene changed", ("actor goal",), missing), 1500.0, True
     )
     assert "1.5 s" in html and "put back" in html
     assert "actor cube_0" in html and f"actor cube_{MOST_SHOWN}" not in html and "and 3 more" in html
 
 
 def test_a_build_without_a_moment_says_that_an_episode_began() -> None:
-    assert "new episode" in version_html(ReloadReport("rebuilt", "another task", 900.0), loaded=True)
+    assert "new episode" in version_html(ReloadReport("rebuilt", "another task"), 900.0, loaded=True)
 
 
 def test_what_comes_of_the_file_is_escaped() -> None:
-    report = ReloadReport("rebuilt", "<img src=x>", 1.0, (), {"<b>name</b>": "<script>why</script>"})
-    html = version_html(report, loaded=True)
+    report = ReloadReport("rebuilt", "<img src=x>", (), {"<b>name</b>": "<script>why</script>"})
+    html = version_html(report, 1.0, loaded=True)
     assert "<img" not in html and "<script" not in html and "<b>name" not in html
 
 
 def test_before_the_first_reload_it_says_what_saving_does() -> None:
-    assert "Save the file" in version_html(None, loaded=True)
-    assert version_html(None, loaded=False).strip() == ""
+    assert "Save the file" in version_html(None, 0.0, loaded=True)
+    assert version_html(None, 0.0, loaded=False).strip() == ""
 
 
 def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: Panels) -> None:
     """It spoke of the good save before, as if that were what had just been saved."""
     panel = VersionPanel(panels.server, cast(Any, StillSession()))
-    good = ReloadReport("patched", "only evaluate changed", 43.2)
+    good = ReloadReport("patched", "only evaluate changed")
     panel.draw(running(4, reload=good))
     assert "not loaded" not in panels.html()
     panel.draw(running(4, reload=good, stale=True, state="error", refused=problem()))
@@ -72,8 +72,8 @@ def test_times_are_short() -> None:
 
 def test_what_the_author_should_know_stands_there_before_and_after_a_reload() -> None:
     notices = tuple(f"<b>file{i}.py</b> has the name of a library" for i in range(MOST_SHOWN + 2))
-    for report in (None, ReloadReport("same", "", 1.0)):
-        html = version_html(report, True, notices=notices)
+    for report in (None, ReloadReport("same", "")):
+        html = version_html(report, 1.0, True, notices=notices)
         assert (
             html.count("has the name of a library") == MOST_SHOWN
             and "And 2 more." in html

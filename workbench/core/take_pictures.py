@@ -21,7 +21,7 @@ shaders that give more than millimetres.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -306,6 +306,16 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
 
 
 # --- of a step ---------------------------------------------------------------------------------------
+
+
+def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
+    """Which pictures of a task an episode keeps: of a sensor what a policy may see, of a human camera colour."""
+    asked = []
+    for camera in cameras:
+        wanted = ("rgb", "depth", "segmentation") if camera.kind == "sensor" else ("rgb",)
+        kept = tuple(modality for modality in wanted if modality in camera.modalities)
+        asked.append((camera.name, camera.kind, kept))
+    return tuple(asked)
 
 
 def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:

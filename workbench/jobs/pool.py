@@ -9,24 +9,23 @@ resumed by dealing what is left.
 from __future__ import annotations
 
 import os
+import pickle
 import socket
 import subprocess
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Protocol, TypeVar
 
-from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_c
-from workbench.jobs.message_reader import MessageReader
-from workbench.jobs.wire import Unpacker, Unreadable, pack, pack_message
+from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
+from workbench.jobs.wire import Answer, Line, Progress, Unpacker, Unreadable, pack, pack_message
 from workbench.machine.breakpoints import ONE_PROCESS, refuse_breakpoints
-from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.child_python import child_environment, python_command, quick_imports
 from workbench.machine.family import describe_exit, end_family
 from workbench.machine.guarded_terminal import guard_terminal
-from workbench.machine.quick_imports import quick_imports
 
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0
@@ -173,61 +172,48 @@ class _Next:
     """More items, please."""
 
 
-@dataclass(frozen=True)
-class _Result:
-    number: int
-    result: bytes
+_ALL = -1
+"""The number of the last answer: nothing is under way any more, and nothing comes after this. Those before are of items;
+news are the parts of a progress."""
 
 
-@dataclass(frozen=True)
-class _News:
-    news: bytes
+@dataclass(eq=False)
+class _Process:
+    """As the one that started it sees it."""
 
-
-@dataclass(frozen=True)
-class _Failed:
-    why: str
-    problem: Problem | None
-
-
-@dataclass(frozen=True)
-class _Over:
-    """Nothing is under way any more, and nothing comes after this."""
+    line: Line
+    keeper: subprocess.Popen[bytes]
+    begun: set[int] = field(default_factory=set)
+    """The items that it has and has told nothing of."""
 
 
 class _Pool:
-    """The processes, as the one that started them sees them."""
+    """The processes."""
 
     def __init__(self, work: Work, deal: Deal, chunk: int) -> None:
         self._work, self._deal, self._chunk = work, deal, chunk
         self._unpack = Unpacker().unpack
-        self._readers: dict[Connection, MessageReader] = {}
-        self._processes: dict[Connection, subprocess.Popen[bytes]] = {}
-        self._busy: list[Connection] = []
-        self._begun: dict[Connection, set[int]] = {}
-        """The items that each has and has told nothing of."""
+        self._processes: list[_Process] = []
+        self._busy: list[_Process] = []
 
     def start(self) -> None:
         cores = sorted(os.sched_getaffinity(0))
         for i, setup in enumerate(self._work.setups):
             ours, theirs = socket.socketpair()
-            connection = Connection(ours.detach())
             with theirs:
                 module = ("workbench.jobs.pool", str(theirs.fileno()))
-                self._processes[connection] = subprocess.Popen(
+                keeper = subprocess.Popen(
                     python_command("-m", "workbench.machine.family", str(os.getpid()), *module),
                     stdin=subprocess.DEVNULL,
                     pass_fds=[theirs.fileno()],
                     start_new_session=True,  # Ctrl-C in the terminal is for this process, which tells them
                     env=child_environment(),
                 )
-            self._busy.append(connection)
-            self._begun[connection] = set()
-            self._readers[connection] = MessageReader(
-                connection.fileno(), (_Next, _Result, _News, _Failed, _Over)
-            )
-            self._send(connection, cores[i :: len(self._work.setups)] or cores)
-            self._send(connection, (self._work.run, setup))
+            process = _Process(Line(ours, (_Next, Answer, Progress)), keeper)
+            self._processes.append(process)
+            self._busy.append(process)
+            self._send(process, cores[i :: len(self._work.setups)] or cores)
+            self._send(process, (self._work.run, setup))
 
     def serve(self) -> None:
         told, stopped = self._deal.limit(), 0.0
@@ -235,19 +221,20 @@ class _Pool:
         while self._busy:
             if (limit := self._deal.limit()) != told:
                 told = limit
-                for connection in self._busy:
-                    self._send(connection, limit)
+                for process in self._busy:
+                    self._send(process, limit)
             if limit == 0:
                 stopped = stopped or time.monotonic()
                 if time.monotonic() - stopped > _END_SECONDS:
                     raise failure or PoolError(f"a process {self._work.name} did not end in time")
-            for connection in wait(self._busy, _LOOK_SECONDS):
-                assert isinstance(connection, Connection)
+            by_end: dict[Any, _Process] = {process.line.end: process for process in self._busy}
+            for end in wait(by_end, _LOOK_SECONDS):
+                process = by_end[end]
                 try:
-                    self._hear(connection)
+                    self._hear(process)
                 except (TaskError, PoolError) as error:
-                    self._busy.remove(connection)
-                    end_family(self._processes[connection])
+                    self._busy.remove(process)
+                    end_family(process.keeper)
                     failure = failure or error
                     self._deal.lower(0)
         if failure is not None:
@@ -255,54 +242,56 @@ class _Pool:
 
     def end(self) -> None:
         """Wait for those that are done; those that are not, as after a second Ctrl-C, may be where nothing reaches them."""
-        for connection, process in self._processes.items():
-            if connection not in self._busy:
-                self._exit_code(connection, _EXIT_SECONDS)
-            end_family(process)
-            connection.close()
+        for process in self._processes:
+            if process not in self._busy:
+                self._exit_code(process, _EXIT_SECONDS)
+            end_family(process.keeper)
+            process.line.end.close()
 
-    def _hear(self, connection: Connection) -> None:
-        """The next message, if it is all there. The author's code runs at the other end: it may write into any descriptor.
+    def _hear(self, process: _Process) -> None:
+        """What it has said whole. The author's code runs at the other end: it may write into any descriptor.
 
         Raises:
-            TaskError, PoolError: it is the last one of a process that failed.
+            TaskError, PoolError: it failed.
         """
-        begun = self._begun[connection]
         try:
-            said = self._readers[connection].receive(0)
-            if isinstance(said, _Next):
-                numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
-                begun.update(numbers)
-                self._send(connection, numbers)
-            elif isinstance(said, _Result):
-                result = self._unpack(said.result, self._work.result)
-                if said.number not in begun:
-                    raise PoolError(f"a process {self._work.name} told of an item that it does not have")
-                begun.remove(said.number)
-                self._deal.tell(said.number, result)
-            elif isinstance(said, _News):
-                self._deal.say(self._unpack(said.news, self._work.news))
-            elif isinstance(said, _Failed):
-                raise PoolError(said.why) if said.problem is None else TaskError(said.problem)
-            elif said is not None and min(begun, default=_NO_LIMIT) < self._deal.limit():
-                raise PoolError(f"a process {self._work.name} ended before it was done")
-            elif said is not None:
-                self._busy.remove(connection)
+            while process in self._busy and (said := process.line.receive(0)) is not None:
+                self._take(process, said)
         except Unreadable as error:
             raise PoolError(f"a process {self._work.name} sent what cannot be read ({error})") from error
         except EOFError:
-            words = describe_exit(self._exit_code(connection, 2.0))
+            words = describe_exit(self._exit_code(process, 2.0))
             raise PoolError(f"a process {self._work.name} {words}") from None
 
-    def _exit_code(self, connection: Connection, patience: float) -> int | None:
+    def _take(self, process: _Process, said: _Next | Answer | Progress) -> None:
+        if isinstance(said, _Next):
+            numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
+            process.begun.update(numbers)
+            self._send(process, numbers)
+        elif isinstance(said, Progress):
+            self._deal.say(self._unpack(said.part, self._work.news))
+        elif said.number != _ALL:
+            result = self._unpack(said.value, self._work.result)
+            if said.number not in process.begun:
+                raise PoolError(f"a process {self._work.name} told of an item that it does not have")
+            process.begun.remove(said.number)
+            self._deal.tell(said.number, result)
+        elif said.why:
+            raise PoolError(said.why) if said.problem is None else TaskError(said.problem)
+        elif min(process.begun, default=_NO_LIMIT) < self._deal.limit():
+            raise PoolError(f"a process {self._work.name} ended before it was done")
+        else:
+            self._busy.remove(process)
+
+    def _exit_code(self, process: _Process, patience: float) -> int | None:
         try:
-            return self._processes[connection].wait(timeout=patience)
+            return process.keeper.wait(timeout=patience)
         except subprocess.TimeoutExpired:
             return None
 
-    def _send(self, connection: Connection, message: Any) -> None:
+    def _send(self, process: _Process, message: Any) -> None:
         try:
-            connection.send(message)
+            process.line.send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
             pass  # it is gone, and `_hear` says so
 
@@ -335,10 +324,10 @@ class _FarShare:
         return self._limit
 
     def tell(self, number: int, result: Any) -> None:
-        self.send(_Result(number, pack(result)))
+        self.send(Answer(number, pack(result)))
 
     def say(self, news: Any) -> None:
-        self.send(_News(pack(news)))
+        self.send(Progress(0, 0, 0, pack(news)))
 
     def _take(self) -> list[int] | int:
         heard: list[int] | int = self._connection.recv()
@@ -366,10 +355,10 @@ def main(socket_fd: str) -> None:
             run, setup = connection.recv()
         try:
             run(setup, share)
-            share.send(_Over())
+            share.send(Answer(_ALL))
         except TaskError as error:
-            share.send(_Failed(str(error), error.problem))
+            share.send(Answer(_ALL, why=str(error) or "TaskError", problem=error.problem))
         except (OSError, ValueError, RuntimeError) as error:
-            share.send(_Failed(str(error), None))
+            share.send(Answer(_ALL, why=str(error) or type(error).__name__))
     except (ConnectionError, EOFError):
         return  # the process that started this one is gone

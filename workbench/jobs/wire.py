@@ -1,8 +1,10 @@
-"""Messages between processes as bytes: msgpack that is read by the types of the messages, never a pickle.
+"""Messages between processes, calls and their answers among them, and the lines that they go over.
 
-The author's code runs in the worker and may write whatever it likes into its line, so what comes is data of the kinds
-that are awaited, or `Unreadable`. Arrays stand behind the message, one after the other; in the message is what they are.
+The author's code runs in the worker: it may write whatever it likes into its line, and end in the middle of a message.
+So no word of it is believed or waited for: what comes is data of the kinds that are awaited, or `Unreadable`. A message is
+msgpack that is read by its types, never a pickle. Arrays stand behind it, one after the other; in it is what they are.
 
+    4 bytes    length of all that follows; framed as `multiprocessing.connection.Connection` does it
     4 bytes    length of the message
     message    msgpack: name of the class, number of the call (or nil), fields
     arrays     bytes, in the order in which the message names them
@@ -13,15 +15,25 @@ from __future__ import annotations
 import functools
 import math
 import os
+import select
+import socket
 import struct
+import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Any, ClassVar, ForwardRef, Generic, TypeVar, get_args, get_origin
 
 import msgspec
 import numpy as np
 
+from workbench.authoring.problem import Problem
+
+MOST_BYTES = 1 << 30
+"""Of one message. The largest of a healthy task are its meshes and the pictures of all envs: some 100 MB."""
+_PIECE, _SMALL = 1 << 18, 1 << 14
+"""Bytes; the first is more than a socket holds."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
 """Kinds of msgpack's extensions: the next array, or one that came before."""
@@ -30,10 +42,21 @@ _NUMBERS = "biufcSU"
 _LONGEST = 500
 """Bytes of what is said of one array."""
 _Head = tuple[str, int | None, msgspec.Raw]
+Value = TypeVar("Value", covariant=True)
 
 
 class Unreadable(EOFError):
     """What came is no message. Nothing that follows can be read, so the line is at its end; the text says why."""
+
+
+# --- calls -----------------------------------------------------------------------------------------
+
+
+class Question(Generic[Value]):
+    """What a worker can be asked in a `Call`; its answer is a `Value`."""
+
+    part: ClassVar[Any] = None
+    """The type of `Progress.part`."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +64,123 @@ class Call:
     """Request to a worker: an `Answer` with this number comes back, after any count of `Progress`."""
 
     number: int
-    request: Any
-    """A `session.calls.Question`."""
+    request: Question[Any]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a `Call` is."""
+
+    number: int
+    done: int
+    total: int
+    part: bytes = b""
+    """What is known of the answer since the last one, packed; see `Question.part`."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of a `Call`."""
+
+    number: int
+    value: bytes = b""
+    """Packed: only who asked knows of what kind it is to be."""
+    why: str = ""
+    """Why there is no value, for the reader; empty where there is one."""
+    problem: Problem | None = None
+    """What the author's code raised, if that is why."""
+
+
+class CannotAnswer(Exception):
+    """In a worker: a question has no answer here; a sentence."""
+
+
+def value_type(question: type[Question[Any]]) -> Any:
+    """What its answer is to be."""
+    (base,) = question.__orig_bases__  # type: ignore[attr-defined]
+    (kind,) = get_args(base)
+    if isinstance(kind, ForwardRef):
+        kind = vars(sys.modules[question.__module__])[kind.__forward_arg__]
+    return kind
+
+
+# --- lines -----------------------------------------------------------------------------------------
+
+
+class Line:
+    """One end of a socket. What is sent may be sent by another thread than the one that receives."""
+
+    def __init__(
+        self, end: socket.socket, kinds: Sequence[type] = (), questions: Sequence[type] = ()
+    ) -> None:
+        """
+        Args:
+            kinds, questions: that may come, as of `Unpacker`.
+        """
+        self.end = end
+        self._unpacker = Unpacker(kinds, questions)
+        self._poll = select.poll()  # not select(): a server with many pages has descriptors beyond 1024
+        self._poll.register(end, select.POLLIN)
+        self._came, self._piece = bytearray(), memoryview(bytearray(_PIECE))
+        self._at = 0
+        """Where in that the next message begins."""
+
+    def send(self, message: object) -> None:
+        """Waits until all of it is on its way. Raises OSError: the other end is closed."""
+        self.send_bytes(pack_message(message))
+
+    def send_bytes(self, raw: bytes) -> None:
+        """What is packed already. Raises as `send`."""
+        head = _LENGTH.pack(len(raw))
+        for piece in (head + raw,) if len(raw) < _SMALL else (head, raw):  # no copy of what is large
+            self.end.sendall(piece)
+
+    def waits(self) -> bool:
+        """Whether anything came since the last `receive` that gave None."""
+        return bool(self._poll.poll(0))
+
+    def receive(self, timeout: float | None) -> Any:
+        """The next message; None where none is complete within `timeout` seconds, of which None is any number.
+
+        Raises:
+            Unreadable: no message begins here.
+            EOFError: the other end is closed, and all that was sent whole was received.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while (message := self._whole()) is None:
+            if not self._poll.poll(
+                None if deadline is None else 1000 * max(0.0, deadline - time.monotonic())
+            ):
+                return None
+            try:
+                count = self.end.recv_into(self._piece)
+            except OSError as error:
+                raise EOFError from error
+            if not count:
+                raise EOFError
+            if self._at:
+                self._came, self._at = self._came[self._at :], 0
+            self._came += self._piece[:count]
+        return message
+
+    def _whole(self) -> Any | None:
+        """The message that is complete, if one is."""
+        begin = self._at + _LENGTH.size
+        if len(self._came) < begin:
+            return None
+        length = _LENGTH.unpack_from(self._came, self._at)[0]
+        if length > MOST_BYTES:
+            raise Unreadable(f"it says that it is {length} bytes long")
+        came, end = self._came, begin + length
+        if len(came) < end:
+            return None
+        self._at = end
+        if end == len(came):  # what was large is not to be kept until more comes
+            self._came, self._at = bytearray(), 0
+        return self._unpacker.message(memoryview(came)[begin:end])
+
+
+# --- bytes -----------------------------------------------------------------------------------------
 
 
 def pack(value: object) -> bytes:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
-import signal
 import site
 import sys
 from collections.abc import Iterable
@@ -27,7 +26,7 @@ _TCP_RIGHTS = 0b11
 """Bind and connect, from version 4 on."""
 _SCOPES = 0b11
 """Abstract sockets of others, and signals to others, from version 6 on."""
-_PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
+_PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MOST_WRITTEN = 1 << 20
@@ -59,13 +58,6 @@ def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()
     ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     if landlock_version():
         _restrict(tuple(reads), writes)
-
-
-def end_with_parent(parent: int) -> None:
-    """Ask the kernel to end this process with `parent`, which must be the process that made it and have one thread."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:

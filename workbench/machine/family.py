@@ -59,10 +59,15 @@ def begin_family(server: int) -> None:
         _keep(worker)
     # A group of its own: what the author's code sends to its group is not for the keeper.
     os.setsid()
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != keeper:
-        os._exit(1)
+    end_with_parent(keeper)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with_parent(parent: int) -> None:
+    """Ask the kernel to end this process with `parent`, which must be the process that made it and have one thread."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def end_family(keeper: subprocess.Popen[bytes]) -> None:

@@ -13,13 +13,14 @@ JSON.
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import struct
 import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import msgspec
 
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import describe_exit
@@ -76,8 +77,7 @@ def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float =
         return RenderProbe(ok=False, error=f"SAPIEN gave no answer in {timeout_s:.0f} s", env=added)
     for line in child.stdout.splitlines():
         if line.startswith(ANSWER):
-            found = json.loads(line[len(ANSWER) :])
-            return RenderProbe(**{**found, "missing_libraries": tuple(found["missing_libraries"])}, env=added)
+            return replace(msgspec.json.decode(line[len(ANSWER) :], type=RenderProbe), env=added)
     how, last = (
         describe_exit(child.returncode),
         (child.stderr.strip().splitlines() or ["it said nothing"])[-1],
@@ -192,9 +192,7 @@ def _text(buffer: ctypes.Array[ctypes.c_char], offset: int) -> str:
 
 
 def _answer() -> None:
-    probe = _look()
-    fields = ("ok", "name", "driver", "error", "device", "missing_libraries")
-    print("\n" + ANSWER + json.dumps({name: getattr(probe, name) for name in fields}), flush=True)
+    print("\n" + ANSWER + msgspec.json.encode(_look()).decode(), flush=True)
 
 
 if __name__ == "__main__":

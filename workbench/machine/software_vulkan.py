@@ -27,11 +27,12 @@ from workbench.machine.apt import (
     apt_get,
     apt_install,
     available_versions,
+    backports_source,
     can_install_packages,
     has_apt,
     os_release,
+    read_apt_sources,
 )
-from workbench.machine.apt_sources import backports_source, read_apt_sources
 from workbench.machine.private_mesa import private_mesa_env, unpack_private_mesa
 from workbench.machine.render_device import (
     DRIVER_VARIABLES,
@@ -72,12 +73,8 @@ def plan_mesa() -> MesaPlan | None:
     good = first_good_mesa(available_versions(MESA))
     if good is not None:
         return MesaPlan(good)
-    release = os_release()
-    codename = release.get("VERSION_CODENAME", "")
-    if release.get("ID") != "debian" or not codename:
-        return None
-    source = backports_source(read_apt_sources(), codename)
-    return MesaPlan(None, source) if source is not None else None
+    source = backports_of_this_machine()
+    return None if source is None else MesaPlan(None, source)
 
 
 def ensure_render_device(install: bool) -> RenderProbe:

@@ -20,11 +20,10 @@ from itertools import count
 from typing import Any, TypeVar
 
 from workbench.core.camera_settings import CameraKey
-from workbench.jobs.wire import Call, Unpacker, Unreadable
+from workbench.jobs.wire import Answer, Call, Progress, Question, Unpacker, Unreadable, value_type
 from workbench.machine.family import describe_exit
-from workbench.session.calls import Answer, Cancel, Progress, Question, value_type
 from workbench.session.lane import Job, JobFailed
-from workbench.session.messages import Load, PlaceCamera, Request
+from workbench.session.messages import Cancel, Load, PlaceCamera, Request
 from workbench.session.process import WorkerProcess
 
 _LOOK = 0.05

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,7 +17,7 @@ from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import seams
-from workbench.core.camera_report import CameraReport, OfferedPlacement
+from workbench.core.camera_report import CameraReport
 from workbench.core.camera_search import suggest_cameras
 from workbench.core.exchange import put_class, undone
 from workbench.core.pictures import Picture
@@ -26,12 +25,12 @@ from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import take_pictures
 from workbench.core.visibility import Placement, judge_camera, picture_of, small_size
 from workbench.session.open_task import OpenedTask, blamed
+from workbench.session.pacing import now_and_then
 from workbench.session.questions import (
     CameraQuestion,
     DrawCamera,
     JudgeCamera,
     RunCameras,
-    SuggestCameras,
 )
 
 JUDGED_SIDE = 128
@@ -63,7 +62,10 @@ def answer(
         return _judged(opened, question)
     if isinstance(question, RunCameras):
         return run_cameras(opened, question)
-    return _suggested(opened, question, tell, cancelled)
+    progress = now_and_then(tell, _TELL_EVERY)
+    return suggest_cameras(
+        opened.env.env, question.space, question.envs, progress=progress, cancelled=cancelled
+    )
 
 
 def _looked_at(opened: OpenedTask, question: DrawCamera) -> Picture:
@@ -106,25 +108,6 @@ def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
     own = settings or opened.description.camera(key)
     size = None if own is None else small_size(own.width, own.height, JUDGED_SIDE)
     return judge_camera(opened.env.env, key, question.env, settings=settings, size=size, poses=question.poses)
-
-
-def _suggested(
-    opened: OpenedTask,
-    question: SuggestCameras,
-    tell: Callable[[int, int], None],
-    cancelled: Callable[[], bool],
-) -> tuple[OfferedPlacement, ...]:
-    told = 0.0
-
-    def progress(done: int, total: int) -> None:
-        nonlocal told
-        if time.monotonic() - told > _TELL_EVERY:
-            told = time.monotonic()
-            tell(done, total)
-
-    return suggest_cameras(
-        opened.env.env, question.space, question.envs, progress=progress, cancelled=cancelled
-    )
 
 
 # --- the hooks of another text ---------------------------------------------------------------------

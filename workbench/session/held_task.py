@@ -1,4 +1,5 @@
-"""The task that the worker holds open, and what happens when its author's code raises or is left by hand.
+"""The worker's line to the server, the task that it holds open, and what happens when its author's code raises or is left
+by hand.
 
 Whichever part of the worker calls into the task does it through here, so that each failure ends the same way: the steps
 that wait are dropped if somebody interrupted, the server is told with the author's line, and the batch stands again
@@ -7,21 +8,78 @@ where the last step ended.
 
 from __future__ import annotations
 
+import socket
 import traceback
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 from workbench.authoring.modules import is_own_file
 from workbench.authoring.problem import Interrupted, Problem, TaskError, problem_from_exception
 from workbench.core.snapshot import restore_snapshot
+from workbench.jobs.wire import Line, Unreadable
 from workbench.session.interrupts import Interrupts
-from workbench.session.messages import Failed
+from workbench.session.messages import Event, Failed, Load, Request, is_a_step
 from workbench.session.open_task import OpenedTask
 from workbench.session.pulse import Doing, PulseWriter
-from workbench.session.server_line import ServerLine
+from workbench.session.questions import QUESTIONS
 from workbench.session.step_events import StepEvents
 
 _STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting": "reset"}
+
+
+class ServerLine:
+    """What the server asks, in order, and what it is told. One that is gone is an end like any other: nothing raises here,
+    and `closed` says so. What is sent is sent whole, whatever the person at the page interrupts meanwhile.
+    """
+
+    def __init__(self, connection: int, interrupts: Interrupts) -> None:
+        self._line = Line(socket.socket(fileno=connection), get_args(Request), QUESTIONS)
+        self._interrupts = interrupts
+        self._queue: deque[Request] = deque()
+        """What has come and was not carried out."""
+        self.closed = False
+        """The server hung up."""
+
+    def listen(self, timeout: float) -> None:
+        """Wait so many seconds for requests, and queue what has come."""
+        self._queue.extend(self._requests(timeout))
+
+    def next(self) -> Request | None:
+        """The next request that is queued."""
+        return self._queue.popleft() if self._queue else None
+
+    def waits(self) -> bool:
+        """Whether something has come that is not even queued."""
+        return self._line.waits()
+
+    def send(self, event: Event) -> None:
+        try:
+            with self._interrupts.shielded():
+                self._line.send(event)
+        except OSError:
+            self.closed = True
+
+    def drop_steps(self) -> None:
+        """What was pressed while a hook hung is not to make it hang again. Before the page is told of the
+        interrupt: what is pressed after that is meant."""
+        with self._interrupts.shielded():
+            waiting = [*self._queue, *self._requests(0.0)]
+            self._queue = deque(request for request in waiting if not is_a_step(request))
+
+    def _requests(self, timeout: float) -> list[Request]:
+        """What has come; of several loads only the last, since each replaces the one before."""
+        requests: list[Request] = []
+        try:
+            while (request := self._line.receive(0.0 if requests else timeout)) is not None:
+                requests.append(request)
+        except Unreadable:
+            raise  # the server is believed: what it sent and cannot be read is a fault of ours
+        except EOFError:
+            self.closed = True
+        loads = [request for request in requests if isinstance(request, Load)]
+        return [request for request in requests if not isinstance(request, Load) or request is loads[-1]]
 
 
 class HeldTask:

@@ -245,18 +245,12 @@ class History:
         """Pictures are kept with the moment that they show, if it still is."""
         if isinstance(event, PastPictures):
             moment = self.at(event.origin)
-            pairs = [] if moment is None else [(moment, picture) for picture in event.pictures]
         else:
-            recent = {
-                self._moments[-k].number: self._moments[-k]
-                for k in range(min(_RECENT, len(self._moments)), 0, -1)
-            }
-            pairs = [
-                (recent[number], picture)
-                for number, picture in zip(event.numbers, event.pictures, strict=False)
-                if number in recent
-            ]
-        for moment, picture in pairs:
+            recent = islice(reversed(self._moments), _RECENT)
+            moment = next((one for one in recent if one.number == event.number), None)
+        if moment is None:
+            return
+        for picture in event.pictures:
             key = (picture.env, picture.kind, picture.camera)
             before = moment.pictures.get(key)
             if before is None:

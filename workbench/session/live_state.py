@@ -100,7 +100,7 @@ class LiveState:
             task=task,
             task_serial=self.now.task_serial + 1,
             step=event.first,
-            load_milliseconds=event.milliseconds,
+            load_milliseconds=sum(event.milliseconds.values()),
             reload=report,
             activity="",
             stale=stale,

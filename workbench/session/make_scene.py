@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workbench.session.calls import CannotAnswer
+from workbench.jobs.wire import CannotAnswer
+from workbench.session.pacing import now_and_then
 from workbench.session.questions import MakeScene, SceneMade
 
 if TYPE_CHECKING:
     from workbench.core.task_env import TaskEnv
 
-_SAY_EVERY = 50
-"""States between two words on how far it is."""
+_SAY_EVERY = 0.2
+"""Seconds."""
 
 
 class SceneEnv:
@@ -113,10 +114,10 @@ def scene_of(env: TaskEnv, wanted: MakeScene, tell: Callable[[int, int, str], No
     states = wanted.env_states
     count = min(len(values) for values in states.values())
     poses: list[Any] = []
+    say = now_and_then(tell, _SAY_EVERY)
     missed = misfits(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
     for row in range(count):
-        if row % _SAY_EVERY == 0:
-            tell(row, count, f"putting it into state {row} of {count - 1}")
+        say(row, count, f"putting it into state {row} of {count - 1}")
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
         poses.append(read_poses(env.env)[0])
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))

@@ -25,8 +25,7 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.rules import Degree, Finding
 from workbench.core.step import StepResult
-from workbench.jobs.wire import Call
-from workbench.session.calls import Answer, Cancel, Progress, Question
+from workbench.jobs.wire import Answer, Call, Progress, Question
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -294,6 +293,11 @@ class Inspect:
 
 
 @dataclass(frozen=True)
+class Cancel:
+    """Nobody waits for what was asked before. What takes long ends early at any request."""
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -340,7 +344,6 @@ class ReloadReport:
     level: ReloadLevel
     reason: str
     """For example ``only compute_dense_reward changed``."""
-    milliseconds: float
     carried: tuple[str, ...] = ()
     """After a build: actors, articulations and attributes that are as they were, by name."""
     not_carried: dict[str, str] = field(default_factory=dict)
@@ -413,7 +416,7 @@ class Stepped:
     new_parts: dict[int, bytes] = field(default_factory=dict)
     """Parts that were not sent before."""
     number: int = 0
-    """Counts these events since the worker began; `Pictures.numbers` refers to it."""
+    """Counts these events since the worker began; `Pictures.number` refers to it."""
     restored: Restored | None = None
     columns: dict[str, NDArray] = field(default_factory=dict)
     """(N, ...) each, as `core.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
@@ -431,8 +434,8 @@ class Pictures:
 
     pictures: tuple[Picture, ...]
     milliseconds: float
-    numbers: tuple[int, ...] = ()
-    """`Stepped.number` of the moment that each of them shows."""
+    number: int
+    """`Stepped.number` of the moment that they show."""
 
 
 @dataclass(frozen=True)

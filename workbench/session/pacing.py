@@ -9,8 +9,11 @@ second, or one slow picture would be followed by a burst. (The idea is that of m
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 _LONGEST_DEBT = 0.1
 """Wall seconds of simulation that may be caught up with."""
@@ -73,3 +76,16 @@ class Rate:
 
     def clear(self) -> None:
         self._times.clear()
+
+
+def now_and_then(tell: Callable[..., None], seconds: float) -> Callable[..., None]:
+    """Calls `tell` with what it is called with; not within the first `seconds`, nor so soon after the last time."""
+    told = time.monotonic()
+
+    def tell_if_due(*what: Any) -> None:
+        nonlocal told
+        if time.monotonic() - told > seconds:
+            told = time.monotonic()
+            tell(*what)
+
+    return tell_if_due

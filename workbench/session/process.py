@@ -23,11 +23,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import get_args
 
-from workbench.jobs.message_reader import MessageReader
-from workbench.jobs.wire import pack_message
+from workbench.jobs.wire import Line
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import end_family
 from workbench.machine.process_tree import main_thread_ended
@@ -101,8 +99,7 @@ class WorkerProcess:
         finally:
             theirs.close()
             os.close(pulse)
-        self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
-        self._reader = MessageReader(ours.fileno(), get_args(Event))
+        self._line = Line(ours, get_args(Event))
         self._memory = FamilyMemory(self._process.pid)
         self._output = output
         self._waiting: deque[Request] = deque()
@@ -145,10 +142,10 @@ class WorkerProcess:
             Unreadable: what it sent is no event, so it counts as gone; `kill` it.
             EOFError: the worker is gone (see `exit_code`), and all that it sent was received.
         """
-        message = self._reader.receive(timeout)
+        message = self._line.receive(timeout)
         # A process that the author's code forked may hold the socket open after its parent's death.
         if message is None and self._process.poll() is not None:
-            message = self._reader.receive(0)
+            message = self._line.receive(0)
             if message is None:
                 raise EOFError
         return message
@@ -228,13 +225,12 @@ class WorkerProcess:
             self._ending = True
             self._wake.notify()
         # Else the writer may wait for ever where a process that left the group still holds the other end.
-        self._socket.shutdown(socket.SHUT_RDWR)
+        self._line.end.shutdown(socket.SHUT_RDWR)
         self._writer.join()
         for reader in self._readers:
             # A process that left the group may hold the pipe; its thread then stays with it.
             reader.join(timeout=1.0)
-        self._connection.close()
-        self._socket.close()
+        self._line.end.close()
         os.close(self._stacks)
 
     # --- its threads -------------------------------------------------------------------------------
@@ -247,7 +243,7 @@ class WorkerProcess:
                     return
                 request = self._waiting.popleft()
             try:
-                self._connection.send_bytes(pack_message(request))
+                self._line.send(request)
             except OSError:
                 return  # it is gone, and `receive` says so
             except Exception as error:

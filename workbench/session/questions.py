@@ -23,7 +23,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
-from workbench.session.calls import Question
+from workbench.jobs.wire import Question
 from workbench.session.messages import Load, PlaceCamera, Reset, WarmUp
 from workbench.session.rescore_messages import Rescore
 

@@ -23,7 +23,7 @@ from workbench.core.recorded_state import apart, write_states
 from workbench.core.rules import Finding
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import step_pictures
+from workbench.core.take_pictures import recorded_pictures, step_pictures
 from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
 from workbench.machine.current_folder import CurrentFolder
 from workbench.recording.episode_writer import EpisodeFiles
@@ -35,7 +35,6 @@ from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 from workbench.session.policy import find_policy
 from workbench.session.record_options import RecordArguments
-from workbench.session.recorded_pictures import recorded_pictures
 from workbench.session.reload import open_task
 
 _STEPS_WITHOUT_LIMIT = 200

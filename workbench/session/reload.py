@@ -12,7 +12,6 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
 
@@ -43,7 +42,7 @@ from workbench.core.rules import Finding
 from workbench.core.seams import task_class
 from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import list_cameras
+from workbench.core.take_pictures import list_cameras, recorded_pictures, take_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.session.messages import Load, ReloadReport, TaskOptions
 from workbench.session.open_task import (
@@ -87,14 +86,14 @@ def load_version(
     Raises:
         TaskError: the version does not work; `running` is as it was.
     """
-    began, opening = perf_counter(), opening or Opening(begins_anew=True)
+    opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
     opening.on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
     import_modules(request.options.imports)
     loaded = load_task(request.task, source=request.source)
     opening.clock.lap("import")
     try:
-        return _bring_in(request, running, before, loaded, began, opening)
+        return _bring_in(request, running, before, loaded, opening)
     except TaskError as error:
         # The author of a task that runs knows what else is in the file, and so does a person who chose one in it.
         knows_others = False
@@ -160,7 +159,6 @@ def _bring_in(
     running: Running | None,
     before: LoadedTask | None,
     loaded: LoadedTask,
-    began: float,
     opening: Opening,
 ) -> tuple[OpenedTask, ReloadReport | None]:
     try:
@@ -168,18 +166,14 @@ def _bring_in(
         if running is not None and change.level != "rebuilt":
             try:
                 opening.on_activity("trying the new version")
-                opened, report = _exchange(running, loaded, change, opening.clock)
-                return opened, replace(report, milliseconds=1000 * (perf_counter() - began))
+                return _exchange(running, loaded, change, opening.clock)
             except _MustRebuild as why:
                 change = replace(change, level="rebuilt", reason=str(why))
-        opened, report = _build(request, running, loaded, change, opening)
+        return _build(request, running, loaded, change, opening)
     except BaseException:
         # The last good version must not go on with the new one's helper modules and registrations.
         take_back(loaded)
         raise
-    if report is not None:
-        report = replace(report, milliseconds=1000 * (perf_counter() - began))
-    return opened, report
 
 
 # --- which level -----------------------------------------------------------------------------------
@@ -293,7 +287,7 @@ def _exchange(
     )
     if change.level == "cameras":
         description = replace(description, cameras=list_cameras(env))
-    report = ReloadReport(change.level, change.reason, 0.0, not_carried=left)
+    report = ReloadReport(change.level, change.reason, not_carried=left)
     return OpenedTask(loaded, task, description, first, clock.laps), report
 
 
@@ -332,7 +326,7 @@ def _build(
     snapshot = _moment(request, running, loaded)
     opened = build_task(loaded, request.options, opening)
     if snapshot is None:
-        report = ReloadReport("rebuilt", change.reason, 0.0) if running is not None else None
+        report = ReloadReport("rebuilt", change.reason) if running is not None else None
         return opened, report
     action = None if running is None else running.last.action
     try:
@@ -347,7 +341,7 @@ def _build(
     opening.clock.lap("restore")
     level = "restarted" if running is None else "rebuilt"
     reason = change.reason if running is not None else "the worker was started anew"
-    report = ReloadReport(level, reason, 0.0, restored.carried, dict(restored.not_carried))
+    report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried))
     return replace(opened, first=first, milliseconds=opening.clock.laps), report
 
 
@@ -369,3 +363,34 @@ def _restore(
     with blamed("reset", opened.loaded, task):
         report = restore_snapshot(task.env, snapshot, there)
         return task.judge(action if fits else None), report
+
+
+# --- before any ----------------------------------------------------------------------------------------
+
+_SMALL_TASK = "PickCube-v1"
+"""Needs no download, has a sensor and a human camera, and the robot that most tasks have."""
+
+
+def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
+    """What a process does once and takes long over, done before somebody waits for it: make a small env, draw it, and
+    throw it away; ends early when `goes_on` says no.
+
+    To make the first env of a process and read its shapes takes 1.2 s with N = 4 on two cores, the second 0.12, and the
+    first picture of each kind of camera has its shaders compiled: the robot's files, the render system and the shaders
+    are the same, whatever the author's task is.
+
+    It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
+    """
+    # Of the author's own arguments the one that says whether there is anything to draw with.
+    renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
+    try:
+        opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))
+    except TaskError:
+        return
+    try:
+        for camera in recorded_pictures(opened.description.cameras):
+            if not goes_on():
+                return
+            take_pictures(opened.env.env, 0, [camera])
+    finally:
+        opened.env.close()

@@ -109,7 +109,9 @@ def group_episodes(
 def hidden_in_words(reference: TaskName) -> list[str]:
     """What lies beside the task's file and cannot be imported because a library has its name, in sentences."""
     file = named_file(reference)
-    return [] if file is None else [named_like_library(hidden) for hidden in hidden_by_libraries(file)]
+    return (
+        [] if file is None else [named_like_library(hidden) for hidden in hidden_by_libraries(file.resolve())]
+    )
 
 
 def judge_each(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from workbench.authoring.problem import Problem
+from workbench.jobs.wire import Question
 from workbench.recording.sources import Source
-from workbench.session.calls import Question
 from workbench.session.verdict import Verdict
 
 

@@ -33,7 +33,6 @@ from workbench.session.lane import Stopped
 from workbench.session.memory_limit import in_words, total_memory
 from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.review_events import happenings
-from workbench.session.review_rows import Stamp, not_as_read, opening_words, shared, stamps_of
 from workbench.session.review_view import START, Opened, ReviewView
 
 log = logging.getLogger(__name__)
@@ -50,6 +49,16 @@ each time a scene is built."""
 _NEVER = datetime.datetime.min.replace(tzinfo=datetime.timezone.utc)
 _LOOK_EVERY = 2.0
 """Seconds between two looks at whether the files are still what was read."""
+
+
+@dataclass(frozen=True)
+class _Stamp:
+    """Of a file that was read."""
+
+    of: str
+    """The recording's name."""
+    was: tuple[int, int] | None
+    """Size and time of change then; None if it was not there."""
 
 
 @dataclass
@@ -96,7 +105,7 @@ class Review:
         self._closed: set[str] = set()
         """What was closed again since then: the opening may still bring more."""
         self._thread: threading.Thread | None = None
-        self._files: dict[Path, Stamp] = {}
+        self._files: dict[Path, _Stamp] = {}
         """Those of the opened ones."""
         self._unread: tuple[str, ...] = ()
         self._looked = -math.inf
@@ -153,7 +162,7 @@ class Review:
             # A table is most often sorted by date, the newest at its top; but one asks what became of the older one. It is
             # read first too: who sees one before the others are there looks at the first of them from then on.
             wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
-            self._change(loading=opening_words(wanted, 0), problems=tuple(said))
+            self._change(loading=_opening_words(wanted, 0), problems=tuple(said))
             self._thread = threading.Thread(
                 target=self._open, args=(number, wanted, said, state), name="review-open", daemon=True
             )
@@ -194,7 +203,7 @@ class Review:
     def _open(self, number: int, rows: list[LibraryRow], said: list[str], state: int | None) -> None:
         opened: list[Opened] = []
         shapes = SharedShapes()
-        files: dict[Path, Stamp] = {}
+        files: dict[Path, _Stamp] = {}
         shown_at, wait = time.monotonic(), FIRST_SHOWN
         held = self._memory()
         for done, row in enumerate(rows):
@@ -211,10 +220,10 @@ class Review:
                 if opened and time.monotonic() - shown_at > wait:
                     self._show(opened, files, state)
                     shown_at, wait = time.monotonic(), 2 * wait
-                self._change(loading=opening_words(rows, done))
-            stamps = stamps_of(row)
+                self._change(loading=_opening_words(rows, done))
+            stamps = _stamps_of(row)
             try:
-                episode = shared(self._read(row, shapes), shapes)
+                episode = _shared(self._read(row, shapes), shapes)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
                 said += [broken.sentence for broken in episode.unread]
@@ -234,7 +243,7 @@ class Review:
             self._change(loading="", problems=self._unread)
         self._give_scenes(number, [one for one in opened if not one.has_scene], shapes)
 
-    def _show(self, opened: Sequence[Opened], files: Mapping[Path, Stamp], state: int | None) -> None:
+    def _show(self, opened: Sequence[Opened], files: Mapping[Path, _Stamp], state: int | None) -> None:
         """Put on the page what an opening has brought so far, less what was closed again; under the lock.
 
         Whoever has begun to look is left at what they look at.
@@ -275,7 +284,7 @@ class Review:
                     say(one, str(made), False)
                     continue
                 episode, words = (
-                    shared(made[0], shapes),
+                    _shared(made[0], shapes),
                     f"Not put back: {'; '.join(made[1])}." if made[1] else "",
                 )
                 self._replace_opened(
@@ -435,7 +444,7 @@ class Review:
                 return
             self._looked = self._clock()
             files, unread = dict(self._files), self._unread
-        said = tuple(dict.fromkeys((*unread, *not_as_read(files))))
+        said = tuple(dict.fromkeys((*unread, *_not_as_read(files))))
         with self._changed:
             if said != self._view.problems and files == self._files and not self._view.loading:
                 self._change(problems=said)
@@ -499,3 +508,41 @@ class Review:
             return 3600.0
         steps = (self._clock() - self._walk.at) * self._rate()
         return max((int(steps + 1e-6) + 1 - steps) / self._rate(), 1e-3)
+
+
+def _shared(episode: Episode, shapes: SharedShapes) -> Episode:
+    """The same recording, with shapes of others where they look the same."""
+    return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
+
+
+def _stamps_of(row: LibraryRow) -> dict[Path, _Stamp]:
+    """Its files as they are now."""
+    return {path: _Stamp(row.name, _size_and_time(path)) for path in row.paths}
+
+
+def _not_as_read(files: Mapping[Path, _Stamp]) -> list[str]:
+    """A sentence for each file that was deleted or changed since it was read: what was read stays in memory."""
+    said = []
+    for path, stamp in files.items():
+        now = _size_and_time(path)
+        if now is None and stamp.was is not None:
+            said.append(f"{path.name} was deleted since it was opened; what was read of it is still shown.")
+        elif now != stamp.was:
+            said.append(
+                f"{path.name} has changed since it was opened; open {stamp.of} again to see what is in it now."
+            )
+    return said
+
+
+def _opening_words(rows: Sequence[LibraryRow], done: int) -> str:
+    """What is being opened, and how far that is."""
+    name = rows[done].name
+    return f"opening {name}" if len(rows) == 1 else f"opening {done + 1} of {len(rows)}: {name}"
+
+
+def _size_and_time(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns

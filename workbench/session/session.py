@@ -22,9 +22,9 @@ from typing import Any
 from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
+from workbench.jobs.wire import Answer, Progress
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.askers import Asker, Background
-from workbench.session.calls import Answer, Progress
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.curves import TermCurves
 from workbench.session.debugger import listening_for_a_debugger
@@ -132,7 +132,7 @@ class Session:
             self._send, self._asker, self._background, self._note, self.past, self.versions
         )
         """Cameras placed by hand."""
-        listen(self._say_failure)
+        listen(self._say)
         self.versions.start()
         self._worker.start()
 
@@ -320,7 +320,7 @@ class Session:
 
     def close(self) -> None:
         """End the worker and the watcher, and wait for episodes that are being written."""
-        stop_listening(self._say_failure)
+        stop_listening(self._say)
         self._shared.close()
         self.versions.close()
         self._policy_file.close()
@@ -427,10 +427,6 @@ class Session:
         self._note()
         for line in lines:
             self._print(line)
-
-    def _say_failure(self, text: str) -> None:
-        """Of the workbench itself."""
-        self._say(text)
 
     def _say(self, text: str) -> None:
         """In the log on the page and in the terminal."""

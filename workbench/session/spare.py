@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import time
 
-from workbench.jobs.wire import Call
-from workbench.session.calls import Answer
+from workbench.jobs.wire import Answer, Call
 from workbench.session.messages import WarmUp
 from workbench.session.process import WorkerProcess
 

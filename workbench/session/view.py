@@ -101,7 +101,7 @@ class SessionView:
     """Grows with every scene: not with a version that was put on the one that is there."""
     cameras_serial: int = 0
     """Grows with every set of cameras."""
-    load_milliseconds: dict[str, float] = field(default_factory=dict)
+    load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
     """How the version that is shown came in; None for the first."""
     choices: tuple[str, ...] = ()

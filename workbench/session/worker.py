@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +30,17 @@ from workbench.authoring.reference import named_file
 from workbench.core.inspect_env import inspect_env
 from workbench.core.seams import mark_camera_configs
 from workbench.core.step import StepResult
-from workbench.jobs.wire import Call, pack
+from workbench.jobs.wire import Answer, Call, CannotAnswer, Progress, Question, pack
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
-from workbench.session.calls import Answer, Cancel, CannotAnswer, Progress, Question
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
 from workbench.session.go_back import go_back, going_back, judge_moments
-from workbench.session.held_task import HeldTask
+from workbench.session.held_task import HeldTask, ServerLine
 from workbench.session.interrupts import Interrupts
 from workbench.session.make_scene import SceneEnv
 from workbench.session.messages import (
     SCENE_KEPT,
+    Cancel,
     DebuggerListens,
     DrawPast,
     Failed,
@@ -67,15 +66,13 @@ from workbench.session.messages import (
     WarmUp,
 )
 from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
-from workbench.session.pacing import Pacer, Rate
+from workbench.session.pacing import Pacer, Rate, now_and_then
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.questions import CameraQuestion, CaptureMoment, JudgeMoments, MakeScene, RunCameras
 from workbench.session.relive import going_there, step_back
-from workbench.session.reload import Running, load_version
+from workbench.session.reload import Running, load_version, warm_up
 from workbench.session.rescore_messages import Rescore
-from workbench.session.server_line import ServerLine
 from workbench.session.step_events import StepEvents
-from workbench.session.warm_up import warm_up
 from workbench.session.worker_cameras import WorkerCameras
 
 _STATUS_PERIOD = 0.25
@@ -86,7 +83,7 @@ _IDLE = 0.5
 class Worker:
     """The state of the loop; see the module's text."""
 
-    def __init__(self, connection: Connection, pulse: PulseWriter) -> None:
+    def __init__(self, connection: int, pulse: PulseWriter) -> None:
         self._pulse = pulse
         self._interrupts = Interrupts()
         self._line = ServerLine(connection, self._interrupts)
@@ -418,15 +415,7 @@ class Worker:
 
     def _tell_now_and_then(self, words: Callable[..., str]) -> Callable[..., None]:
         """What tells how far a long way is, in `words` of its arguments."""
-        told = time.monotonic()
-
-        def tell(*done: int) -> None:
-            nonlocal told
-            if time.monotonic() - told > _STATUS_PERIOD:
-                told = time.monotonic()
-                self._send_status(None, words(*done))
-
-        return tell
+        return now_and_then(lambda *done: self._send_status(None, words(*done)), _STATUS_PERIOD)
 
     def _send_step(
         self,
@@ -512,4 +501,4 @@ def work(connection: int, pulse: PulseWriter) -> None:
     torch.set_num_threads(1)
     mark_camera_configs()
     nobody_presses_ctrl_c()
-    Worker(Connection(connection), pulse).run()
+    Worker(connection, pulse).run()

@@ -31,11 +31,12 @@ from workbench.core.take_pictures import (
     Request,
     begin_pictures,
     list_cameras,
+    recorded_pictures,
     step_pictures,
     take_pictures,
 )
 from workbench.core.task_env import TaskEnv
-from workbench.session.calls import CannotAnswer
+from workbench.jobs.wire import CannotAnswer
 from workbench.session.camera_answers import answer
 from workbench.session.held_task import HeldTask
 from workbench.session.messages import (
@@ -48,7 +49,6 @@ from workbench.session.messages import (
 )
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.questions import CameraQuestion, Captured, CaptureMoment
-from workbench.session.recorded_pictures import recorded_pictures
 
 _PERIOD = 1 / 15
 _PAUSE_SHARE = 0.3
@@ -76,8 +76,8 @@ class PictureMaker:
         """No step is due: a picture is waited for where it is not ready, since guessing when it will be takes longer."""
         self._moment = 0
         self._begun_of = 0
-        self.moments: list[int] = []
-        """Which moment (as `scene_changed` was told) each of the pictures that were fetched last shows."""
+        self.shown = 0
+        """Which moment (as `scene_changed` was told) the pictures that were fetched last show."""
 
     def watch(self, env_index: int, requests: Sequence[Request]) -> None:
         """From now on these cameras of this env."""
@@ -155,7 +155,7 @@ class PictureMaker:
         assert begun is not None
         asked = time.monotonic()
         made = tuple(begun.finish())
-        self.moments = [self._begun_of] * len(made)
+        self.shown = self._begun_of
         done = time.monotonic()
         waited = done - asked > 0.004
         # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
@@ -308,7 +308,7 @@ class WorkerCameras:
         if made is None:
             return
         pictures, seconds = made
-        self._held.line.send(Pictures(pictures, 1000 * seconds, tuple(self._pictures.moments)))
+        self._held.line.send(Pictures(pictures, 1000 * seconds, self._pictures.shown))
         if not self._renderer_ready:
             self._renderer_ready = True
             self._on_first(True)

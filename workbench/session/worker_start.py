@@ -18,8 +18,8 @@ import traceback
 from pathlib import Path
 from typing import NoReturn
 
+from workbench.machine.child_python import quick_imports
 from workbench.machine.family import begin_family
-from workbench.machine.quick_imports import quick_imports
 
 
 def main() -> None:

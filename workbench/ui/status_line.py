@@ -150,10 +150,10 @@ def _doing(busy: Busy) -> str:
 
 
 def _news(view: SessionView) -> str:
-    report = view.reload
+    report, seconds = view.reload, took(view.load_milliseconds)
     if report is None:
-        return f"new version in {took(sum(view.load_milliseconds.values()))}"
-    return f"{report.level} in {took(report.milliseconds)}" + (f": {report.reason}" if report.reason else "")
+        return f"new version in {seconds}"
+    return f"{report.level} in {seconds}" + (f": {report.reason}" if report.reason else "")
 
 
 class RulesMark(PagePart[SessionView]):

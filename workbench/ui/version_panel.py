@@ -65,19 +65,26 @@ class VersionPanel(PagePart[SessionView]):
         self._task.handle.visible = len(view.choices) > 1
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
-        self._html.content = version_html(view.reload, task is not None, refused, notices)
+        self._html.content = version_html(
+            view.reload, view.load_milliseconds, task is not None, refused, notices
+        )
 
     def _load(self, value: str) -> None:
         self._session.versions.reload(LEVELS[value])
 
 
 def version_html(
-    report: ReloadReport | None, loaded: bool, refused: Problem | None = None, notices: tuple[str, ...] = ()
+    report: ReloadReport | None,
+    milliseconds: float,
+    loaded: bool,
+    refused: Problem | None = None,
+    notices: tuple[str, ...] = (),
 ) -> str:
     """What the page says of the version that runs, and of the file where it holds another; every value escaped.
 
     Args:
         report: how the version that runs came in; None for the first.
+        milliseconds: that it took.
         loaded: whether one runs.
         refused: why what is in the file does not.
         notices: what the author should know of it besides.
@@ -85,11 +92,11 @@ def version_html(
     return render(
         "version",
         report=report,
+        time=took(milliseconds),
         loaded=loaded,
         refused=refused,
         notices=notices,
         most=MOST_SHOWN,
-        took=took,
     )
 
 

@@ -14,11 +14,11 @@ import signal
 import socket
 import sys
 from collections import OrderedDict
-from multiprocessing.connection import Connection
 from typing import Literal, get_args
 
-from workbench.jobs.wire import Unpacker, pack, pack_message
-from workbench.machine.confinement import confine, end_with_parent
+from workbench.jobs.wire import Line, Unpacker, pack, pack_message
+from workbench.machine.confinement import confine
+from workbench.machine.family import end_with_parent
 from workbench.recording.encoded_pictures import EncodedPictures
 from workbench.recording.episode import CameraTrack
 from workbench.recording.library_read import read_found
@@ -71,7 +71,7 @@ def main() -> None:
         pid = os.fork()
         if pid == 0:
             control.close()
-            _be_a_reader(Connection(fds[0]), wanted, nursery)
+            _be_a_reader(socket.socket(fileno=fds[0]), wanted, nursery)
         os.close(fds[0])
         try:
             os.setpgid(pid, pid)  # whoever ends it ends its group, perhaps before it has come to this itself
@@ -80,14 +80,14 @@ def main() -> None:
         control.send(pack(pid))
 
 
-def _be_a_reader(connection: Connection, wanted: NewReader, nursery: int) -> None:
+def _be_a_reader(end: socket.socket, wanted: NewReader, nursery: int) -> None:
     try:
         end_with_parent(nursery)
         os.setpgid(0, 0)
         if wanted.episodes:
             warm_up()
         confine(wanted.paths, MOST_MEMORY)
-        serve(connection)
+        serve(Line(end, get_args(Request)))
     finally:
         os._exit(0)
 
@@ -102,16 +102,16 @@ def warm_up() -> None:
     import workbench.recording.read_episode  # noqa: F401
 
 
-def serve(connection: Connection) -> None:
+def serve(line: Line) -> None:
     """Answer one request after the other, until nobody asks any more."""
-    reader, unpacker = _Reader(), Unpacker(get_args(Request))
+    reader = _Reader()
     while True:
         try:
-            wanted = unpacker.message(connection.recv_bytes())
+            wanted = line.receive(None)
             if isinstance(wanted, Forget):
                 reader.forget(wanted.opened)
                 continue
-            connection.send_bytes(reader.answer(wanted))
+            line.send_bytes(reader.answer(wanted))
         except (EOFError, OSError):
             return
 

@@ -12,12 +12,10 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import get_args
 
-from workbench.jobs.message_reader import MessageReader
-from workbench.jobs.wire import Unpacker, Unreadable, pack, pack_message
+from workbench.jobs.wire import Line, Unpacker, Unreadable, pack
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import describe_exit
 from workbench.recording.reader.requests import Answer, Ended, Forget, NewReader, Request
@@ -69,7 +67,7 @@ class _Nursery:
         with self._lock:
             self._start()
 
-    def new_reader(self, paths: Sequence[Path], episodes: bool) -> tuple[int, Connection]:
+    def new_reader(self, paths: Sequence[Path], episodes: bool) -> tuple[int, Line]:
         """Its process id and the line to it. Raises OSError."""
         ours, theirs = socket.socketpair()
         message = pack(NewReader(list(paths), episodes))
@@ -78,7 +76,7 @@ class _Nursery:
                 control = self._start()
                 try:
                     socket.send_fds(control, [message], [theirs.fileno()])
-                    return self._answer(control), Connection(ours.detach())
+                    return self._answer(control), Line(ours, get_args(Answer))
                 except (OSError, Unreadable):
                     self._end()  # somebody ended it: once more, with another
         ours.close()
@@ -153,7 +151,7 @@ class Reader:
         """Further files: what links in the folder lead to."""
         self._turns = _Turns()
         self._pid = 0
-        self._connection: Connection | None = None
+        self._line: Line | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
         """What those and the folder were when the present process began."""
         self._forgotten: deque[tuple[int, int]] = deque()
@@ -199,16 +197,16 @@ class Reader:
         """The number of the one that is asked for once more."""
         with self._turns.turn(patience):
             while len(answers) < len(requests):
-                connection = self._started()
+                line = self._started()
                 if process is not None and process != self.process:
                     raise NotThere
                 begun = len(answers)
                 try:
-                    self._send_forgotten(connection)
+                    self._send_forgotten(line)
                     for request in requests[begun:]:
-                        connection.send_bytes(pack_message(request))
+                        line.send(request)
                     for _ in requests[begun:]:
-                        if (answer := self._answers.receive(seconds)) is None:
+                        if (answer := line.receive(seconds)) is None:
                             raise TimeoutError
                         answers.append(Answered(answer, self.process))
                 except (OSError, EOFError) as error:
@@ -236,30 +234,26 @@ class Reader:
         with self._turns.turn(None):
             self._kill()
 
-    def _started(self) -> Connection:
+    def _started(self) -> Line:
         paths = (self._folder, *sorted(self._allowed))
         # It may read what was there when it began: a folder that was made anew is another one.
         there = tuple(map(_identity, paths))
-        if self._connection is not None and (
-            there != self._there
-            # Nothing is asked, so this is its end: nobody's fault but of who ended it.
-            or self._connection.poll()
-        ):
+        # Nothing is asked, so what came is its end: nobody's fault but of who ended it.
+        if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
-        if self._connection is None:
-            self._pid, self._connection = nursery.new_reader(paths, self._episodes)
-            self._answers = MessageReader(self._connection.fileno(), get_args(Answer))
+        if self._line is None:
+            self._pid, self._line = nursery.new_reader(paths, self._episodes)
             self.process, self._there = next(self._numbers), there
-        return self._connection
+        return self._line
 
-    def _send_forgotten(self, connection: Connection) -> None:
+    def _send_forgotten(self, line: Line) -> None:
         gone = []
         while self._forgotten:
             process, opened = self._forgotten.popleft()
             if process == self.process:
                 gone.append(opened)
         if gone:
-            connection.send_bytes(pack_message(Forget(gone)))
+            line.send(Forget(gone))
 
     def _ended(self, error: Exception, seconds: float) -> ReaderEnded:
         status = self._kill()
@@ -272,10 +266,10 @@ class Reader:
 
     def _kill(self) -> int | None:
         """Its exit status, where it had ended by itself or is known."""
-        if self._connection is None:
+        if self._line is None:
             return None
-        self._connection.close()
-        self._connection, self.process = None, 0
+        self._line.end.close()
+        self._line, self.process = None, 0
         # With what it started. Its number is its own until the nursery was told.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
