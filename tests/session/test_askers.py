@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from queue import Queue
@@ -185,8 +185,9 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
         assert background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
 
 
-def test_what_nobody_waits_for_gives_way_and_is_done_from_its_beginning_afterwards(
-    background: Background, tmp_path: Path
+@pytest.mark.parametrize("aside", [True, False])
+def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_afterwards(
+    background: Background, tmp_path: Path, aside: bool
 ) -> None:
     load = Load(str(write_task(tmp_path)), TaskOptions(1, env_kwargs={"render_backend": "none"}))
     done, under_way, seen = list[str](), threading.Event(), threading.Event()
@@ -206,14 +207,46 @@ def test_what_nobody_waits_for_gives_way_and_is_done_from_its_beginning_afterwar
             done.append("answered")
             seen.set()
 
-    job = a_job()
+    # What nobody waits for gives way to what was begun before it, too.
+    one, other = a_job(), a_job()
+    job, waiting = (other, one) if aside else (one, other)
+    told = list[str]()
+    job.tell = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
     with ThreadPoolExecutor(2) as threads:
         # It would go on for ever if it did not give way.
-        aside = threads.submit(background.in_turns, job, lambda: side_work(job))
+        side = threads.submit(background.in_turns, job, lambda: side_work(job), aside)
         assert under_way.wait(90)
-        threads.submit(somebody_waits, a_job()).result(timeout=90)
-        aside.result(timeout=90)
+        threads.submit(somebody_waits, waiting).result(timeout=90)
+        side.result(timeout=90)
     assert done == ["begins", "answered", "begins", "ends"]
+    assert told[-1] == "waiting for other work in the background"
+
+
+@pytest.mark.parametrize("aside", [True, False])
+def test_what_was_begun_last_is_left_alone_by_what_waits_behind_it(
+    background: Background, tmp_path: Path, aside: bool
+) -> None:
+    load = Load(str(write_task(tmp_path)), TaskOptions(1, env_kwargs={"render_backend": "none"}))
+    done, has_it, waits = list[str](), threading.Event(), threading.Event()
+    one, other = a_job(), a_job()
+    behind, job = (other, one) if aside else (one, other)
+    behind.check = waits.set  # type: ignore[method-assign]
+
+    def first() -> str:
+        background.ensure(job, load)
+        has_it.set()
+        assert waits.wait(90)
+        for _ in range(5):
+            background.ask(job.check, Reset((0,), 1))
+        done.append("first")
+        return "what it comes to"
+
+    with ThreadPoolExecutor(2) as threads:
+        asked = threads.submit(background.in_turns, job, first)
+        assert has_it.wait(90)
+        threads.submit(background.in_turns, behind, lambda: done.append("behind"), aside).result(timeout=90)
+        assert asked.result(timeout=90) == "what it comes to"
+    assert done == ["first", "behind"]
 
 
 def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes_on_with_another(
@@ -236,13 +269,14 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
             background.ask(job.check, Reset((0,), 1))
             pids.append(background.pid)
 
-    stopped = a_job()
+    stopped, *before, aside, last = (a_job() for _ in range(5))
     with ThreadPoolExecutor(5) as threads:
-        fails = threads.submit(first, a_job())
+        fails = threads.submit(first, last)
         assert has_it.wait(90)
-        queue = [threads.submit(waiting, a_job()) for _ in range(2)]
-        aside = a_job()
-        queue.append(threads.submit(background.in_turns, aside, lambda: background.ensure(aside, load)))
+        queue: list[Future[Any]] = [threads.submit(waiting, job) for job in before]
+        queue.append(
+            threads.submit(background.in_turns, aside, lambda: background.ensure(aside, load), aside=True)
+        )
         given_up = threads.submit(waiting, stopped)
         stopped.stopped = True
         with pytest.raises(Stopped):

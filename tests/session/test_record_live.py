@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, live_session, step, wait_until
+from tests.drive.session import TASKS, live_session, start_over, step, wait_until
+from tests.session.studio import BASE
 from workbench.authoring.load import load_task
+from workbench.core.camera_report import ObjectSummary
+from workbench.core.camera_settings import CameraSettings
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.session.session import Session
@@ -116,6 +119,64 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     assert "its start was drawn for several envs at once" in said
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
     session.change(action_source="random")
+
+
+def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(session: Session) -> None:
+    """A keep to a camera that is judged over seeds; that, and a search, to a keep."""
+    judging = session.studio.judging
+
+    def keep(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
+        session.keep_past((0,))
+        wait_until(session, lambda view: bool(view.recording.keeping.said) or begun(view), "a keep")
+
+    def kept() -> Episode:
+        wait_until(session, lambda view: bool(view.recording.keeping.said), "what was kept")
+        return written(session, session.view().recording.episodes_written)[-1]
+
+    def drawing(view: SessionView) -> bool:
+        return view.recording.keeping.what == "drawing it again" and view.recording.keeping.done > 0
+
+    def judge() -> None:
+        judging.judge(BASE, 60)
+
+    def judged() -> tuple[tuple[int, ...], ObjectSummary]:
+        view = wait_until(session, lambda view: view.studio.progress is None, "the judgement")
+        report = view.studio.looked.report
+        assert report is not None and view.studio.looked.report_seeds == 60 and not view.studio.problem
+        return report.envs, report.wanted_objects(("cube",))[0].summary()
+
+    def search() -> None:
+        judging.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+
+    def found() -> list[tuple[float, CameraSettings]]:
+        view = wait_until(session, lambda view: view.studio.progress is None, "the search")
+        return [(offer.score, offer.settings) for offer in view.studio.looked.suggestions]
+
+    def is_at_it(view: SessionView) -> bool:
+        return view.studio.progress is not None and view.studio.progress.done > 0
+
+    start_over(session, 5)
+    step(session, 20)
+    keep()
+    episode = kept()
+    assert episode.length == 20
+    judge()
+    alone = judged()
+    search()
+    offers = found()
+    assert offers and not session.view().studio.problem
+
+    keep(drawing)
+    judge()
+    assert judged() == alone and not session.view().recording.keeping.said, "the keep came first"
+    assert_same(kept(), episode)
+    for begin, came, of in ((judge, judged, alone), (search, found, offers)):
+        begin()
+        wait_until(session, is_at_it, "its beginning")
+        keep()
+        assert_same(kept(), episode)
+        assert session.view().studio.progress is not None, "the keep came last"
+        assert came() == of
 
 
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:

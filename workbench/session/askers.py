@@ -3,7 +3,8 @@
 The worker that plays has the envs that are on the screen, at their present moment. Judging the past, drawing it again
 and looking at cameras over many seeds take seconds or minutes, and put the envs wherever they like. So that is asked of
 a process of its own with a lower priority, which costs some seconds to start and some 0.75 GB. All jobs of an open task
-share one, in turns; it is ended when there was none in a while. What nobody waits for gives way in the middle.
+share one, in turns; it is ended when there was none in a while. What was begun last is what somebody waits for: all else
+gives way to it in the middle, and goes on afterwards.
 
 A worker answers in order. A job that is stopped, or gives way, leaves one answer owed, which is taken at the end of its
 turn, or the process is ended. One that dies ends the job that asked it, and the next starts another.
@@ -30,6 +31,7 @@ _LOOK = 0.05
 """Seconds between two looks at whether the job is to stop."""
 _NICENESS = 10
 """After the one that plays, where there are fewer cores than work."""
+WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
 """How long the process is kept without a job."""
 _PATIENCE = 3.0
@@ -96,11 +98,15 @@ class Asker:
 
 
 class GaveWay(Exception):
-    """Somebody who waits wants the process: what was asked is to be asked again, from a beginning, in another turn."""
+    """A job that comes first wants the process: what was asked is to be asked again, in another turn."""
+
+
+_Rank = tuple[bool, int]
+"""Whether somebody waits for a job, and its number: the highest comes first."""
 
 
 class Background(Asker):
-    """Asks a process in the background, one thing at a time; all but `pid` and `has` within a turn.
+    """Asks a process in the background, one thing at a time; within a turn, where several jobs share it.
 
     The process ends with the thread that started it, which is that of the lane that came first.
     """
@@ -113,9 +119,8 @@ class Background(Asker):
         super().__init__(self._send_call)
         self._niceness = niceness
         self._turns = threading.Condition()
-        self._taken = self._gives_way = False
-        self._wanted = 0
-        """Jobs that wait for their turn and that somebody waits for."""
+        self._has_it: _Rank | None = None
+        self._waiting: list[_Rank] = []
         self._idle: threading.Timer | None = None
         """Ends the process if nobody wants it meanwhile."""
         self._process: WorkerProcess | None = None
@@ -133,34 +138,34 @@ class Background(Asker):
         return None if process is None else process.pid
 
     @contextmanager
-    def turn(self, job: Job, gives_way: bool = False) -> Iterator[None]:
-        """What a job asks is asked within this, which begins when nobody else has the process.
+    def turn(self, job: Job, aside: bool = False) -> Iterator[None]:
+        """What a job asks is asked within this. It begins when nobody has the process and none that comes first wants it;
+        where one does in the middle, `ask` raises GaveWay.
 
         Args:
-            gives_way: nobody waits for this job: where another wants a turn, `ask` raises GaveWay.
+            aside: nobody waits for this job: all others come first, and not only those that are begun later.
 
         Raises:
             Stopped: the job is to stop.
         """
-        self._take(job, gives_way)
+        self._take(job, (not aside, job.number))
         try:
             yield
         finally:
             self._settle(job)
             with self._turns:
-                self._taken = False
+                self._has_it = None
                 self._rest_later()
                 self._turns.notify_all()
 
-    def in_turns(self, job: Job, work: Callable[[], object]) -> None:
-        """Do what nobody waits for, from its beginning as often as it has to give way."""
+    def in_turns(self, job: Job, work: Callable[[], Value], aside: bool = False) -> Value:
+        """Do `work`, as often as it had to give way once more; the envs are not where it left them then."""
         while True:
             try:
-                with self.turn(job, gives_way=True):
-                    work()
-                    return
+                with self.turn(job, aside):
+                    return work()
             except GaveWay:
-                job.check()
+                job.tell(0, 0, WAITING)
 
     def has(self, load: Load) -> bool:
         """Whether it would not have to be loaded."""
@@ -176,19 +181,24 @@ class Background(Asker):
     def _rest(self) -> None:
         with self._turns:
             # There was a turn since, or there is one, which will say when it ends.
-            if threading.current_thread() is self._idle and not self._taken and not self._wanted:
+            if threading.current_thread() is self._idle and self._has_it is None and not self._waiting:
                 self.end()
 
-    def _take(self, job: Job, gives_way: bool) -> None:
+    def _take(self, job: Job, rank: _Rank) -> None:
         with self._turns:
-            self._wanted += not gives_way
+            self._waiting.append(rank)
             try:
-                while self._taken or (gives_way and self._wanted):
+                while self._has_it is not None or max(self._waiting) > rank:
                     job.check()
                     self._turns.wait(_LOOK)
+                self._has_it = rank
             finally:
-                self._wanted -= not gives_way
-            self._taken, self._gives_way = True, gives_way
+                self._waiting.remove(rank)
+
+    def _is_wanted(self) -> bool:
+        """Whether a job waits that comes before the one that has it."""
+        with self._turns:
+            return self._has_it is not None and max(self._waiting, default=self._has_it) > self._has_it
 
     def start(self) -> None:
         """Have a process.
@@ -256,12 +266,12 @@ class Background(Asker):
 
         Raises:
             JobFailed: it cannot be answered, or the process died.
-            GaveWay: the turn is one that gives way, and is wanted. A load is not left: who waits most likely needs it too.
+            GaveWay: the process is wanted. A load is not left: who waits most likely needs it too.
         """
 
         def check_turn() -> None:
             check()
-            if self._gives_way and self._wanted and not isinstance(question, Load):
+            if not isinstance(question, Load) and self._is_wanted():
                 raise GaveWay
 
         check_turn()  # or who waits would wait for this too

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_frames import compose
-from workbench.core.camera_report import CameraReport, SearchSpace, join_reports
+from workbench.core.camera_report import CameraReport, OfferedPlacement, SearchSpace, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
@@ -118,23 +118,32 @@ class CameraJudging:
         def work(job: Job) -> None:
             with self._judging_anew():
                 question = JudgeCamera(camera.key, None, 0)
-                self._judge(job, self._live, question, camera.now, cases, len(cases), every)
+                self._judge(job, self._live, question, camera.now, [], cases, len(cases), every)
 
         self._live_lane.start(what, work)
 
     def _judge_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
+        question = JudgeCamera(camera.key, camera.now if camera.moved else None, 0)
+
         def work(job: Job) -> None:
-            with self._judging_anew(), self._background.turn(job):
+            reports: list[CameraReport] = []
+
+            def judge() -> None:
+                """From where it gave way."""
                 num_envs = self._background.ensure(job, _for_judging(load))
 
                 def cases() -> Iterator[Case]:
-                    for seed in range(seeds):
-                        if seed % num_envs == 0:
-                            self._background.ask(job.check, Reset(None, FIRST_SEED + seed))
-                        yield seed % num_envs, None, None
+                    for seed in range(begun := len(reports), seeds):
+                        if (env := seed % num_envs) == 0 or seed == begun:
+                            self._background.ask(job.check, Reset(None, FIRST_SEED + seed - env))
+                        yield env, None, None
 
-                question = JudgeCamera(camera.key, camera.now if camera.moved else None, 0)
-                self._judge(job, self._background, question, camera.now, cases(), seeds, num_envs, fresh=True)
+                self._judge(
+                    job, self._background, question, camera.now, reports, cases(), seeds, num_envs, fresh=True
+                )
+
+            with self._judging_anew():
+                self._background.in_turns(job, judge)
 
         self._background_lane.start(f"judging {camera.key[1]} over {seeds} seeds", work)
 
@@ -144,6 +153,7 @@ class CameraJudging:
         asker: Asker,
         question: JudgeCamera,
         now: CameraSettings | None,
+        reports: list[CameraReport],
         cases: Iterable[Case],
         total: int,
         every: int,
@@ -153,10 +163,10 @@ class CameraJudging:
         Args:
             question: but for where.
             now: how the camera stands.
+            reports: of the cases before; gets those of `cases`.
             every: cases after which what is known so far is shown.
             fresh: the cases are fresh episodes.
         """
-        reports: list[CameraReport] = []
         moments: list[JudgedMoment] = []
         for env, poses, moment in cases:
             job.tell(len(reports), total)
@@ -190,17 +200,19 @@ class CameraJudging:
         what = f"searching places for {key[1]}"
 
         def work(job: Job) -> None:
-            self._know(suggestions=(), suggestions_of=key)
-            with self._background.turn(job):
+            def search() -> tuple[OfferedPlacement, ...]:
                 num_envs = self._background.ensure(job, _for_judging(load))
                 self._background.ask(job.check, Reset(None, FIRST_SEED))
                 envs = tuple(range(min(max(1, seeds), num_envs)))
                 job.tell(0, 0, what)
-                found = self._background.ask(
+                return self._background.ask(
                     job.check,
                     SuggestCameras(space, envs),
                     lambda done, total, part: job.tell(done, total, what),
                 )
+
+            self._know(suggestions=(), suggestions_of=key)
+            found = self._background.in_turns(job, search)
             problem = "" if found else f"no place in that box sees {' and '.join(objects)} in any env."
             self._know(suggestions=found, problem=problem)
 

@@ -124,7 +124,7 @@ class Judge:
 
         try:
             for rows in judgement.runs():
-                self._process.in_turns(job, partial(judge_run, rows))
+                self._process.in_turns(job, partial(judge_run, rows), aside=True)
         finally:
             with self._lock:
                 judgement.let_go()

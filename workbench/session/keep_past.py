@@ -18,8 +18,9 @@ rest is as it was said then.
 from __future__ import annotations
 
 import pickle
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ import numpy as np
 from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.recording.columns import BatchPacker
 from workbench.recording.landing import RecordingError
-from workbench.session.askers import Background
+from workbench.session.askers import WAITING, Background
 from workbench.session.episodes import EpisodeFinisher, GatheredEpisode
 from workbench.session.history import History, Lived, Moment
 from workbench.session.lane import Job, JobFailed, Lane
@@ -141,7 +142,7 @@ class PastKeeper:
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""
         self._say("")
-        self._lane.start("waiting for other work in the background", lambda job: self._keep(job, what))
+        self._lane.start(WAITING, lambda job: self._keep(job, what))
 
     def stop(self) -> None:
         """Give up; nothing of it is kept."""
@@ -163,65 +164,65 @@ class PastKeeper:
     # --- on the lane's thread --------------------------------------------------------------------------
 
     def _keep(self, job: Job, what: WhatToKeep) -> None:
-        with self._process.turn(job):
-            self._process.ensure(job, what.load, what.placed)
-            what, lost = self._with_sure_seeds(job, what)
-            writers: dict[int, GatheredEpisode] = {}
-            try:
-                self._capture_all(job, what, writers)
-            except BaseException as error:
-                for episode in writers.values():
-                    episode.writer.discard()
-                if isinstance(error, RecordingError | ValueError):
-                    raise JobFailed(f"it could not be kept: {error}") from error
-                raise
-            job.tell(1, 1, "writing the files")
-            made = [self._finisher.finish(episode) for episode in writers.values()]
-            problems = [result for future in made if isinstance(result := future.result(), str)]
-            if problems:
-                raise JobFailed(problems[0])
-            steps = sum(episode.steps for episode in what.episodes)
-            unfinished = sum(not episode.ended for episode in what.episodes)
-            kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
-            self._say(kept + _not_ended(unfinished, len(made)) + _no_seed(lost, len(made)))
+        seeds: dict[int, int] = {}
+        writers: dict[int, GatheredEpisode] = {}
+        moments, packer = deque(moments_of(what.episodes)), BatchPacker()
+        total = len(moments)
 
-    def _with_sure_seeds(self, job: Job, what: WhatToKeep) -> tuple[WhatToKeep, int]:
-        """Each episode with its seed only if that, alone, starts it; and of how many it does not.
+        def see_again() -> None:
+            """From where it gave way."""
+            self._process.ensure(job, what.load, what.placed)
+            for episode in what.episodes:
+                if episode.env not in seeds:
+                    job.tell(len(seeds), len(what.episodes), "trying the seeds")
+                    seeds[episode.env] = self._sure_seed(job, episode)
+            while moments:
+                job.tell(total - len(moments), total, "drawing it again")
+                moment, rows = moments[0]
+                snapshot = pickle.dumps(what.snapshots[moment.serial])
+                question = CaptureMoment(snapshot, tuple(rows), what.task.can_render)
+                captured = self._process.ask(job.check, question)
+                del moments[0]
+                for row, episodes in rows.items():
+                    for episode in episodes:
+                        if (writer := writers.get(episode.env)) is not None:
+                            writer.acts(moment.acted_by)
+                        else:
+                            seed = seeds[episode.env]
+                            writer = GatheredEpisode.of(self._folder, what.task, episode.env, seed)
+                            writers[episode.env] = writer
+                        writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
+
+        try:
+            self._process.in_turns(job, see_again)
+        except BaseException as error:
+            for episode in writers.values():
+                episode.writer.discard()
+            if isinstance(error, RecordingError | ValueError):
+                raise JobFailed(f"it could not be kept: {error}") from error
+            raise
+        job.tell(1, 1, "writing the files")
+        made = [self._finisher.finish(episode) for episode in writers.values()]
+        problems = [result for future in made if isinstance(result := future.result(), str)]
+        if problems:
+            raise JobFailed(problems[0])
+        steps = sum(episode.steps for episode in what.episodes)
+        unfinished = sum(not episode.ended for episode in what.episodes)
+        lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
+        kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
+        self._say(kept + _not_ended(unfinished, len(made)) + _no_seed(lost, len(made)))
+
+    def _sure_seed(self, job: Job, episode: PastEpisode) -> int:
+        """Its seed, if a reset of its env alone with that gives its first state; else below 0.
 
         What envs that were reset together drew from torch's generator hangs on all of them.
         """
-        sure: list[PastEpisode] = []
-        for done, episode in enumerate(what.episodes):
-            job.tell(done, len(what.episodes), "trying the seeds")
-            sure.append(episode if self._starts(job, episode) else replace(episode, seed=-1))
-        lost = sum(was.seed != now.seed for was, now in zip(what.episodes, sure, strict=True))
-        return replace(what, episodes=tuple(sure)), lost
-
-    def _starts(self, job: Job, episode: PastEpisode) -> bool:
-        """Whether a reset of its env alone with its seed gives its first state."""
         if episode.seed < 0:
-            return True
+            return episode.seed
         first, env = episode.moments[0]
         step = self._process.ask(job.check, Reset((env,), episode.seed))
-        return np.allclose(
-            step.poses[env], first.as_recorded.poses[env], rtol=0, atol=_SAME_START, equal_nan=True
-        )
-
-    def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
-        moments, packer = moments_of(what.episodes), BatchPacker()
-        for done, (moment, rows) in enumerate(moments):
-            job.tell(done, len(moments), "drawing it again")
-            snapshot = pickle.dumps(what.snapshots[moment.serial])
-            question = CaptureMoment(snapshot, tuple(rows), what.task.can_render)
-            captured = self._process.ask(job.check, question)
-            for row, episodes in rows.items():
-                for episode in episodes:
-                    if (writer := writers.get(episode.env)) is not None:
-                        writer.acts(moment.acted_by)
-                    else:
-                        writer = GatheredEpisode.of(self._folder, what.task, episode.env, episode.seed)
-                        writers[episode.env] = writer
-                    writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
+        now, then = step.poses[env], first.as_recorded.poses[env]
+        return episode.seed if np.allclose(now, then, rtol=0, atol=_SAME_START, equal_nan=True) else -1
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
         why, problem = str(failure), failure.problem

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from itertools import count
 
 from workbench.authoring.problem import Problem, shorten
 from workbench.machine.watched_thread import say_failure, watched_thread
@@ -29,8 +30,12 @@ class JobFailed(Exception):
 class Job:
     """One piece of work."""
 
+    _numbers = count(1)
+
     def __init__(self, lane: Lane, what: str, work: Callable[[Job], None]) -> None:
         self._lane, self._what, self.work = lane, what, work
+        self.number = next(self._numbers)
+        """One that is begun later has a higher one, whatever lane it is on."""
         self.stopped = False
         self.progress = Progress(what, 0, 0)
 

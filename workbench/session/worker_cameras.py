@@ -234,7 +234,11 @@ class WorkerCameras:
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
-        drawn = step_pictures(opened.env, request.env_idx, wanted)
+        drawn: list[Picture] = []
+        for env in request.env_idx:
+            if self._held.line.waits():
+                raise CannotAnswer("nobody waits for it any more")
+            drawn += step_pictures(opened.env, [env], wanted)
         return Captured(columns, tuple(drawn))
 
     # --- what the worker does to the scene -----------------------------------------------------------
