@@ -35,7 +35,7 @@ from tests.drive.waiting import until
 from tests.ui.tabs import handshake
 from workbench import terminal
 from workbench.authoring.problem import Problem
-from workbench.machine.guarded_terminal import SafeStream, guard_terminal
+from workbench.machine.terminal_text import SafeStream, guard_terminal
 from workbench.recording.library import Library
 from workbench.session.printed import PrintedLine, Run
 from workbench.terminal import SafeConsole, print_line, print_problem, refuse, say, warn
@@ -221,7 +221,7 @@ def test_a_loggers_record_is_one_line_and_its_traceback_is_text(monkeypatch: pyt
 
 
 def test_what_ends_a_command_is_printed_as_text(child_process: None, tmp_path: Path) -> None:
-    program = f"from workbench.machine.guarded_terminal import guard_terminal\nguard_terminal()\nraise ValueError({EVIL!r})"
+    program = f"from workbench.machine.terminal_text import guard_terminal\nguard_terminal()\nraise ValueError({EVIL!r})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert harmful(done.stderr) == set() and "ValueError" in done.stderr and "\\x1b" in done.stderr
 

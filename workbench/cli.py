@@ -18,8 +18,8 @@ from typing import Annotated, Any
 import tyro
 
 from workbench.machine.child_python import quick_imports
-from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.software_vulkan import use_private_driver
+from workbench.machine.terminal_text import guard_terminal
 from workbench.session.record_options import RecordArguments
 from workbench.task_arguments import (
     BatchArguments,

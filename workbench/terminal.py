@@ -2,7 +2,7 @@
 
 Much of it comes from elsewhere: names of files, notes of recordings, what the author's code raises and prints, the
 paths of requests. What is said here is made harmless where it is known (`terminal_text`); and for what libraries, loggers
-and tracebacks say past this module, `machine.guarded_terminal` stands before both streams of every command.
+and tracebacks say past this module, `machine.terminal_text` stands before both streams of every command.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.segment import Segment
 
-from workbench.machine.guarded_terminal import SafeStream
-from workbench.machine.terminal_text import plain_text
+from workbench.machine.terminal_text import SafeStream, plain_text
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem

@@ -21,7 +21,6 @@ from workbench.authoring.problem import Interrupted
 from workbench.jobs.wire import Answer, Call, Unpacker, pack_message
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import (
-    DebuggerListens,
     ListenForDebugger,
     Load,
     Loaded,
@@ -51,7 +50,9 @@ class SmallWorker:
             if isinstance(request, Quit):
                 return
             if isinstance(request, ListenForDebugger):
-                self.line.send_bytes(pack_message(DebuggerListens(request.port, request.wait)))
+                self.line.send_bytes(
+                    pack_message(Loading(f"debugger at {request.port}, waits: {request.wait}"))
+                )
             if isinstance(request, Call) and isinstance(request.request, RunCameras):
                 words = str(request.request.task).partition(" ")
                 try:

@@ -20,7 +20,6 @@ from workbench.session import kept_worker, process
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.messages import (
-    DebuggerListens,
     Event,
     Load,
     Loading,
@@ -401,11 +400,11 @@ def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> 
 
 def test_every_worker_listens_for_a_debugger_and_only_the_first_waits_for_it() -> None:
     with minded(WorkerOptions(debug_port=1234, debug_wait=True)) as one:
-        assert one.events[0] == DebuggerListens(1234, waits=True)
+        assert one.events[0] == Loading("debugger at 1234, waits: True")
         one.worker.replace()
         one.until_greeted(2)
-        listens = [event for event in one.events if isinstance(event, DebuggerListens)]
-        assert listens == [DebuggerListens(1234, waits=True), DebuggerListens(1234, waits=False)]
+        listens = [e.activity for e in one.events if isinstance(e, Loading) and "debugger" in e.activity]
+        assert listens == ["debugger at 1234, waits: True", "debugger at 1234, waits: False"]
 
 
 def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
@@ -424,9 +423,7 @@ def test_nothing_is_kept_beside_the_worker_that_nobody_asked_for() -> None:
 
 
 def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
-    from workbench.session import spare
-
-    monkeypatch.setattr(spare, "_DELAY", 0.0)
+    monkeypatch.setattr("workbench.session.kept_worker._SPARE_DELAY", 0.0)
     with minded(WorkerOptions(spare=True)) as one:
         assert one.worker.vitals.spare_memory is None
         one.worker.send(do("loaded"))

@@ -25,7 +25,7 @@ from workbench.jobs.wire import Answer, Line, Progress, Unpacker, Unreadable, pa
 from workbench.machine.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.child_python import child_environment, python_command, quick_imports
 from workbench.machine.family import describe_exit, end_family
-from workbench.machine.guarded_terminal import guard_terminal
+from workbench.machine.terminal_text import guard_terminal
 
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0

@@ -3,13 +3,16 @@
 What a terminal gets can clear it, rename its window, write to the clipboard or move the cursor over what stood there;
 characters that turn the direction of writing make a name look like another. So all of these are shown as Python would
 write them (``\\x1b``, ``\\u202e``). Of an author's prints the colours are kept: only ``ESC [ numbers m``, and of the numbers
-only those that a reader can still see through.
+only those that a reader can still see through. `guard_terminal` stands between a process and its terminal.
 """
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 _SHOWN = re.compile(
     "[\x00-\x1f\x7f-\x9f"  # C0, DEL and C1, which some terminals take for ESC and a letter
@@ -74,3 +77,46 @@ def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
         wanted = {"5": 1, "2": 3}.get(kind, 0)
         following = [next(parts, "") for _ in range(wanted)]
         yield (code, *(int(value) if value.isdigit() else 0 for value in (kind, *following)))
+
+
+class SafeStream:
+    """A text stream that lets nothing through but text and its colours."""
+
+    def __init__(self, raw: Any) -> None:
+        self.raw = raw
+
+    def write(self, text: str) -> int:
+        self.raw.write(only_colours(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.raw, name)
+
+
+def guard_terminal() -> None:
+    """From now on nothing that this process prints does more to a terminal than show text in colours.
+
+    For good, since the traceback of what ends the process is printed last of all. What a program of its own writes to
+    the terminal, and native code, does not come by here.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, SafeStream):
+            setattr(sys, name, SafeStream(stream))
+    # Where nobody sets up logging, as here, all records go through this one.
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_OneLine())
+
+
+class _OneLine(logging.Formatter):
+    """A record of a logger is one line, whatever names are in it, and its traceback behind it."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return plain_text(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:
+        return plain_text(super().formatException(ei), "\n\t")

@@ -16,8 +16,6 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from workbench.session.messages import DebuggerListens
-
 USUAL_PORT = 5678
 """Which editors propose to attach to."""
 HOST = "127.0.0.1"
@@ -136,11 +134,9 @@ def port_for_debugger(wanted: int | None) -> int:
     raise ValueError(f"--debug-port {wanted} cannot be listened on: {reason.strerror}")
 
 
-def listening_for_a_debugger(event: DebuggerListens) -> str:
-    """The line of the log."""
-    if event.why_not:
-        return f"no debugger can attach: {event.why_not}"
-    at = f"{HOST}:{event.port}"
-    if event.waits:
+def listening_for_a_debugger(port: int, waits: bool) -> str:
+    """In the log."""
+    at = f"{HOST}:{port}"
+    if waits:
         return f"the worker waits for a debugger at {at}; the task is loaded when one has attached"
     return f"the worker listens for a debugger at {at}"

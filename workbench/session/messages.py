@@ -277,7 +277,7 @@ class WarmUp(Question[None]):
 
 @dataclass(frozen=True)
 class ListenForDebugger:
-    """Have debugpy listen on this machine; answered with `DebuggerListens`."""
+    """Have debugpy listen on this machine; what comes of it is a line of the log."""
 
     port: int
     wait: bool = False
@@ -483,17 +483,6 @@ class RulesBroken:
     """Those of the rows that the event before did not have."""
 
 
-@dataclass(frozen=True)
-class DebuggerListens:
-    """The answer to `ListenForDebugger`."""
-
-    port: int
-    waits: bool = False
-    """Nothing is done until a debugger attaches."""
-    why_not: str = ""
-    """Why none can attach; empty where one can."""
-
-
 Event = (
     Loading
     | Loaded
@@ -507,5 +496,4 @@ Event = (
     | Progress
     | Status
     | RulesBroken
-    | DebuggerListens
 )

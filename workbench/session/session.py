@@ -27,7 +27,6 @@ from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.curves import TermCurves
-from workbench.session.debugger import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import Judge, what_a_load_means
 from workbench.session.judgement import Judgement
@@ -37,7 +36,6 @@ from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.live_state import LiveState, SharedState, scene_kept
 from workbench.session.messages import (
-    DebuggerListens,
     Event,
     Failed,
     Inspect,
@@ -357,8 +355,6 @@ class Session:
             self._on_stepped(event)
         elif isinstance(event, Answer | Progress):
             self._asker.take(event)
-        elif isinstance(event, DebuggerListens):
-            self._say(listening_for_a_debugger(event))
         else:
             with self._lock:
                 self._state.take(event)

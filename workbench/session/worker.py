@@ -15,6 +15,7 @@ the author's code is called, and left, in `held_task`.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +34,12 @@ from workbench.core.step import StepResult
 from workbench.jobs.wire import Answer, Call, CannotAnswer, Progress, Question, pack
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
-from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
+from workbench.session.debugger import (
+    CannotDebug,
+    listen_for_debugger,
+    listening_for_a_debugger,
+    wait_for_debugger,
+)
 from workbench.session.go_back import go_back, going_back, judge_moments
 from workbench.session.held_task import HeldTask, ServerLine
 from workbench.session.interrupts import Interrupts
@@ -41,7 +47,6 @@ from workbench.session.make_scene import SceneEnv
 from workbench.session.messages import (
     SCENE_KEPT,
     Cancel,
-    DebuggerListens,
     DrawPast,
     Failed,
     Inspect,
@@ -278,9 +283,9 @@ class Worker:
         try:
             listen_for_debugger(request.port, self._pulse.hold)
         except CannotDebug as error:
-            self._line.send(DebuggerListens(request.port, why_not=str(error)))
+            print(f"workbench: no debugger can attach: {error}", file=sys.stderr)
             return
-        self._line.send(DebuggerListens(request.port, request.wait))
+        print(f"workbench: {listening_for_a_debugger(request.port, request.wait)}", file=sys.stderr)
         if request.wait:
             self._pulse.begin("waiting for a debugger")
             wait_for_debugger(self._pulse.hold)
