@@ -119,10 +119,18 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: Live
     lived.panels.choose(panel.EPISODE)
     lived.draw()
     assert lived.ends()[0] == -3
+    lived.panels.command("The first moment")
+    assert lived.past.shown == lived.past.last - 3, "of the episode"
+    lived.panels.command("What is live")
+    lived.draw()
     assert lived.panels.control("step to take").options[-2:] == (panel.EVERYTHING, "undo reset of all")
     lived.panels.choose(panel.EVERYTHING)
     lived.draw()
     assert lived.ends()[0] == -8
+    lived.panels.command("The first moment")
+    assert lived.past.shown == lived.past.first
+    lived.panels.command("What is live")
+    lived.draw()
     lived.panels.choose("undo reset of all")
     view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
@@ -187,6 +195,7 @@ def test_a_value_that_no_slider_has_is_refused(lived: Lived) -> None:
 def test_one_moment_alone_has_nothing_to_slide_along(lived: Lived) -> None:
     lived.draw()
     assert not lived.panels.shows(SLIDER)
+    assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
     assert "1 step<" in lived.strip()
     lived.step(1)
     assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)
