@@ -60,7 +60,13 @@ PROTECTED = {
     " authoring/camera_source/test_which_camera.py",
     "authoring/source/trace": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
     " authoring/camera_source/test_which_camera.py",
-    "authoring/source/numbers": "authoring/camera_source/test_rotations.py",
+    "authoring/source/names": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
+    " authoring/camera_source/test_which_camera.py",
+    "authoring/source/numbers": "authoring/camera_source/test_rotations.py authoring/camera_source/test_shapes.py"
+    " authoring/camera_source/test_members.py authoring/camera_source/test_which_camera.py",
+    "authoring/camera_source/disk": "authoring/camera_source/test_disk.py",
+    "authoring/camera_source/edit": "authoring/camera_source/test_which_camera.py"
+    " authoring/camera_source/test_members.py",
     "authoring/camera_source/plan": "authoring/camera_source/test_which_camera.py"
     " authoring/camera_source/test_round_trip.py authoring/camera_source/test_shapes.py",
     "authoring/camera_source/run_hooks": "authoring/camera_source/test_which_camera.py"

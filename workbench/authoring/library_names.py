@@ -162,29 +162,27 @@ def _library_spec(name: str) -> ModuleSpec | None:
 @lru_cache
 def _dependency_names() -> frozenset[str]:
     """Top-level modules of the workbench and of all that it depends on, as far as it is installed."""
-    distributions: dict[str, importlib.metadata.Distribution] = {}
+    found: set[str] = set()
     wanted = [DISTRIBUTION]
     while wanted:
-        name = re.sub(r"[-_.]+", "-", wanted.pop()).lower()
-        if name in distributions:
+        name = _plain(wanted.pop())
+        if name in found:
             continue
         try:
-            distributions[name] = importlib.metadata.distribution(name)
+            required = importlib.metadata.requires(name) or []
         except importlib.metadata.PackageNotFoundError:
             continue  # for another platform, or another version of Python
-        required = distributions[name].requires or []
+        found.add(name)
         wanted += [
-            found[0]
+            said[0]
             for line in required
-            if "extra ==" not in line and (found := re.match(r"[\w.-]+", line)) is not None
+            if "extra ==" not in line and (said := re.match(r"[\w.-]+", line)) is not None
         ]
-    return frozenset({"workbench", *(top for found in distributions.values() for top in _top_level(found))})
+    of = importlib.metadata.packages_distributions()
+    # What was removed by halves has no name.
+    tops = (top for top in of if found.intersection(_plain(owner) for owner in of[top] if owner))
+    return frozenset({"workbench", *tops})
 
 
-def _top_level(distribution: importlib.metadata.Distribution) -> list[str]:
-    if listed := (distribution.read_text("top_level.txt") or "").split():
-        return listed
-    firsts = {
-        line.split(",")[0].partition("/") for line in (distribution.read_text("RECORD") or "").splitlines()
-    }
-    return [first if rest else first.removesuffix(".py") for first, _, rest in firsts]
+def _plain(distribution: str) -> str:
+    return re.sub(r"[-_.]+", "-", distribution).lower()

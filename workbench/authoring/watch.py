@@ -144,23 +144,16 @@ class SourceWatcher:
 
     def _changes(self) -> set[Path]:
         """Files whose content is not what was known, which it is from now on."""
-        changed = self._take_changes(believe_gone=False)
         deadline = time.monotonic() + GONE_S
-        while changed is None:
-            if self._stopped.wait(QUIET_S):
-                return set()
-            changed = self._take_changes(believe_gone=time.monotonic() > deadline)
-        return changed
-
-    def _take_changes(self, believe_gone: bool) -> set[Path] | None:
-        """None for "ask again"."""
-        with self._lock:
-            now = {path: _read(path) for path in self._known}
-            changed = {path for path, content in now.items() if content != self._known[path]}
-            if not believe_gone and any(not now[path] for path in changed):
-                return None
-            self._known.update(now)
-        return changed
+        while not self._stopped.is_set():
+            with self._lock:
+                now = {path: _read(path) for path in self._known}
+                changed = {path for path, content in now.items() if content != self._known[path]}
+                if all(now[path] for path in changed) or time.monotonic() > deadline:
+                    self._known.update(now)
+                    return changed
+            self._stopped.wait(QUIET_S)
+        return set()
 
 
 def _status(path: Path) -> tuple[int, ...]:

@@ -77,6 +77,13 @@ def _alike(a: Any, b: Any, close: float) -> bool:
     return a == b
 
 
+def in_words(value: object) -> str:
+    """What one setting is, for a sentence."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(in_words, value))})"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 MOST_PIXELS = 4096
 """On a side; a typing mistake of a digit more would take the memory of all envs."""

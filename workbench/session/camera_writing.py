@@ -21,7 +21,7 @@ from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import read_exactly
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.core.camera_settings import CameraKey, CameraSettings, differences, in_words
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
 from workbench.session.studio_view import Change, Wish, Writing
@@ -206,10 +206,7 @@ def not_as_written(wanted: CameraSettings, now: CameraSettings) -> str:
     """The numbers that are not as wanted, with both; empty where all are."""
 
     def said(settings: CameraSettings, what: str) -> str:
-        value = vars(settings)["quaternion" if what == "orientation" else what]
-        if isinstance(value, tuple):
-            return "(" + ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in value) + ")"
-        return f"{value:.6g}" if isinstance(value, float) else str(value)
+        return in_words(vars(settings)["quaternion" if what == "orientation" else what])
 
     apart = differences(wanted, now)
     return "; ".join(f"{what}: {said(now, what)}, not {said(wanted, what)}" for what in apart)

@@ -19,7 +19,7 @@ from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.numbers import matrix_text, number_text
 from workbench.authoring.source.text import Refused, Replacement
 from workbench.core.camera_frames import angle_between
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_settings import CameraKey, CameraSettings, in_words
 
 
 def plan_edit(
@@ -185,15 +185,10 @@ def _check_asked(
 
 
 def _differs(name: str, written: CameraSettings, has: CameraSettings) -> str:
-    def say(value: object) -> str:
-        if isinstance(value, tuple):
-            return "(" + ", ".join(say(item) for item in value) + ")"
-        return f"{value:.5g}" if isinstance(value, float) else str(value)
-
     there, here = (
         (*s.position, *s.quaternion) if name == "pose" else getattr(s, name) for s in (written, has)
     )
     return (
-        f"{name} is {say(there)} in the file and {say(here)} in the env, so something else changes it: an argument of "
+        f"{name} is {in_words(there)} in the file and {in_words(here)} in the env, so something else changes it: an argument of "
         "gym.make, a class that inherits, or code that runs later"
     )
