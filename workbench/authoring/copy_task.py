@@ -92,10 +92,14 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
         at = file.import_place()
         changes.append(Replacement(at, at, f"import {'.'.join(package)} as {name}  # its files lie there\n"))
     ids: list[tuple[str, str]] = []
-    for said in _registered_ids(file.module):
-        new = _new_id(str(said.value), number)
+    for _, call, said in registrations_in(file.module):
+        if not isinstance(said, ast.Constant) or not isinstance(said.value, str):
+            raise NoCopy(
+                f"line {call.lineno} registers an id that is computed, so its copy would take the id of the original"
+            )
+        new = _new_id(said.value, number)
         changes.append(Replacement(*file.inner_span(said), f'"{new}"'))
-        ids.append((str(said.value), new))
+        ids.append((said.value, new))
     return file.replaced(changes), tuple(ids)
 
 
@@ -114,20 +118,13 @@ def _absolute(file: SourceFile, node: ast.ImportFrom, package: list[str]) -> Rep
     return Replacement(start, file.token_after(start, "import"), f"from {full} ")
 
 
-def _registered_ids(tree: ast.Module) -> Iterator[ast.Constant]:
-    """Where ``@register_env`` is given an id."""
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.ClassDef):
-            continue
+def registrations_in(tree: ast.Module) -> Iterator[tuple[ast.ClassDef, ast.Call, ast.expr | None]]:
+    """Each class with its ``@register_env(...)``, and what that is given as id."""
+    for node in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
         for call in node.decorator_list:
-            if not isinstance(call, ast.Call) or not ast.unparse(call.func).endswith("register_env"):
-                continue
-            given = (*call.args, *(word.value for word in call.keywords if word.arg == "uid"), None)[0]
-            if not isinstance(given, ast.Constant) or not isinstance(given.value, str):
-                raise NoCopy(
-                    f"line {call.lineno} registers an id that is computed, so its copy would take the id of the original"
-                )
-            yield given
+            if isinstance(call, ast.Call) and ast.unparse(call.func).endswith("register_env"):
+                given = (*call.args, *(word.value for word in call.keywords if word.arg == "uid"), None)[0]
+                yield node, call, given
 
 
 def _new_id(env_id: str, number: int) -> str:

@@ -18,6 +18,8 @@ from __future__ import annotations
 import ast
 from collections.abc import Collection, Iterator
 
+from workbench.authoring.symbols import bound_names
+
 MUTATES = frozenset(
     (
         "append appendleft extend insert add update put push pop popitem clear remove discard set sort reverse "
@@ -154,22 +156,18 @@ def _fresh_names(function: ast.FunctionDef | ast.AsyncFunctionDef, imported: Col
                 if isinstance(target, ast.Name):
                     values.setdefault(target.id, []).append(node.value)
                 else:
-                    stale |= _stored(target)
+                    stale |= bound_names(target)
         elif isinstance(node, (ast.AnnAssign, ast.NamedExpr)) and isinstance(node.target, ast.Name):
             if node.value is not None:
                 values.setdefault(node.target.id, []).append(node.value)
         elif isinstance(node, (ast.For, ast.AsyncFor, ast.comprehension)):
-            stale |= _stored(node.target)
+            stale |= bound_names(node.target)
         elif isinstance(node, ast.withitem) and node.optional_vars is not None:
-            stale |= _stored(node.optional_vars)
+            stale |= bound_names(node.optional_vars)
         elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name:
             stale.add(node.name)
     new = {name for name, bound in values.items() if all(_is_new(value, imported) for value in bound)}
     return (new - stale) | (_HOOK_ARGUMENTS - values.keys())
-
-
-def _stored(target: ast.AST) -> set[str]:
-    return {n.id for n in ast.walk(target) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
 
 
 def _is_new(value: ast.expr, imported: Collection[str]) -> bool:

@@ -25,6 +25,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
+from workbench.authoring.copy_task import registrations_in
 from workbench.authoring.modules import read_source
 from workbench.authoring.reference import RecordedTask
 from workbench.authoring.task_content import CannotRead, read_text, source_hash
@@ -284,21 +285,12 @@ def _class_of(text: str, env_id: str) -> str | None:
         tree = ast.parse(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return None
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
-    for node in classes:
-        if any(_registers(decorator, env_id) for decorator in node.decorator_list):
-            return node.name
-    return env_id if any(node.name == env_id for node in classes) else None
-
-
-def _registers(decorator: ast.expr, env_id: str) -> bool:
-    """Whether it is ``@register_env("this id", ...)``."""
-    if not isinstance(decorator, ast.Call):
-        return False
-    called = decorator.func
-    name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
-    values = [*decorator.args[:1], *(k.value for k in decorator.keywords if k.arg == "uid")]
-    return name == "register_env" and any(isinstance(v, ast.Constant) and v.value == env_id for v in values)
+    for cls, _, said in registrations_in(tree):
+        if isinstance(said, ast.Constant) and said.value == env_id:
+            return cls.name
+    return (
+        env_id if any(isinstance(node, ast.ClassDef) and node.name == env_id for node in tree.body) else None
+    )
 
 
 def _is_installed(file: Path) -> bool:
