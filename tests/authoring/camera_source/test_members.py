@@ -98,6 +98,25 @@ def test_what_cannot_be_added_to_is_refused() -> None:
         assert isinstance(plan, Refused) and "is not a name" in plan.reason
 
 
+@pytest.mark.parametrize("name", ["sapien", "CameraConfig"])
+def test_a_name_that_means_something_else_in_the_file_is_not_imported_over_it(name: str) -> None:
+    source = hook('        return [ManiSkills("cam", pose.Pose([0, 0, 1]), 8, 8, 1.0)]\n')
+    source = source.replace("import sapien\n", "import sapien as pose\n")
+    source = source.replace(
+        "import CameraConfig\n", f"import CameraConfig as ManiSkills\n{name} = 1\n{name} = 2\n"
+    )
+    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
+    line = source.splitlines().index(f"{name} = 2") + 1
+    assert (
+        isinstance(plan, Refused)
+        and f"`{name}` means something else in this file (line {line})" in plan.reason
+    )
+    free = source.replace(f"{name} = 1\n{name} = 2\n", "")
+    plan = planned(plan_add, {FILE: free}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
+    assert isinstance(plan, SourceEdit) and len(plan.notes) == 2, plan
+    assert same_cameras(cameras(plan.new_text), cameras(free) | {(SENSOR, "added"): NEW}), plan.diff
+
+
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_copy_stands_beside_its_original(name: str) -> None:
     source = WRITTEN[name]

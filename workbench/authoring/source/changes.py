@@ -155,11 +155,11 @@ class Changes:
     def _with_part(self, value: Part, into: SourceFile) -> str:
         """An expression of which only a part is changed, in the middle of its text."""
         chain = _chain(value)
-        inner = next(part for part in chain if part in self.texts)
+        inner = chain[-1]
         file, node = self.find(value.at)
         where, within = self.find(inner.at)
         if len(inner.reads) > len(value.reads) or file is not into or where is not file:
-            return number_text(_outward(chain[: chain.index(inner) + 1], float(self.texts[inner])), 7)
+            return number_text(_outward(chain, float(self.texts[inner])), 7)
         (start, end), (a, b) = file.span(node), file.span(within)
         return file.text[start:a] + self.texts[inner] + file.text[b:end]
 
