@@ -89,7 +89,7 @@ PROTECTED = {
     "session/env_table": "session/test_env_table.py session/test_outlier_watch.py",
     "session/curves": "session/test_curves.py",
     "session/verdict": "session/test_verdict.py",
-    "session/judgement": "session/test_judgement.py",
+    "session/judgement": "session/test_judgement.py session/test_judge.py",
     "session/kept_worker": "session/test_kept_worker.py",
     "ui/gate": "ui/test_gate.py",
     "ui/door": "ui/test_door.py ui/test_socket_and_renewal.py ui/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"

@@ -206,7 +206,7 @@ def rescore(
             it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
     with quick_imports():
-        from workbench.rescore_command import run_rescore
+        from workbench.rescore_command import RescoreOptions, run_rescore
 
     if task is not None and recorded_source:
         return refuse("--task and --recorded-source name two versions to judge with: give one of them")
@@ -220,7 +220,6 @@ def rescore(
     use_private_driver()
     from workbench.authoring.problem import TaskError
     from workbench.session.clearance import NotTrusted
-    from workbench.session.rescore_all import RescoreOptions
     from workbench.trust_prompt import not_trusted
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)

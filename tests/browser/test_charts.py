@@ -53,7 +53,7 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
 ) -> None:
     """It went blank, and stayed so: each new range or line moved the x axis, until none of the steps was on it."""
     clock = Clock()
-    panel = CurvesPanel(server, lambda: None)
+    panel = CurvesPanel(server)
     with page_at(browser, f"http://127.0.0.1:{server.get_port()}") as (page, errors):
         expect(page.get_by_text("Curves appear with the second step.")).to_be_visible()
 

@@ -23,8 +23,7 @@ from workbench.core.rules import Finding
 from workbench.jobs.wire import Answer, Call, Unpacker, Unreadable, pack, pack_message, value_type
 from workbench.recording.sources import Source
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status, Stepped, TaskOptions
-from workbench.session.questions import QUESTIONS
-from workbench.session.rescore_messages import Rescore
+from workbench.session.questions import QUESTIONS, Rescore
 
 EVENTS: tuple[type, ...] = get_args(Event)
 WHATEVER = st.recursive(

@@ -32,7 +32,7 @@ def test_a_row_is_a_step() -> None:
 def test_a_task_has_empty_curves_before_its_first_step() -> None:
     curves = RecentSteps(N).curves()
     assert curves.tick.tolist() == [] and curves.reward.shape == curves.success.shape == (0, N)
-    assert RecentSteps(N).terms().terms == {}
+    assert curves.terms == {}
 
 
 @pytest.mark.parametrize("count", [999, 1000, 1001, 2048, 2500])
@@ -40,29 +40,29 @@ def test_only_the_newest_are_kept_oldest_first(count: int) -> None:
     recent = RecentSteps(N)
     for number in range(count):
         recent.add(step(number, reach=[number, -number, 0]))
-    curves, terms = recent.curves(), recent.terms()
+    curves = recent.curves()
     kept = list(range(max(0, count - 1000), count))
-    assert curves.tick.tolist() == terms.tick.tolist() == [number + 1 for number in kept]
-    assert curves.reward[:, 1].tolist() == terms.terms["reach"][:, 0].tolist() == kept
+    assert curves.tick.tolist() == [number + 1 for number in kept]
+    assert curves.reward[:, 1].tolist() == curves.terms["reach"][:, 0].tolist() == kept
     assert curves.serial == count
 
 
 def test_curves_that_were_taken_do_not_change_and_a_task_without_success_has_none() -> None:
     recent = RecentSteps(N)
-    recent.add(replace(step(1), evaluate={}))
+    recent.add(replace(step(1), evaluate={"reward_terms/reach": np.ones(N)}))
     curves = recent.curves()
-    before = curves.reward.copy()
-    assert recent.curves() is curves, "copied once"
+    before = curves.reward.copy(), curves.terms["reach"].copy()
+    assert np.shares_memory(recent.curves().reward, curves.reward), "nothing is copied"
     for number in range(2000):
         recent.add(step(number))
-    assert np.array_equal(curves.reward, before) and np.isnan(curves.success).all()
+    assert np.array_equal((curves.reward, curves.terms["reach"]), before) and np.isnan(curves.success).all()
 
 
 def test_terms_are_kept_by_their_name_and_other_entries_are_not() -> None:
     recent = RecentSteps(N)
     recent.add(step(1, reach=[1, 2, 0]))
     recent.add(step(2, reach=[3, 4, 0], push=[5, 6, 7]))
-    curves = recent.terms()
+    curves = recent.curves()
     assert curves.tick.tolist() == [1, 2]
     assert curves.terms.keys() == {"reach", "push"}
     assert curves.terms["reach"].tolist() == [[1, 2, 0], [3, 4, 0]]
@@ -76,12 +76,12 @@ def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
     result = replace(result, others={"reward_terms/mean": mean, "reward_terms/note": note, "other": note})
     for _ in range(2):
         recent.add(result)
-    curves = recent.terms()
+    curves = recent.curves()
     assert (list(curves.terms), curves.no_curve) == (["reach"], ("both", "mean", "note"))
     recent.add(replace(result, others={"reward_terms": note}, evaluate={}))
-    assert recent.terms().no_curve == ("reward_terms",)
+    assert recent.curves().no_curve == ("reward_terms",)
     recent.add(step(1, reach=[1, 2, 3]))
-    assert recent.terms().no_curve == ()
+    assert recent.curves().no_curve == ()
 
 
 def test_a_term_that_a_new_version_drops_goes_when_its_last_value_goes() -> None:
@@ -89,20 +89,20 @@ def test_a_term_that_a_new_version_drops_goes_when_its_last_value_goes() -> None
     recent.add(step(1, reach=[1, 1, 1]))
     for number in range(999):
         recent.add(step(number, push=[1, 1, 1]))
-    assert recent.terms().terms.keys() == {"reach", "push"}
+    assert recent.curves().terms.keys() == {"reach", "push"}
     recent.add(step(1, push=[1, 1, 1]))
-    assert recent.terms().terms.keys() == {"push"}
+    assert recent.curves().terms.keys() == {"push"}
 
 
 def test_the_number_of_terms_is_bounded_and_those_that_are_long_gone_make_room() -> None:
     recent = RecentSteps(N)
     recent.add(step(1, **{f"term{i}": [0] * N for i in range(MOST + 5)}))
     recent.add(step(2, other=[1] * N))
-    assert list(recent.terms().terms) == [f"term{i}" for i in range(MOST)]
+    assert list(recent.curves().terms) == [f"term{i}" for i in range(MOST)]
     for number in range(1100):
         recent.add(step(number))
     recent.add(step(3, other=[1] * N))
-    assert list(recent.terms().terms) == ["other"]
+    assert list(recent.curves().terms) == ["other"]
 
 
 def test_rows_that_are_wanted_stay_with_their_numbers_and_a_missing_value_is_none() -> None:

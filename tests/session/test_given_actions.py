@@ -23,8 +23,8 @@ def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: str) -> None:
     one = np.asarray(np.arange(12.0).reshape(4, 3), order=order)  # type: ignore[call-overload]
     np.save(tmp_path / "a.npy", one)
     np.savez_compressed(tmp_path / "b.npz", one, 2 * one)
-    assert read_given(tmp_path / "a.npy").episodes[0].actions.tolist() == one.tolist()
-    assert [e.actions.tolist() for e in read_given(tmp_path / "b.npz").episodes] == [
+    assert read_given(tmp_path / "a.npy")[0][0].action.tolist() == one.tolist()
+    assert [run.action.tolist() for run in read_given(tmp_path / "b.npz")[0]] == [
         one.tolist(),
         (2 * one).tolist(),
     ]

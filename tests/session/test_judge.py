@@ -248,7 +248,7 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     process, session = desk.session._background.pid, desk.session
     session.keep_past((0,), before=True)
     wait_until(
-        session, lambda v: not v.recording.keeping.active and v.recording.keeping.said, "what was kept"
+        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "what was kept"
     )
     view = session.view()
     assert view.recording.keeping.said.startswith("kept 1 episode") and not view.recording.keeping.failed
@@ -260,7 +260,9 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     desk.edit(REWARD, f"{REWARD} * 3")
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
     assert desk.judged().stopped_by is None
-    wait_until(session, lambda v: not v.recording.keeping.active and v.recording.keeping.said, "the second")
+    wait_until(
+        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "the second"
+    )
     assert not session.view().recording.keeping.failed
     for env in range(N):
         np.testing.assert_array_equal(session.judge.curve("reward", env).new, 3 * rewards[:, env])

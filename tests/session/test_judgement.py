@@ -17,8 +17,7 @@ from workbench.core.recorded_run import pose_distances
 from workbench.core.step import StepResult
 from workbench.session.askers import Background
 from workbench.session.history import History
-from workbench.session.judge import Judge
-from workbench.session.judgement import MOST_ENTRIES, Judgement
+from workbench.session.judgement import MOST_ENTRIES, Judge, Judgement
 from workbench.session.judging import StoppedBy
 from workbench.session.messages import Load, Stepped, TaskOptions
 

@@ -20,8 +20,8 @@ from tests.session.recorded_runs import opened
 from workbench.core.step import OtherEntry, StepResult
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
+from workbench.rescore_command import RescoreOptions, rescore_all
 from workbench.session.relive import arrive
-from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.review_events import curves
 from workbench.session.session import Session
 from workbench.session.step_back import run_of

@@ -25,6 +25,7 @@ from tests.drive.waiting import until
 from workbench.cli import main
 from workbench.recording.library import Library
 from workbench.recording.sources import sources_among
+from workbench.rescore_command import RescoreOptions, rescore_all
 from workbench.session.clearance import Clearances, Consent, NotTrusted, TrustQuestion
 from workbench.session.make_scene import make
 from workbench.session.messages import TaskOptions
@@ -32,7 +33,6 @@ from workbench.session.questions import MakeScene
 from workbench.session.record import RecordOptions, record
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.rescore import Rescorer
-from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.review import Review
 from workbench.terminal import Exit
 from workbench.ui.judged_panel import status_html

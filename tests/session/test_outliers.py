@@ -141,4 +141,4 @@ def test_a_healthy_task_played_hard_has_none(child_process: None, tmp_path: Path
         wait_until(session, lambda v: session.env_rows().ended.sum() >= 8, "eight episodes")
         rows = session.env_rows()
         assert not rows.outliers and not rows.last.outliers
-        assert session.term_curves().terms.keys() == {"reach", "push", "end"}
+        assert session.view().curves.terms.keys() == {"reach", "push", "end"}

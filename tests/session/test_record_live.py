@@ -134,7 +134,8 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
         return written(session, session.view().recording.episodes_written)[-1]
 
     def drawing(view: SessionView) -> bool:
-        return view.recording.keeping.what == "drawing it again" and view.recording.keeping.done > 0
+        progress = view.recording.keeping.progress
+        return progress is not None and progress.what == "drawing it again" and progress.done > 0
 
     def judge() -> None:
         judging.judge(BASE, 60)

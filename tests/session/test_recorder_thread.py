@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import numpy as np
 import pytest
 
 from tests.drive.episodes import begin, made
 from tests.drive.waiting import until
+from tests.session.moments import stepped
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session import record_live
 from workbench.session.messages import Stepped
 from workbench.session.record_live import LiveRecorder
+from workbench.session.studio_view import Progress
+from workbench.session.view import KeepStatus, RecordingStatus
 from workbench.ui.record_panel import recording_html
 
 
@@ -43,14 +46,10 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
     recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
     try:
         task: Any = SimpleNamespace()  # no task at all: the gatherer takes it and fails at the first reset
-        empty = np.zeros((1, 1, 7), np.float32)
-        step: Any = SimpleNamespace(poses=empty, reward=np.zeros(1), evaluate={}, action=None)
-        step.elapsed_steps = np.zeros(1, np.int64)
-        stepped = Stepped(step, np.ones(1, bool))
         for _ in range(2):
             recorder.start(task, (0,))
             until(lambda: recorder._gatherer is not None, "the gatherer")
-            recorder.take(stepped)
+            recorder.take(stepped(0, jumped=(0, 1, 2)))
             until(lambda: recorder.status().problem is not None, "the problem")
             assert not recorder.status().active
             assert str(recorder.status().problem).startswith("the recording ended: ")
@@ -60,11 +59,20 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
         stop_listening(said.append)
 
 
-def step_of(size: int, env_steps: int = 1) -> Stepped:
-    """A step that begins no episode, of some more bytes than `size`."""
-    step: Any = SimpleNamespace(poses=np.zeros((1, 1, 7), np.float32), reward=np.zeros(1), evaluate={})
-    step.action, step.elapsed_steps = np.zeros((1, 1)), np.full(1, env_steps)
-    return Stepped(step, np.zeros(1, bool), snapshot=bytes(size))
+def test_how_far_keeping_is_and_what_came_of_it_stand_on_the_page() -> None:
+    under_way = KeepStatus(progress=Progress("drawing it again", 3, 12))
+    html = recording_html(RecordingStatus(keeping=under_way))
+    assert "keeping what was seen: drawing it again, 3 of 12 moments" in html and "width: 25%" in html
+    assert "Each episode becomes" not in html
+    failed = recording_html(RecordingStatus(keeping=KeepStatus("nothing was seen yet", failed=True)))
+    assert "nothing was seen yet" in failed and "wb-bad-text" in failed and "wb-again-bar" not in failed
+    kept = recording_html(RecordingStatus(keeping=KeepStatus("kept 1 episode")))
+    assert "kept 1 episode" in kept and "wb-bad-text" not in kept
+
+
+def step_of(size: int) -> Stepped:
+    """A step that begins no episode, of so many bytes, 396 of them arrays."""
+    return replace(stepped(1), snapshot=bytes(size - 396))
 
 
 def until_taken(recorder: LiveRecorder) -> None:

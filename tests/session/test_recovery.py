@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.ui.scenes import description, table_scene
-from workbench.session.recovery import Recovery, Wanted, is_on_disk
+from workbench.session.versions import Recovery, Wanted, is_on_disk
 
 TASK = replace(description(table_scene(1)[0]), source={"push.py": "good"})
 

@@ -12,7 +12,9 @@ import pytest
 
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.core.recorded_run import RecordedRun
+from workbench.core.recorded_state import read_states
 from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.session.open_task import reset_checked, step_checked
 from workbench.session.rescore_run import rescore
 from workbench.session.verdict import Verdict
 
@@ -142,3 +144,60 @@ def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded
     assert "3 numbers" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
     assert told["no states"].why_not == "it holds no env states"
     assert told["fine"].why_not == "" and not told["fine"].differs
+
+
+BALL = """
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.building.actors import build_sphere
+from mani_skill.utils.structs.pose import Pose
+
+
+class FallingBallEnv(BaseEnv):
+    SUPPORTED_ROBOTS = ["none"]
+    SUPPORTED_REWARD_MODES = ["dense"]
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, robot_uids="none", **kwargs)
+
+    def _load_scene(self, options):
+        self.ball = build_sphere(self.scene, 0.1, [1, 0, 0, 1], "ball", initial_pose=Pose.create_from_pq([0, 0, 5]))
+
+    def _initialize_episode(self, env_idx, options):
+        self.ball.set_pose(Pose.create_from_pq(torch.tensor([[0.0, 0.0, 5.0]]).repeat(len(env_idx), 1)))
+
+    def _get_obs_agent(self):
+        return {}
+
+    def get_state_dict(self):
+        return self.scene.get_sim_state()  # BaseEnv's asks the robot
+
+    def _get_obs_extra(self, info):
+        return {"ball": self.ball.pose.p}
+
+    def evaluate(self):
+        return {"low": self.ball.pose.p[:, 2] < 4.9}
+
+    def compute_dense_reward(self, obs, action, info):
+        return self.ball.pose.p[:, 2]
+"""
+
+
+@pytest.mark.parametrize("use_env_states", [False, True], ids=["actions", "states"])
+def test_a_task_without_a_robot_is_given_its_rewards(tmp_path: Path, use_env_states: bool) -> None:
+    (tmp_path / "ball.py").write_text(BALL)
+    task = opened(str(tmp_path / "ball.py"), 2)
+    said = [reset_checked(task.env, task.loaded, 0)]
+    states = [read_states(task.env.env)]
+    for _ in range(10):
+        said.append(step_checked(task.env, task.loaded, None))
+        states.append(read_states(task.env.env))
+    reward = np.array([step.reward[0] for step in said[1:]], np.float32)
+    low = np.array([step.evaluate["low"][0] for step in said])
+    rows = {name: np.stack([state[name][0] for state in states]) for name in states[0]}
+    run = RecordedRun("fallen", 0, {}, np.zeros((10, 0), np.float32), rows, {"low": low}, reward)
+    (verdict,) = rescore(task, [Held(run)], use_env_states=use_env_states)
+    task.env.close()
+    assert verdict.why_not == "" and reward[0] > reward[-1] and low[-1]
+    np.testing.assert_array_equal(verdict.new_reward, reward)
+    assert verdict.differing == ()

@@ -25,13 +25,13 @@ from workbench.core.recorded_state import apart, read_states
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
 from workbench.recording.sources import sources_among
+from workbench.rescore_command import RescoreOptions, rescore_all
 from workbench.session import rescore_words as words
 from workbench.session.given_actions import read_given
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.session.relive import arrive
 from workbench.session.rescore import Rescorer
-from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.step_back import run_of
 from workbench.share_command import export_in_terminal
 
@@ -99,7 +99,7 @@ def test_no_recording_is_opened_in_this_process(
     for module in ("read_maniskill", "read_episode"):
         monkeypatch.setattr(f"workbench.recording.{module}.open_h5", refuse)
     assert len(rescore_all(RescoreOptions((foreign, author / "recordings")))[0]) == 5
-    assert [len(one.actions) for one in read_given(foreign).episodes] == [STEPS, STEPS]
+    assert [run.length for run in read_given(foreign)[0]] == [STEPS, STEPS]
 
 
 def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:

@@ -60,7 +60,7 @@ def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once() -> 
 def test_only_what_is_lacking_is_asked_for() -> None:
     timeline = played(3)
     timeline.seek(1)
-    timeline.add_pictures(PastPictures(1, (picture(1), picture(0, "hand"))))
+    timeline.history.add_pictures(PastPictures(1, (picture(1), picture(0, "hand"))))
     assert timeline.draw(1, (EYE,)) is None and not timeline.view(1, (EYE,)).wants_pictures
     assert timeline.view(0, (EYE,)).wants_pictures
     assert timeline.draw(1, (EYE, HAND, PEOPLE)).cameras == (HAND, PEOPLE)

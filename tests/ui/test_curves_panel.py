@@ -7,7 +7,7 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import running
-from workbench.session.curves import Curves, TermCurves
+from workbench.session.curves import Curves
 from workbench.session.timeline import TimelineView
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.line_chart import LONGEST
@@ -21,7 +21,7 @@ def curves(length: int, num_envs: int, success: float | None = 0.0, serial: int 
 
 @pytest.fixture
 def panel(panels: Panels) -> CurvesPanel:
-    return CurvesPanel(panels.server, lambda: None)
+    return CurvesPanel(panels.server)
 
 
 def test_selected_env_against_the_mean(panels: Panels, panel: CurvesPanel) -> None:
@@ -70,12 +70,12 @@ def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(
         assert [series.get("label") for series in chart.series][-2:] == ["env 3", "shown"]
 
 
-def test_each_part_of_the_reward_has_a_line_of_the_selected_env(panels: Panels) -> None:
+def test_each_part_of_the_reward_has_a_line_of_the_selected_env(panels: Panels, panel: CurvesPanel) -> None:
     term = np.arange(2.0 * LONGEST * 3, dtype=np.float32).reshape(-1, 3)
-    found = TermCurves(np.arange(2 * LONGEST), {"reach": term, "<b>": -term}, ("sum",))
-    panel = CurvesPanel(panels.server, lambda: found)
-    panel.draw(running(3, selected_env=1))
-    (chart,) = panels.charts()
+    parts = {"reach": term, "<b>": -term, "gone": np.full_like(term, np.nan)}
+    found = replace(curves(2 * LONGEST, 3), parts=parts, no_curve=("sum",))
+    panel.draw(running(3, curves=found, selected_env=1))
+    *_, chart = panels.charts()
     assert chart.title == "reward terms, env 1"
     assert [series.get("label") for series in chart.series] == ["step", "reach", "<b>"]
     x, reach, other = chart.data
@@ -85,10 +85,10 @@ def test_each_part_of_the_reward_has_a_line_of_the_selected_env(panels: Panels) 
     assert "No curve of sum" in panels.html()
 
 
-def test_how_parts_get_a_curve_is_said_where_a_dense_reward_names_none(panels: Panels) -> None:
-    found = TermCurves(np.arange(2), {})
-    panel = CurvesPanel(panels.server, lambda: found)
-    view = running(2)
+def test_how_parts_get_a_curve_is_said_where_a_dense_reward_names_none(
+    panels: Panels, panel: CurvesPanel
+) -> None:
+    view = running(2, curves=curves(2, 2))
     assert view.task is not None
     panel.draw(view)
     says = "put info[&#34;reward_terms&#34;]" in panels.html()
@@ -96,7 +96,8 @@ def test_how_parts_get_a_curve_is_said_where_a_dense_reward_names_none(panels: P
     panel.draw(replace(view, task=replace(view.task, reward_mode="normalized_dense")))
     assert "put info" in panels.html()
     panel.draw(replace(view, task=replace(view.task, reward_mode="sparse")))
-    assert "put info" not in panels.html() and panels.charts() == []
+    assert "put info" not in panels.html()
+    assert [chart.title for chart in panels.charts()] == ["reward", "success"]
 
 
 def test_task_without_success_has_no_curve_of_it(panels: Panels, panel: CurvesPanel) -> None:

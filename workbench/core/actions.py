@@ -8,6 +8,7 @@ half-open gripper, and for absolute joint control it is a pose at the middle of 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +65,21 @@ def bounds(parts: tuple[ActionPart, ...]) -> tuple[NDArray[np.float32], NDArray[
     return np.concatenate([p.low for p in parts]), np.concatenate([p.high for p in parts])
 
 
+def width(parts: tuple[ActionPart, ...]) -> int:
+    """A, of the flat action."""
+    return sum([len(part.names) for part in parts])
+
+
+def action_of(
+    parts: tuple[ActionPart, ...], num_envs: int, rows: Mapping[int, NDArray]
+) -> NDArray[np.float32]:
+    """(N, A) with these rows (A,) by env; zeros in the others."""
+    action = np.zeros((num_envs, width(parts)), np.float32)
+    for env, row in rows.items():
+        action[env] = row
+    return action
+
+
 def random_action(
     parts: tuple[ActionPart, ...], num_envs: int, rng: np.random.Generator
 ) -> NDArray[np.float32]:
@@ -112,7 +128,7 @@ def to_flat_action(
         robots = dict.fromkeys(p.robot for p in parts)
         action = np.concatenate([_numpy(action[robot]) for robot in robots], axis=-1)
     flat = _numpy(action)
-    expected = (env.num_envs, sum([len(part.names) for part in parts]))
+    expected = (env.num_envs, width(parts))
     if flat.shape == expected[1:]:
         flat = np.broadcast_to(flat, expected)
     if flat.shape != expected:

@@ -78,6 +78,6 @@ class Picture:
 
     @property
     def nbytes(self) -> int:
-        """What its pixels take in memory."""
-        pixels = self.rgb, self.depth, self.segmentation, self.position, self.normal, self.albedo
-        return sum(array.nbytes for array in pixels if array is not None)
+        """Roughly what it takes in memory."""
+        planes = self.rgb, self.depth, self.segmentation, self.position, self.normal, self.albedo
+        return 300 + sum(plane.nbytes for plane in planes if plane is not None)

@@ -45,7 +45,7 @@ class PackedSnapshot:
     """Those that were not given out yet."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class WholeSnapshot:
     """Unpickles as the `core.snapshot.Snapshot` that it was packed from."""
 

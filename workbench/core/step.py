@@ -55,3 +55,10 @@ class StepResult:
     of it."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
     """The entries that it returned otherwise; no name is in `evaluate` too."""
+
+    @property
+    def nbytes(self) -> int:
+        """Roughly what it takes in memory."""
+        arrays = [self.elapsed_steps, self.reward, self.terminated, self.truncated, self.poses]
+        arrays += [*self.evaluate.values()] + ([] if self.action is None else [self.action])
+        return sum(value.nbytes for value in (*arrays, *self.others.values()))

@@ -8,22 +8,21 @@ of its own, begun with its seed; and where actions are given by a file, each has
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core import actions
+from workbench.core.recorded_run import RecordedRun
 from workbench.core.task_env import TaskEnv
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.messages import ActionSource
 from workbench.session.policy import Policy, load_policy, problem_of
-
-if TYPE_CHECKING:
-    from workbench.session.given_actions import GivenEpisode  # it brings what reads recordings
 
 
 class Acting:
@@ -70,13 +69,8 @@ class Acting:
         self._policy = None
         if source != "policy" or not self._policy_name:
             return
-        try:
-            with self._folder.again():
-                self._policy = load_policy(self._policy_name, beside)
-        except BaseException as error:
-            if is_ctrl_c(error):
-                raise
-            raise TaskError(problem_of(error, self._policy_name, beside)) from error
+        with self._imported():
+            pass
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
         """(N, A), within the bounds but for a policy's.
@@ -89,23 +83,29 @@ class Acting:
             return actions.random_action(task.parts, task.num_envs, self._rng)
         if self._source == "policy":
             # Never another action in its place: the page says that the policy acts.
-            try:
-                if self._policy is None:
-                    with self._folder.again():
-                        self._policy = load_policy(self._policy_name, self._beside)
+            with self._imported() as policy:
                 whose = f"what {self._policy_name} returned"
-                return actions.to_flat_action(task.env, task.parts, self._policy(task.obs), whose)
-            except BaseException as error:
-                if is_ctrl_c(error):
-                    raise
-                policy, self._policy = self._policy, None
-                raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error
+                return actions.to_flat_action(task.env, task.parts, policy(task.obs), whose)
         low, high = actions.bounds(task.parts)
         if self._source == "zero":
             return _same_for_all(np.clip(0.0, low, high), task)
         if self._source == "sliders" and len(self.sliders) == len(low):
             return _same_for_all(np.clip(np.asarray(self.sliders, np.float32), low, high), task)
         return actions.hold_action(task.parts, task.num_envs)
+
+    @contextmanager
+    def _imported(self) -> Iterator[Policy]:
+        """The policy; what is raised within is its fault, and it is imported anew the next time."""
+        try:
+            if self._policy is None:
+                with self._folder.again():
+                    self._policy = load_policy(self._policy_name, self._beside)
+            yield self._policy
+        except BaseException as error:
+            if is_ctrl_c(error):
+                raise
+            policy, self._policy = self._policy, None
+            raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error
 
 
 def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
@@ -122,9 +122,9 @@ class RecordActing:
         """
         self._acting = acting
         self._rng: dict[int, np.random.Generator] = {}
-        self._given: dict[int, GivenEpisode] = {}
+        self._given: dict[int, RecordedRun] = {}
 
-    def begin(self, env: int, seed: int, given: GivenEpisode | None) -> str:
+    def begin(self, env: int, seed: int, given: RecordedRun | None) -> str:
         """An episode begins in this env; returns what will choose its actions, as its recording says it."""
         self._rng[env] = np.random.default_rng(seed)
         self._given.pop(env, None)
@@ -156,10 +156,10 @@ class RecordActing:
             if given is None:
                 action[env] = actions.random_action(task.parts, 1, self._rng[env])[0]
                 continue
-            if given.actions.shape[1] != action.shape[1]:
+            if given.action.shape[1] != action.shape[1]:
                 raise ValueError(
-                    f"the file's actions have {given.actions.shape[1]} dimensions, and this task's {action.shape[1]} "
+                    f"the file's actions have {given.action.shape[1]} dimensions, and this task's {action.shape[1]} "
                     f"({', '.join(name for part in task.parts for name in part.names)}): another control mode or robot?"
                 )
-            action[env] = given.actions[step]
+            action[env] = given.action[step]
         return action

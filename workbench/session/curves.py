@@ -13,7 +13,7 @@ and has no curve.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,12 +65,15 @@ class Columns:
             column[number - self._base] = values.get(name, np.nan)
 
     def between(self, name: str, low: int, high: int) -> NDArray[np.float32]:
-        """(K, N) of the rows from `low` to `high`, both of rows that are wanted; NaN in a column that is not there."""
+        """(K, N) of the rows from `low` to `high`, both of rows that are wanted; NaN in a column that is not there.
+
+        What is given changes only where one of these rows is written again.
+        """
         rows = slice(low - self._base, max(low, high + 1) - self._base)
         column = self._columns.get(name)
         if column is None:
             return np.full((rows.stop - rows.start, self._num_envs), np.nan, np.float32)
-        return column[rows].copy()
+        return column[rows]
 
     def _new(self, name: str) -> NDArray[np.float32]:
         column = self._columns[name] = np.full((self._room, self._num_envs), np.nan, np.float32)
@@ -89,18 +92,15 @@ class Curves:
     """(T, N)"""
     success: NDArray[np.float32]
     """(T, N) 0 or 1; NaN for a task that has no ``success``."""
-
-
-@dataclass(frozen=True)
-class TermCurves:
-    """Oldest first."""
-
-    tick: NDArray[np.int64]
-    """(T,) as `Curves.tick`."""
-    terms: dict[str, NDArray[np.float32]]
-    """By name: (T, N); NaN where a step did not have that term."""
+    parts: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """(T, N) of each term of the reward by name; NaN where a step did not have it."""
     no_curve: tuple[str, ...] = ()
     """Names of what the last step put there that is no number for each env."""
+
+    @property
+    def terms(self) -> dict[str, NDArray[np.float32]]:
+        """Of `parts` those that are drawn: one that is gone for as long as a curve is long has none any more."""
+        return {name: values for name, values in self.parts.items() if not np.isnan(values).all()}
 
 
 class RecentSteps:
@@ -108,7 +108,6 @@ class RecentSteps:
 
     def __init__(self, num_envs: int) -> None:
         self._num_envs, self._columns = num_envs, Columns(num_envs)
-        self._curves: Curves | None = None
         self._no_curve: tuple[str, ...] = ()
         self.count = 0
         """Control steps so far."""
@@ -135,22 +134,12 @@ class RecentSteps:
         self.count += 1
 
     def curves(self) -> Curves:
-        """Copied once for every control step, however often they are asked for."""
-        if self._curves is None or self._curves.serial != self.count:
-            self._curves = Curves(self.count, self._ticks, self._newest("reward"), self._newest("success"))
-        return self._curves
-
-    def terms(self) -> TermCurves:
-        kept = {
-            name.removeprefix(PREFIX): self._newest(name) for name in self._columns.names if PREFIX in name
+        """Nothing is copied for it: a row is written once."""
+        first, last, columns = max(0, self.count - _LENGTH), self.count - 1, self._columns
+        reward, success = (columns.between(name, first, last) for name in ("reward", "success"))
+        parts = {
+            name.removeprefix(PREFIX): columns.between(name, first, last)
+            for name in columns.names
+            if name.startswith(PREFIX)
         }
-        # A term that is gone for as long as a curve is long has no curve any more.
-        drawn = {name: values for name, values in kept.items() if not np.isnan(values).all()}
-        return TermCurves(self._ticks, drawn, self._no_curve)
-
-    @property
-    def _ticks(self) -> NDArray[np.int64]:
-        return np.arange(max(0, self.count - _LENGTH), self.count) + 1
-
-    def _newest(self, name: str) -> NDArray[np.float32]:
-        return self._columns.between(name, max(0, self.count - _LENGTH), self.count - 1)
+        return Curves(self.count, np.arange(first, self.count) + 1, reward, success, parts, self._no_curve)

@@ -115,7 +115,7 @@ class EpisodeGatherer:
         task: TaskDescription,
         env_idx: Sequence[int],
         folder: Path,
-        on_episode: Callable[[GatheredEpisode], None],
+        on_episode: Callable[[GatheredEpisode], object],
         *,
         ends: Literal["over", "reset"] = "over",
         one_each: bool = False,

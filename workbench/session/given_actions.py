@@ -11,54 +11,27 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.recorded_run import RecordedRun
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording.reading import find_trajectories, read_recording
+from workbench.session.step_back import run_of
 
 MOST_BYTES = 2**30
 """Of a NumPy file, also unpacked: 20 million steps of a Panda."""
 SUFFIXES = (".npy", ".npz", ".h5")
 
 
-@dataclass(frozen=True)
-class GivenEpisode:
-    """What one episode is to do."""
-
-    name: str
-    """``file pushes.npy``, ``file demos.h5, traj_3``"""
-    actions: NDArray[np.float32]
-    """(T, A)"""
-    seed: int | None = None
-    """None where the file does not say."""
-    states: dict[str, NDArray] = field(default_factory=dict)
-    """(T + 1, D) env states by name; empty where the file has none."""
-
-
-@dataclass(frozen=True)
-class GivenEpisodes:
-    name: str
-    """Of the file."""
-    episodes: Sequence[GivenEpisode]
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """What of the env's keywords the file asks for: the control mode that its actions are of, the robot."""
-
-    def __len__(self) -> int:
-        return len(self.episodes)
-
-    def of(self, index: int) -> GivenEpisode:
-        """The one that episode `index` does; a file with a single one has it for all."""
-        return self.episodes[0] if len(self.episodes) == 1 else self.episodes[index]
-
-
-def read_given(path: Path) -> GivenEpisodes:
-    """Read a file of actions.
+def read_given(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    """Read a file of actions: what each episode is to do, begun as its run did where that is known; and what of the env's
+    keywords the file asks for, such as the control mode that its actions are of.
 
     ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
     trajectories of ManiSkill, or a recording of the workbench.
@@ -88,9 +61,7 @@ def read_given(path: Path) -> GivenEpisodes:
     names = [
         f"file {path.name}" + (f", its array {i}" if len(arrays) > 1 else "") for i in range(len(arrays))
     ]
-    return GivenEpisodes(
-        path.name, [GivenEpisode(name, _finite(path, array)) for name, array in zip(names, arrays)]
-    )
+    return [RecordedRun(name, -1, {}, _finite(path, array), {}) for name, array in zip(names, arrays)], {}
 
 
 def _arrays(path: Path) -> list[NDArray]:
@@ -123,22 +94,21 @@ def _array(file: IO[bytes], size: int) -> NDArray:
     return np.frombuffer(content, dtype, math.prod(shape)).reshape(shape, order="F" if fortran else "C")
 
 
-def _demonstrations(path: Path) -> GivenEpisodes:
-    episodes, kwargs = [], {}
+def _demonstrations(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    runs, kwargs = list[RecordedRun](), dict[str, Any]()
     for name in find_trajectories(path):
         episode = read_recording("maniskill", path, name)
         if episode.length == 0:
             continue
-        seed = episode.info.seed if episode.info.seed >= 0 else None
-        actions = _finite(path, episode.action)
-        episodes.append(GivenEpisode(f"file {path.name}, {name}", actions, seed, dict(episode.env_states)))
+        run = run_of(episode)
+        runs.append(replace(run, name=f"file {path.name}, {name}", action=_finite(path, run.action)))
         given: Mapping[str, Any] = episode.info.env_kwargs
         kwargs = {key: given[key] for key in ("robot_uids", "control_mode") if given.get(key) is not None}
         if episode.info.control_mode is not None:
             kwargs["control_mode"] = episode.info.control_mode
-    if not episodes:
+    if not runs:
         raise ValueError(f"{path} holds no trajectory with actions")
-    return GivenEpisodes(path.name, episodes, kwargs)
+    return runs, kwargs
 
 
 def _finite(path: Path, actions: NDArray) -> NDArray[np.float32]:

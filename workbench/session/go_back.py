@@ -16,10 +16,8 @@ import time
 from collections.abc import Callable, Mapping
 from itertools import count
 
-import numpy as np
-
 from workbench.authoring.problem import Interrupted, TaskError
-from workbench.core import seams
+from workbench.core import actions, seams
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
@@ -86,7 +84,8 @@ def _live_through(
 ) -> list[int]:
     """Make the steps of all ways again; gives the envs that are at the moment then, to the last byte."""
     task, env = opened.env, opened.env.env
-    ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (_width(opened),)}
+    width = actions.width(task.parts)
+    ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (width,)}
     px = seams.batched_system(env.scene)
     if px is None or not ways:
         return []
@@ -108,10 +107,9 @@ def _live_through(
                     break
                 waiting = [i for i, way in ways.items() if total - len(way.actions) > done]
                 px.hold_still({*others, *waiting})
-                action = np.zeros((task.num_envs, _width(opened)), np.float32)
-                for i, way in ways.items():
-                    action[i] = way.actions[max(0, done - total + len(way.actions))]
-                step_checked(task, opened.loaded, action)
+                at = {i: max(0, done - total + len(way.actions)) for i, way in ways.items()}
+                rows = {i: way.actions[at[i]] for i, way in ways.items()}
+                step_checked(task, opened.loaded, actions.action_of(task.parts, task.num_envs, rows))
                 on_step(done + 1, total)
                 if time.monotonic() - began > MOST_SECONDS:
                     return []
@@ -120,10 +118,6 @@ def _live_through(
         if isinstance(error.__cause__, Interrupted):
             raise
         return []  # an edited hook fails on the way: what it says of the moment itself is told
-
-
-def _width(opened: OpenedTask) -> int:
-    return sum(len(part.names) for part in opened.env.parts)
 
 
 def _of_simulation(report: RestoreReport) -> dict[str, str]:

@@ -46,8 +46,9 @@ class PartSet:
     """The parts of a snapshot, shared by all moments that have the same."""
 
     keys: tuple[int, ...]
+    content: tuple[bytes, ...] | None
+    """None where some of them went to another history: then a snapshot cannot be put back, and is none."""
     moments: int = 0
-    complete: bool = True
 
 
 class SharedParts:
@@ -60,21 +61,18 @@ class SharedParts:
     def __init__(self) -> None:
         self._parts: dict[int, bytes] = {}
         self._references: dict[int, int] = {}
-        self._last = PartSet(())
+        self._last = PartSet((), ())
         self.used = 0
         """Bytes."""
 
     def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> PartSet:
         """Those of the next moment; `keys` is None where they are those of the moment before."""
         self._parts.update(new_parts)
-        if keys is None or keys == self._last.keys:
-            parts = self._last
-        else:
-            # A snapshot whose parts went to another history cannot be put back: it is none.
-            parts = self._last = PartSet(keys, complete=all(key in self._parts for key in keys))
-        if not parts.complete:
-            return parts
-        if parts.moments == 0:
+        if keys is not None and keys != self._last.keys:
+            known = self._parts.keys() >= {*keys}
+            self._last = PartSet(keys, tuple(self._parts[key] for key in keys) if known else None)
+        parts = self._last
+        if parts.content is not None and parts.moments == 0:
             for key in parts.keys:
                 self._references[key] = self._references.get(key, 0) + 1
                 if self._references[key] == 1:
@@ -85,7 +83,7 @@ class SharedParts:
     def release(self, parts: PartSet) -> None:
         """A moment that had them is gone."""
         parts.moments -= 1
-        if parts.moments == 0 and parts.complete:
+        if parts.moments == 0 and parts.content is not None:
             for key in parts.keys:
                 self._references[key] -= 1
                 if self._references[key] == 0:
@@ -93,9 +91,6 @@ class SharedParts:
                     del self._references[key]
                     # The worker will not send it again while the newest moment has it; that one is kept.
                     del self._parts[key]
-
-    def of(self, parts: PartSet) -> tuple[bytes, ...]:
-        return tuple(self._parts[key] for key in parts.keys)
 
 
 @dataclass
@@ -116,7 +111,8 @@ class Moment:
     restored: Restored | None
     number: int
     """`Stepped.number`."""
-    snapshot: bytes
+    snapshot: WholeSnapshot | None
+    """Of the whole batch; it shares its bytes with other moments. None where there is none."""
     parts: PartSet
     size: int
     """Bytes, without parts and pictures."""
@@ -198,7 +194,10 @@ class History:
         )
         if not jumps:
             self.steps.add(stepped.step)
-        size = _OVERHEAD + len(stepped.snapshot) + _step_bytes(stepped.step)
+        snapshot = None
+        if stepped.snapshot and parts.content is not None:
+            snapshot = WholeSnapshot(stepped.snapshot, parts.content)
+        size = _OVERHEAD + len(stepped.snapshot) + stepped.step.nbytes
         size += EnvRows.bytes_a_step(self._num_envs)
         moment = Moment(
             serial=self._next_serial,
@@ -209,7 +208,7 @@ class History:
             happened=self._events(stepped, rows),
             restored=restored,
             number=stepped.number,
-            snapshot=stepped.snapshot if parts.complete else b"",
+            snapshot=snapshot,
             parts=parts,
             size=size,
             rows=rows,
@@ -235,8 +234,8 @@ class History:
         moment = self._moments[-1]
         if moment.first_said is None:
             moment.first_said = moment.step
-            moment.size += _step_bytes(step)
-            self._used += _step_bytes(step)
+            moment.size += step.nbytes
+            self._used += step.nbytes
         moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
         self._write(moment)
         return moment.step
@@ -257,7 +256,7 @@ class History:
                 self._pictured.append(moment.serial)
             moment.pictures[key] = picture
             moment.outdated.discard(key)
-            change = _picture_bytes(picture) - (0 if before is None else _picture_bytes(before))
+            change = picture.nbytes - (0 if before is None else before.nbytes)
             self._pictures_used += change
             self._used += change
         self._shrink()
@@ -289,25 +288,14 @@ class History:
         """Serial of the newest moment."""
         return self._next_serial - 1
 
-    @property
-    def next_serial(self) -> int:
-        return self._next_serial
-
     def at(self, serial: int) -> Moment | None:
         """The moment of this number, if it is kept."""
         return self._moments[serial - self.first] if self.first <= serial <= self.last else None
 
     def snapshot_at(self, serial: int) -> bytes | None:
         """A pickled `core.snapshot.Snapshot` of the whole batch at that moment; None where there is none."""
-        whole = self.whole_at(serial)
-        return None if whole is None else pickle.dumps(whole)
-
-    def whole_at(self, serial: int) -> WholeSnapshot | None:
-        """The same, not pickled yet: it shares its bytes with the history, and outlives the moment."""
         moment = self.at(serial)
-        if moment is None or not moment.snapshot:
-            return None
-        return WholeSnapshot(moment.snapshot, self._parts.of(moment.parts))
+        return None if moment is None or moment.snapshot is None else pickle.dumps(moment.snapshot)
 
     def between(self, low: int, high: int) -> Iterable[Moment]:
         """The kept moments of these serials, both included."""
@@ -384,7 +372,7 @@ class History:
                     return None
                 rows.append(moment.step.action[at])
             elif jump is None or (at not in jump.lived_through and jump.origin != NO_MOMENT):
-                if not moment.snapshot or not rows:
+                if moment.snapshot is None or not rows:
                     return None
                 return WayBack(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
         return None
@@ -415,7 +403,7 @@ class History:
                 until = moment.restored.origin
                 continue
             before = self.at(moment.serial - 1)
-            return moment if before is not None and before.snapshot else None
+            return moment if before is not None and before.snapshot is not None else None
         return None
 
     def moved_last_by(self, jump: Moment) -> tuple[int, ...]:
@@ -439,7 +427,7 @@ class History:
                 self._jumps.popleft()
 
     def _drop_pictures(self, moment: Moment) -> None:
-        size = sum(_picture_bytes(picture) for picture in moment.pictures.values())
+        size = sum(picture.nbytes for picture in moment.pictures.values())
         moment.pictures = {}
         self._pictures_used -= size
         self._used -= size
@@ -477,13 +465,3 @@ class History:
             if what in rows.first:
                 happened[rows.first[what] == step.elapsed_steps] |= flag
         return happened
-
-
-def _step_bytes(step: StepResult) -> int:
-    arrays = [step.elapsed_steps, step.reward, step.terminated, step.truncated, step.poses]
-    arrays += [*step.evaluate.values()] + ([] if step.action is None else [step.action])
-    return sum(array.nbytes for array in arrays) + sum(entry.nbytes for entry in step.others.values())
-
-
-def _picture_bytes(picture: Picture) -> int:
-    return 300 + picture.nbytes

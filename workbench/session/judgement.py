@@ -1,10 +1,14 @@
-"""What new code says of moments that were lived through with the old: the comparison, in plain arrays.
+"""The past judged again: the recorded moments lived through with the new code, and compared with the record.
 
-A `Judgement` is begun from a history and filled as the moments come back from the worker that lives through them
-again (see `session.judge`). Each is a row: the reward, every number that ``evaluate`` returned, and how far the bodies
-are from where they were, since what is judged is the run anew and not the record itself. That drift is what
-makes a comparison good or bad, so it is kept for every moment and every env. Where an episode begins at a kept reset
-it is mostly zero to the last bit, because the envs get the same physics without a past there (measured: PushCube,
+After an edit of a reward the question is what it would have said of the episodes that one has just watched. They
+are all in the history: a snapshot for every beginning, and every action. So they are run again with the new code. Some
+moments are sent, the answer is compared, and the next are sent: so one stops it by not sending more, and a process that
+does not answer (the new code may loop for ever) is ended.
+
+A `Judgement` is begun from a history and filled as the moments come back from the worker. Each is a row: the reward, every
+number that ``evaluate`` returned, and how far the bodies are from where they were, since what is judged is the run anew
+and not the record itself. That drift is what makes a comparison good or bad, so it is kept for every moment and every
+env. Where an episode begins at a kept reset it is mostly zero to the last bit, because the envs get the same physics without a past there (measured: PushCube,
 PickCube and StackCube none, PushT 7e-8 m, PushCube with a going back among its moments 6e-8 m). It may grow where the
 oldest kept moment is in the middle of an episode, and for tasks whose state a snapshot cannot hold whole (see
 `core.snapshot`).
@@ -15,16 +19,24 @@ A *run* here is what one env lived through without a jump, up to its reset or to
 from __future__ import annotations
 
 import pickle
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.recorded_run import pose_distances
-from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.core.step import StepResult
+from workbench.session.askers import Background
 from workbench.session.history import History, Moment
-from workbench.session.questions import MomentToJudge
+from workbench.session.judging import JudgedView, Judging, StoppedBy
+from workbench.session.lane import Job, JobFailed
+from workbench.session.messages import Load, Loaded, TaskDescription
+from workbench.session.questions import Judged, JudgeMoments, MomentToJudge
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
 MOST_ENTRIES = 24
@@ -70,14 +82,9 @@ class Judgement:
     def __init__(self, history: History) -> None:
         """Take everything that `history` has, up to the first jump whose snapshot could not be made."""
         self._moments: list[Moment] = []
-        self._snapshots: dict[int, WholeSnapshot] = {}
-        """By row."""
         for moment in history.between(history.first, history.last):
-            if not self._moments or moment.jumped.any():
-                whole = history.whole_at(moment.serial)
-                if whole is None:
-                    break
-                self._snapshots[len(self._moments)] = whole
+            if moment.snapshot is None and (not self._moments or moment.jumped.any()):
+                break
             self._moments.append(moment)
         count = len(self._moments)
         envs = len(self._moments[0].step.reward) if count else 0
@@ -131,7 +138,7 @@ class Judgement:
         if self._is_step[row]:
             return MomentToJudge(self._moments[row].step.action)
         envs = tuple(int(env) for env in np.flatnonzero(self._jumped[row]))
-        return MomentToJudge(None, pickle.dumps(self._snapshots[row]), envs)
+        return MomentToJudge(None, pickle.dumps(self._moments[row].snapshot), envs)
 
     def add(self, row: int, step: StepResult) -> None:
         """What the new code says of this row.
@@ -150,7 +157,7 @@ class Judgement:
 
     def let_go(self) -> None:
         """Forget the moments and their snapshots, when no more rows will come."""
-        self._moments, self._snapshots = [], {}
+        self._moments = []
 
     def curve(self, name: str, env: int) -> JudgedCurve | None:
         """One number of one env; None if neither version has one of this name."""
@@ -213,3 +220,153 @@ class Judgement:
                     continue
                 table[name] = np.full(self._jumped.shape, np.nan, np.float32)
             table[name][row] = value
+
+
+_CHUNK_SECONDS = 0.1
+"""About how long one answer takes: how soon progress is seen, and stopping heard."""
+_MOST_AT_ONCE = 64
+_SUMMARY_EVERY = 0.5
+"""Seconds between two looks at what it comes to so far."""
+
+
+def what_a_load_means(
+    before: TaskDescription | None, loaded: Loaded, view: JudgedView
+) -> Literal["judge", "keep", "forget"]:
+    """Whether the episodes of the version before are to be judged with the one that was loaded.
+
+    If not, what the last judgement said is kept to be seen, or forgotten with the episodes.
+    """
+    level = None if before is None or loaded.reload is None else loaded.reload.level
+    if level == "patched":
+        return "judge"
+    if level in ("same", "cameras"):
+        # Saved again without a change that matters: what that stopped is to be had all the same.
+        return "judge" if view.stopped_by is StoppedBy.SAVE else "keep"
+    return "forget"
+
+
+class Judge:
+    """Judges the past."""
+
+    def __init__(self, on_change: Callable[[], None], process: Background) -> None:
+        """
+        Args:
+            on_change: called when `judging` has something new.
+            process: in which it is judged. Whoever else wants it need not wait.
+        """
+        self.judging = Judging("judge", on_change)
+        self._process, self._lock = process, threading.Lock()
+        self._judgement: Judgement | None = None
+        """What is shown: what is being judged, or was last."""
+
+    def curve(self, name: str, env: int) -> JudgedCurve | None:
+        """See `Judgement.curve`; None also while nothing is judged."""
+        with self._lock:
+            return None if self._judgement is None else self._judgement.curve(name, env)
+
+    def judge(self, load: Load, judgement: Judgement) -> None:
+        """Begin, in place of whatever was judged before.
+
+        Args:
+            load: the new code.
+            judgement: of the record; it is this object's from now on.
+        """
+        if judgement.steps == 0:
+            return
+        self.stop(StoppedBy.LOAD)
+        with self._lock:
+            self._judgement = judgement
+        view = JudgedView("loading", total=judgement.steps, task="the new code")
+        self.judging.begin(view, lambda job: self._judge(job, load, judgement))
+
+    def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
+        """As `Judging.stop`."""
+        self.judging.stop(why)
+        with self._lock:
+            if self._judgement is not None:
+                self._judgement.let_go()  # a job that still waited does not come to it
+
+    def forget(self) -> None:
+        """Stop, and have nothing to show: the record is gone."""
+        self.judging.forget()
+        with self._lock:
+            self._judgement = None
+
+    # --- on the lane ---------------------------------------------------------------------------------
+
+    def _judge(self, job: Job, load: Load, judgement: Judgement) -> None:
+        looked, missed = 0.0, dict[str, str]()
+
+        def tell(answer: Judged, seconds: float) -> None:
+            nonlocal looked
+            missed.update(answer.not_carried)
+            now, done = time.monotonic(), judgement.judged_steps
+            if answer.problem is not None or done == judgement.steps or now - looked > _SUMMARY_EVERY:
+                looked = now
+                with self._lock:
+                    names, differing = judgement.names()
+                    verdicts = tuple(judgement.verdicts())
+                self.judging.tell(job, verdicts=verdicts, names=names, differing_names=differing)
+            self.judging.tell(
+                job,
+                state="judging",
+                done=done,
+                steps=done,
+                seconds=self.judging.view.seconds + seconds,
+                warnings=tuple(f"not put back: {what}: {why}" for what, why in missed.items()),
+            )
+            if answer.problem is not None:
+                raise JobFailed("the new code raised", answer.problem)
+
+        def judge_run(rows: range) -> None:
+            self._load(job, load, judgement)
+            self._live_through(job, judgement, rows, tell)
+
+        try:
+            for rows in judgement.runs():
+                self._process.in_turns(job, partial(judge_run, rows), aside=True)
+        finally:
+            with self._lock:
+                judgement.let_go()
+
+    def _load(self, job: Job, load: Load, judgement: Judgement) -> None:
+        if self._process.has(load):
+            return
+        self.judging.tell(job, state="loading")
+        if self._process.num_envs == judgement.num_envs:
+            # A version is tried at the moment at which the env stands, which is where the judgement before
+            # ended: there the new code may raise or loop though it runs from the beginnings in the record.
+            self._ask(job, judgement, judgement.runs()[0][:1])
+        try:
+            self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
+        except JobFailed as failure:
+            if failure.problem is None:
+                raise
+            raise JobFailed("the new code could not be loaded to judge with", failure.problem) from failure
+
+    def _live_through(
+        self, job: Job, judgement: Judgement, rows: range, tell: Callable[[Judged, float], None]
+    ) -> None:
+        at, count = rows.start, 2
+        while at < rows.stop:
+            chunk = range(at, min(at + count, rows.stop))
+            began = time.monotonic()
+            answer = self._ask(job, judgement, chunk)
+            took = time.monotonic() - began
+            with self._lock:
+                job.check()
+                for row, step in zip(chunk, answer.steps, strict=False):
+                    try:
+                        judgement.add(row, step)
+                    except ValueError as error:
+                        raise JobFailed(f"the episodes cannot be compared: {error}") from error
+            tell(answer, took)
+            wanted = count * _CHUNK_SECONDS / max(took, 1e-3)
+            count = max(1, min(int(wanted), 2 * count, _MOST_AT_ONCE))
+            at = chunk.stop
+
+    def _ask(self, job: Job, judgement: Judgement, rows: range) -> Judged:
+        with self._lock:
+            job.check()
+            moments = tuple(judgement.to_judge(row) for row in rows)
+        return self._process.ask(job.check, JudgeMoments(moments))

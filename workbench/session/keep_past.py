@@ -20,12 +20,11 @@ from __future__ import annotations
 import pickle
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.recording.columns import BatchPacker
 from workbench.recording.landing import RecordingError
 from workbench.session.askers import WAITING, Background
@@ -68,8 +67,6 @@ class WhatToKeep:
     placed: tuple[PlaceCamera, ...]
     """Cameras that stand elsewhere than the file says."""
     episodes: tuple[PastEpisode, ...]
-    snapshots: dict[int, WholeSnapshot]
-    """Of their moments, by serial."""
 
 
 def episode_round(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
@@ -104,7 +101,7 @@ def _of(history: History, env: int, serial: int) -> PastEpisode | str:
     first, of = lived[0]
     if not first.jumped[of] or first.step.elapsed_steps[of] != 0:
         return "its beginning is no longer in memory"
-    if any(not moment.snapshot for moment, _ in lived):
+    if any(moment.snapshot is None for moment, _ in lived):
         return "the state of this task cannot be kept, so what was seen cannot be put back"
     for count, (moment, at) in enumerate(lived):
         step = moment.as_recorded
@@ -154,9 +151,7 @@ class PastKeeper:
         self._say(why, failed=True)
 
     def status(self) -> KeepStatus:
-        if (progress := self._lane.progress) is not None:
-            return KeepStatus(True, progress.what, progress.done, progress.total)
-        return self._status
+        return replace(self._status, progress=self._lane.progress)
 
     def close(self) -> None:
         self._lane.close()
@@ -179,8 +174,7 @@ class PastKeeper:
             while moments:
                 job.tell(total - len(moments), total, "drawing it again")
                 moment, rows = moments[0]
-                snapshot = pickle.dumps(what.snapshots[moment.serial])
-                question = CaptureMoment(snapshot, tuple(rows), what.task.can_render)
+                question = CaptureMoment(pickle.dumps(moment.snapshot), tuple(rows), what.task.can_render)
                 captured = self._process.ask(job.check, question)
                 del moments[0]
                 for row, episodes in rows.items():

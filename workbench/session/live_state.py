@@ -19,7 +19,7 @@ from workbench.authoring.reference import RecordedTask, TaskName, class_beside, 
 from workbench.core.inspection import Inspection
 from workbench.core.step import StepResult
 from workbench.session.env_table import EnvTable
-from workbench.session.keep_past import PastEpisode, WhatToKeep, episode_round, moments_of
+from workbench.session.keep_past import PastEpisode, WhatToKeep, episode_round
 from workbench.session.kept_worker import Death
 from workbench.session.last_words import death_problem, own_files_of
 from workbench.session.messages import (
@@ -42,7 +42,6 @@ from workbench.session.messages import (
     TaskDescription,
     TaskOptions,
 )
-from workbench.session.recovery import Wanted
 from workbench.session.timeline import Timeline
 from workbench.session.view import SessionView
 
@@ -138,9 +137,9 @@ class LiveState:
             inspection=None,
         )
         if self.timeline is None or not its_past_stays:
-            next_serial = 0 if self.timeline is None else self.timeline.history.next_serial
+            last = -1 if self.timeline is None else self.timeline.history.last
             table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode)
-            self.timeline = Timeline(table, self.history_bytes, next_serial)
+            self.timeline = Timeline(table, self.history_bytes, last + 1)
 
     def stepped(self, event: Stepped) -> None:
         if self.timeline is None:
@@ -172,11 +171,11 @@ class LiveState:
             self.set(rules=event if event.rows else None, rules_serial=now.rules_serial + 1)
         elif isinstance(event, PastPictures):
             if self.timeline is not None:
-                self.timeline.add_pictures(event)
+                self.timeline.history.add_pictures(event)
                 self.new_pictures()
         elif isinstance(event, Pictures):
             if self.timeline is not None:
-                self.timeline.add_pictures(event)
+                self.timeline.history.add_pictures(event)
             if event.pictures and event.pictures[0].env == now.settings.selected_env:
                 # They come a kind at a time; what nobody looks through any more is not to stay.
                 watched = {(camera.kind, camera.name) for camera in now.settings.cameras}
@@ -289,12 +288,15 @@ class LiveState:
         if isinstance(self.reference, RecordedTask) and self.reference.approved is not None:
             self.reference = str(self.reference)
 
-    def load_request(self, wanted: Wanted, level: LoadLevel = "auto") -> Load:
+    def load_request(
+        self, source: dict[str, str] | None, snapshot: bytes | None = None, level: LoadLevel = "auto"
+    ) -> Load:
+        """See `Load`."""
         options = replace(self.options, seed=self.now.seed)
         # The version that ran is brought back although another class of the file was asked for since.
-        reference = self.reference if wanted.source is None else self.running_reference
+        reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)
-        return Load(reference, options, wanted.source, level, wanted.snapshot, any_task)
+        return Load(reference, options, source, level, snapshot, any_task)
 
     def settings(self) -> Settings:
         """What the worker is to know of what was chosen."""
@@ -355,9 +357,7 @@ class LiveState:
         if not episodes:
             env, why = next(iter(found.items()))
             return f"nothing was kept of env {env}: {why}"
-        serials = [moment.serial for moment, _ in moments_of(episodes)]
-        snapshots = {at: whole for at in serials if (whole := history.whole_at(at)) is not None}
-        return WhatToKeep(self.now.task, load, placed, episodes, snapshots)
+        return WhatToKeep(self.now.task, load, placed, episodes)
 
     def view(self, **known: Any) -> SessionView:
         """A snapshot of what is shown.

@@ -7,7 +7,7 @@ own too (`acting.RecordActing`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,8 +18,8 @@ import torch
 
 from workbench.authoring.reference import named_file
 from workbench.core.broken_rule import warn_of
-from workbench.core.recorded_run import states_of
-from workbench.core.recorded_state import apart, write_states
+from workbench.core.recorded_run import RecordedRun, states_of
+from workbench.core.recorded_state import apart
 from workbench.core.rules import Finding
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
@@ -30,11 +30,12 @@ from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting, RecordActing
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
-from workbench.session.given_actions import SUFFIXES, GivenEpisode, GivenEpisodes, read_given
+from workbench.session.given_actions import SUFFIXES, read_given
 from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 from workbench.session.policy import find_policy
 from workbench.session.record_options import RecordArguments
+from workbench.session.relive import put_there
 from workbench.session.reload import open_task
 
 _STEPS_WITHOUT_LIMIT = 200
@@ -90,21 +91,21 @@ class Recorded:
     """Episodes that were."""
 
 
-def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, GivenEpisodes | None]:
-    """What is asked for, with what the file of actions says of it: how many episodes, the control mode.
+def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[RecordedRun]]:
+    """What is asked for, with what the file of actions says of it: how many episodes, the control mode. And its runs, one
+    for each episode or one for all; none where the actions are not in a file.
 
     Raises:
         FileNotFoundError, ValueError: as `read_given`; or the numbers asked for make no sense.
     """
-    given = None
+    given: Sequence[RecordedRun] = ()
     if Path(what.actions).suffix in SUFFIXES:
-        given = read_given(Path(what.actions))
-        options = what.options
-        options = replace(options, env_kwargs={**given.env_kwargs, **options.env_kwargs})
+        given, env_kwargs = read_given(Path(what.actions))
+        options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
         what = replace(what, options=options)
     elif what.actions not in _KINDS:
         find_policy(what.actions, _beside(what))
-    if what.use_env_states and (given is None or not all(episode.states for episode in given.episodes)):
+    if what.use_env_states and not (given and all(run.env_states for run in given)):
         raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")
     if what.episodes is not None and what.successes is not None:
         raise ValueError("--episodes and --successes: name one of them")
@@ -117,9 +118,9 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, GivenEpisode
     ):
         if number is not None and number < 1:
             raise ValueError(f"--{name} must be at least 1, not {number}")
-    several = 0 if given is None or len(given) == 1 else len(given)
+    several = len(given) if len(given) > 1 else 0
     if what.successes is None:
-        episodes = what.episodes or (len(given) if given is not None else 4)
+        episodes = what.episodes or len(given) or 4
         if several and episodes > several:
             raise ValueError(f"{what.actions} has {several} episodes, and --episodes asks for {episodes}")
         return replace(what, episodes=episodes), given
@@ -217,11 +218,11 @@ class _Recording:
             (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)
 
 
-def _record_share(what: RecordOptions, share: Share, given: GivenEpisodes | None = None) -> None:
+def _record_share(what: RecordOptions, share: Share, given: Sequence[RecordedRun] | None = None) -> None:
     """What one process does. Raises as `record`.
 
     Args:
-        given: what its file of actions holds, if that was read already.
+        given: as `with_given_actions`, if that was read already.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
     if given is None:
@@ -245,14 +246,14 @@ class _Episodes:
         what: RecordOptions,
         here: CurrentFolder,
         folder: Path,
-        given: GivenEpisodes | None,
+        given: Sequence[RecordedRun],
         share: Share,
     ) -> None:
         self._opened, self._what, self._given, self._share = opened, what, given, share
         self._finisher = EpisodeFinisher()
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
-        plain = given is None and what.actions != "random"
+        plain = not given and what.actions != "random"
         self._acting = RecordActing(_acting(what, here) if plain else None)
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
         self._running: dict[int, int] = {}
@@ -318,32 +319,29 @@ class _Episodes:
 
     # --- one episode -----------------------------------------------------------------------------------
 
-    def _given_of(self, index: int) -> GivenEpisode | None:
-        return None if self._given is None else self._given.of(index)
+    def _given_of(self, index: int) -> RecordedRun | None:
+        return self._given[index % len(self._given)] if self._given else None
 
     def _begin(self, env: int, index: int) -> None:
         task, given = self._opened.env, self._given_of(index)
         seed = self._what.options.seed + index
-        if given is not None and given.seed is not None:
+        if given is not None and given.seed >= 0:
             seed = given.seed
         step = reset_checked(task, self._opened.loaded, seed, [env])
         self._running[env], self._steps[env] = index, 0
-        if given is not None and given.states:
+        if given is not None and given.env_states:
             step = self._put_right_start(env, given, step)
         self._gatherer.acted_by = self._acting.begin(env, seed, given)
         mask = np.zeros(task.num_envs, bool)
         mask[env] = True
         self._gatherer.take(self._stepped(step, mask, [env]))
 
-    def _put_right_start(self, env: int, given: GivenEpisode, step: StepResult) -> StepResult:
-        first = {name: values[0] for name, values in given.states.items()}
-        task = self._opened.env
+    def _put_right_start(self, env: int, given: RecordedRun, step: StepResult) -> StepResult:
+        first, task = given.state(0), self._opened.env
         if max(apart(states_of(read_state_columns(task), env), first)) <= _ELSEWHERE:
             return step
         self._put_right.add(self._running[env])
-        with blamed("restore", self._opened.loaded, task):
-            write_states(task.env, {env: first})
-            return task.judge()
+        return put_there(self._opened, {env: first})
 
     def _step(self) -> None:
         """A control step of all envs, and the end of the episodes that are over with it."""
@@ -351,14 +349,12 @@ class _Episodes:
         action = self._acting.next_action(task, {env: self._steps[env] for env in self._running})
         step = step_checked(task, loaded, action)
         if self._what.use_env_states:
-            states: dict[int, Mapping[str, np.ndarray]] = {}
-            for env, index in self._running.items():
-                given = self._given_of(index)
-                assert given is not None
-                states[env] = {name: values[self._steps[env] + 1] for name, values in given.states.items()}
-            with blamed("restore", loaded, task):
-                write_states(task.env, states)
-                step = task.judge(action)
+            states = {
+                env: given.state(self._steps[env] + 1)
+                for env, index in self._running.items()
+                if (given := self._given_of(index)) is not None
+            }
+            step = put_there(self._opened, states, action)
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
         self._share.say(len(self._running))
@@ -371,7 +367,7 @@ class _Episodes:
     def _is_over(self, env: int, step: StepResult) -> bool:
         given = self._given_of(self._running[env])
         if given is not None:
-            return self._steps[env] >= min(len(given.actions), self._what.max_steps or 10**9)
+            return self._steps[env] >= min(given.length, self._what.max_steps or 10**9)
         limit = self._what.max_steps or self._opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
         return bool(step.terminated[env] or step.truncated[env] or self._steps[env] >= limit)
 

@@ -14,30 +14,18 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
 from workbench.recording.mend import mend
-from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
+from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.view import RecordingStatus
 
 _MOST_WAITING = 256 * 1024**2
 """Bytes of steps that the disk has not taken."""
-
-
-@dataclass(frozen=True)
-class _Start:
-    task: TaskDescription
-    env_idx: tuple[int, ...]
-    one_each: bool
-
-
-@dataclass(frozen=True)
-class _Stop:
-    pass
 
 
 class LiveRecorder:
@@ -66,10 +54,11 @@ class LiveRecorder:
         self._problem: str | None = None
         self._waiting_bytes = 0
         self._ends_by_itself = False
-        self._queue: queue.Queue[Stepped | _Start | _Stop | None] = queue.Queue()
+        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue()
+        """What the recorder's thread is to do; None to end."""
         self.finisher = EpisodeFinisher(on_change, self._recover)
         """Makes the files, of other episodes too."""
-        self._thread = watched_thread("recorder", self._gather_all)
+        self._thread = watched_thread("recorder", self._work)
         self._thread.start()
 
     # --- the session's side ----------------------------------------------------------------------------
@@ -78,13 +67,14 @@ class LiveRecorder:
         """From each env's next reset on; of each only the next episode if `one_each`."""
         with self._lock:
             self._env_idx, self._problem, self._ends_by_itself = tuple(env_idx), None, one_each
-        self._queue.put(_Start(task, tuple(env_idx), one_each))
+        gatherer = EpisodeGatherer(task, env_idx, self._folder, self.finisher.finish, one_each=one_each)
+        self._queue.put(partial(self._gather_with, gatherer))
 
     def stop(self) -> None:
         """End the episodes under way; what was gathered of them is written."""
         with self._lock:
             self._env_idx = ()
-        self._queue.put(_Stop())
+        self._queue.put(partial(self._gather_with, None))
 
     def take(self, stepped: Stepped) -> None:
         """The next reset or step."""
@@ -98,10 +88,10 @@ class LiveRecorder:
                     "the recording ended: the disk is slower than the simulation. Record fewer envs, or choose "
                     "another folder"
                 )
-                self._queue.put(_Stop())
+                self._queue.put(partial(self._gather_with, None))
                 return
             self._waiting_bytes += size
-        self._queue.put(stepped)
+        self._queue.put(partial(self._take, stepped, size))
 
     @property
     def recording(self) -> tuple[int, ...]:
@@ -141,23 +131,21 @@ class LiveRecorder:
 
     # --- the recorder's thread -------------------------------------------------------------------------
 
-    def _gather_all(self) -> None:
-        while (what := self._queue.get()) is not None:
-            if isinstance(what, Stepped):
-                with self._lock:
-                    self._waiting_bytes -= _size(what)
-                self._take(what)
-                continue
-            self._end()
-            if isinstance(what, _Start):
-                gatherer = EpisodeGatherer(
-                    what.task, what.env_idx, self._folder, self._over, one_each=what.one_each
-                )
-                with self._lock:
-                    self._gatherer = gatherer
-            self._on_change()
+    def _work(self) -> None:
+        while (work := self._queue.get()) is not None:
+            work()
 
-    def _take(self, stepped: Stepped) -> None:
+    def _gather_with(self, gatherer: EpisodeGatherer | None) -> None:
+        """End the episodes under way, and gather others from now on, or none."""
+        with self._lock:
+            before, self._gatherer = self._gatherer, gatherer
+        if before is not None:
+            before.finish()
+        self._on_change()
+
+    def _take(self, stepped: Stepped, size: int) -> None:
+        with self._lock:
+            self._waiting_bytes -= size
         gatherer = self._gatherer
         if gatherer is None:
             return
@@ -168,7 +156,7 @@ class LiveRecorder:
             # A disk that is full, an entry of evaluate() that is no number, a step that was lost; else it is ours.
             if not isinstance(error, (RecordingError, ValueError)):
                 say_failure("A step could not be recorded", error)
-            self._end()
+            self._gather_with(None)
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
             # Nothing more of `_env_idx`: another recording may have been started by now.
@@ -181,15 +169,6 @@ class LiveRecorder:
                 self._env_idx = tuple(env for env in self._env_idx if env in left)
             self._on_envs(left)
             self._on_change()
-
-    def _end(self) -> None:
-        with self._lock:
-            gatherer, self._gatherer = self._gatherer, None
-        if gatherer is not None:
-            gatherer.finish()
-
-    def _over(self, episode: GatheredEpisode) -> None:
-        self.finisher.finish(episode)
 
     def _recover(self) -> None:
         """What a server before this one left behind; on the finisher's thread, before all else."""
@@ -223,7 +202,6 @@ def recovered_in_words(paths: Sequence[str]) -> str:
 
 
 def _size(stepped: Stepped) -> int:
-    step = stepped.step
-    arrays = [*stepped.columns.values(), *step.evaluate.values(), step.poses, step.reward]
-    kept = len(stepped.snapshot) + sum(map(len, stepped.new_parts.values()))
-    return kept + sum(array.nbytes for array in arrays) + sum(picture.nbytes for picture in stepped.captured)
+    held = stepped.step, *stepped.columns.values(), *stepped.captured
+    snapshot = len(stepped.snapshot) + sum(map(len, stepped.new_parts.values()))
+    return snapshot + sum(part.nbytes for part in held)

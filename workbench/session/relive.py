@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core import actions
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import (
     apart,
@@ -106,6 +107,19 @@ def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int
     return {i: Beginning(other[i], missed[i]) for i in runs}
 
 
+def put_there(
+    opened: OpenedTask, states: Mapping[int, Mapping[str, NDArray]], action: NDArray[np.float32] | None = None
+) -> StepResult:
+    """Put a recorded state into each of these envs, and let the task say what it is; as `TaskEnv.judge`.
+
+    Raises:
+        TaskError: the task's code raised.
+    """
+    with blamed("restore", opened.loaded, opened.env):
+        write_states(opened.env.env, states)
+        return opened.env.judge(action)
+
+
 def arrive(
     opened: OpenedTask,
     run: RecordedRun,
@@ -138,7 +152,9 @@ def arrive(
         missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:
             for t in range(state):
-                step_checked(task, opened.loaded, _for_all(opened, run.action[t]))
+                action: NDArray[np.float32] = run.action[t]
+                rows = dict.fromkeys(chosen, action)
+                step_checked(task, opened.loaded, actions.action_of(task.parts, task.num_envs, rows))
                 wanted = run.state(t + 1)
                 if wanted and _far(env, chosen, wanted):
                     with blamed("restore", opened.loaded, task):
@@ -168,7 +184,7 @@ def arrive(
 
 def why_not_lived_through(opened: OpenedTask, run: RecordedRun) -> str:
     """Why the recorded actions cannot be made; empty where they can."""
-    width = sum(len(part.names) for part in opened.env.parts)
+    width = actions.width(opened.env.parts)
     recorded = run.action.shape[1] if run.action.ndim == 2 else 0
     if not np.isfinite(run.action).all():
         return "the recorded actions hold NaN or infinity: they were not made again"
@@ -188,10 +204,6 @@ def _kept(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
             None,
             f"the other envs cannot be put back after steps, since this task's state cannot be kept ({error})",
         )
-
-
-def _for_all(opened: OpenedTask, action: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.broadcast_to(action, (opened.env.num_envs, len(action))).astype(np.float32)
 
 
 def _of(states: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:

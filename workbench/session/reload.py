@@ -359,7 +359,7 @@ def _restore(
 ) -> tuple[StepResult, RestoreReport]:
     task = opened.env
     there = [i for i in snapshot.env_idx if i < task.num_envs]
-    fits = action is not None and action.shape == (task.num_envs, len(actions.bounds(task.parts)[0]))
+    fits = action is not None and action.shape == (task.num_envs, actions.width(task.parts))
     with blamed("reset", opened.loaded, task):
         report = restore_snapshot(task.env, snapshot, there)
         return task.judge(action if fits else None), report

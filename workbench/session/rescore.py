@@ -29,7 +29,7 @@ from workbench.session.clearance import Clearances, NotCleared, Wanted, recorded
 from workbench.session.judging import JudgedView, Judging
 from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Load, TaskOptions
-from workbench.session.rescore_messages import Rescore, Rescored
+from workbench.session.questions import Rescore, Rescored
 from workbench.session.step_back import (
     CannotStepIn,
     NoText,

@@ -9,21 +9,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError
+from workbench.core import actions
 from workbench.core.recorded_run import RecordedRun
-from workbench.core.recorded_state import apart, read_states, write_states
+from workbench.core.recorded_state import apart, read_states
 from workbench.core.snapshot import only_these_move
 from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.recording.sources import Source
 from workbench.session.open_task import OpenedTask, blamed, step_checked
-from workbench.session.relive import begin_again, why_not_lived_through
-from workbench.session.rescore_messages import Rescore, Rescored
+from workbench.session.questions import Rescore, Rescored
+from workbench.session.relive import begin_again, put_there, why_not_lived_through
 from workbench.session.step_back import run_of
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
@@ -177,19 +179,14 @@ def _begin(opened: OpenedTask, seats: dict[int, _Seat]) -> None:
 
 def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool) -> None:
     task = opened.env
-    action = np.zeros((task.num_envs, sum(len(part.names) for part in task.parts)), np.float32)
-    for env, seat in seats.items():
-        action[env] = seat.run.action[seat.at]
-    if len(seats) < task.num_envs:
-        with only_these_move(task.env, [*seats], None):
-            step = step_checked(task, opened.loaded, action)
-    else:
+    rows = {env: seat.run.action[seat.at] for env, seat in seats.items()}
+    action = actions.action_of(task.parts, task.num_envs, rows)
+    others = only_these_move(task.env, [*seats], None) if len(seats) < task.num_envs else nullcontext()
+    with others:
         step = step_checked(task, opened.loaded, action)
     now = read_states(task.env)
     if use_env_states:
-        with blamed("restore", opened.loaded, task):
-            write_states(task.env, {env: seat.run.state(seat.at + 1) for env, seat in seats.items()})
-            step = task.judge(action if task.parts else None)
+        step = put_there(opened, {env: seat.run.state(seat.at + 1) for env, seat in seats.items()}, action)
         now = read_states(task.env)
     for env, seat in seats.items():
         seat.reward.append(float(step.reward[env]))

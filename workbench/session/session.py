@@ -26,10 +26,8 @@ from workbench.jobs.wire import Answer, Progress
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_studio import CameraStudio
-from workbench.session.curves import TermCurves
 from workbench.session.env_table import EnvRows
-from workbench.session.judge import Judge, what_a_load_means
-from workbench.session.judgement import Judgement
+from workbench.session.judgement import Judge, Judgement, what_a_load_means
 from workbench.session.judging import StoppedBy
 from workbench.session.keep_past import PastKeeper
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
@@ -152,11 +150,6 @@ class Session:
         """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
         with self._lock:
             return None if self._state.timeline is None else self._state.timeline.history.env_rows()
-
-    def term_curves(self) -> TermCurves | None:
-        """The reward's terms over time; None before a task is loaded. Copies: not for every frame."""
-        with self._lock:
-            return None if self._state.timeline is None else self._state.timeline.history.steps.terms()
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until something changed since the counter `seen`; returns the counter as it is now."""

@@ -21,10 +21,9 @@ from workbench.session.history import History, Lived, Moment, ShownMoment
 from workbench.session.messages import (
     CameraRequest,
     DrawPast,
-    PastPictures,
-    Pictures,
     Request,
     Restore,
+    Restored,
     Stepped,
 )
 
@@ -92,8 +91,8 @@ class Timeline:
         self.history = History(table, limit, first_serial)
         self._num_envs = table.rows().num_envs
         self._shown: int | None = None
-        self._not_carried: tuple[str, ...] = ()
-        self._arrived = ""
+        self._jump: Restored | None = None
+        """Of the last jump."""
         self._entered = 0
         self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
@@ -102,17 +101,12 @@ class Timeline:
     def add(self, stepped: Stepped) -> Moment:
         moment = self.history.add(stepped)
         if stepped.reset_mask.any():
-            missed = {} if stepped.restored is None else stepped.restored.not_carried
-            self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
-            self._arrived = "" if stepped.restored is None else stepped.restored.how
+            self._jump = stepped.restored
         if stepped.restored is not None and stepped.restored.number:
             self._entered = stepped.restored.number
         if self._shown is not None and self._shown < self.history.first:
             self._shown = self.history.first  # what was looked at had to go
         return moment
-
-    def add_pictures(self, event: Pictures | PastPictures) -> None:
-        self.history.add_pictures(event)
 
     # --- what is shown -------------------------------------------------------------------------------
 
@@ -170,6 +164,7 @@ class Timeline:
         history, moment = self.history, self.shown
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
+        missed, how = ({}, "") if self._jump is None else (self._jump.not_carried, self._jump.how)
         return TimelineView(
             first=history.first,
             last=history.last,
@@ -178,10 +173,10 @@ class Timeline:
             used=history.used,
             limit=history.limit,
             moments=len(history),
-            can_go_on=moment is not None and bool(moment.snapshot),
+            can_go_on=moment is not None and moment.snapshot is not None,
             undo=None if jump is None else _in_words(jump, history.moved_last_by(jump), self._num_envs),
-            not_carried=self._not_carried,
-            arrived=self._arrived,
+            not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
+            arrived=how,
             entered=self._entered,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
         )
@@ -236,12 +231,12 @@ class Timeline:
         origin: int,
         undoes: int | None = None,
     ) -> Restore:
-        found = {i: self.history.way_to(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
+        history = self.history
+        found = {i: history.way_to(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
         ways = {i: way for i, way in found.items() if way is not None}
-        starts = {start: self.history.snapshot_at(start) for start in {way.start for way in ways.values()}}
-        known = {start: taken for start, taken in starts.items() if taken is not None}
-        ways = {i: way for i, way in ways.items() if way.start in known}
-        return Restore(snapshot, envs, source, origin, undoes, ways, known)
+        beginnings = {way.start for way in ways.values()}
+        starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
+        return Restore(snapshot, envs, source, origin, undoes, ways, starts)
 
     def draw(self, env: int, cameras: tuple[CameraRequest, ...]) -> DrawPast | None:
         """Ask for the pictures that the shown moment lacks; once for each moment, env and choice of cameras."""

@@ -1,20 +1,123 @@
 """Which version of the author's file is asked for, and from where: a save, a person, or the end of a worker.
 
 The file is followed whether or not it ever loaded, with the modules beside it that the task imported. What a worker is
-asked to load after another's end is `recovery`'s to say; here it is said to the worker, and the page's state follows.
+asked to load after another's end is `Recovery`'s to say; `Versions` says it to the worker, and the page's state follows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Literal, NamedTuple
 
+from workbench.authoring.modules import read_source
 from workbench.authoring.problem import Problem
 from workbench.authoring.watch import SourceWatcher
 from workbench.session.kept_worker import Death
 from workbench.session.live_state import SharedState
 from workbench.session.messages import Failed, Load, LoadLevel, Play, Request, TaskDescription
-from workbench.session.recovery import Recovery, Wanted, is_on_disk
+
+Rung = Literal["file", "moment", "version", "nothing"]
+
+
+class Wanted(NamedTuple):
+    """What a load is to name besides the task."""
+
+    source: dict[str, str] | None
+    """Text to be used in place of the files; None for what is on disk."""
+    snapshot: bytes | None
+    """The moment to be restored."""
+
+
+def is_on_disk(source: Mapping[str, str]) -> bool:
+    """Whether the files still have these texts."""
+    for path, text in source.items():
+        try:
+            if read_source(path) != text:
+                return False
+        except (OSError, SyntaxError):
+            return False
+    return True
+
+
+class Recovery:
+    """What the next worker is asked to load when one has gone: the last good version at the last moment.
+
+    Bringing back a version can itself fail, in ways that end the worker again: the moment cannot be restored, the file kills
+    whoever imports it, the memory does not suffice. So there is a way down: the file as it is on disk (if that is what
+    somebody waits for), the last good version at its last moment, the same from its start, and at last nothing: a worker
+    that is up and waits for the file to change. None is tried twice, so that no file can make workers die one after the
+    other. Used under the session's lock.
+    """
+
+    def __init__(self, newest: Callable[[], bytes | None]) -> None:
+        """
+        Args:
+            newest: the newest state of the batch, a pickled `core.snapshot.Snapshot`, or None. Asked for only
+                when it is wanted, since putting one together takes longer than a step.
+        """
+        self._good: TaskDescription | None = None
+        self._newest = newest
+        self._rung: Rung = "file"
+        self.loading = True
+        """Whether a load is under way."""
+        self._has_env = False
+
+    @property
+    def restoring(self) -> bool:
+        """Whether the load under way brings back what there was."""
+        return self.loading and self._rung in ("moment", "version")
+
+    def wanted(self) -> Wanted | None:
+        """What a fresh worker is to load; None to load nothing."""
+        if self._rung == "nothing":
+            return None
+        self.loading = True
+        good = self._good.source if self._good is not None and self._rung != "file" else None
+        return Wanted(good or None, self._newest() if self._rung in ("file", "moment") else None)
+
+    def file_asked(self) -> Wanted:
+        """The file is to be loaded as it is on disk, by the worker that there is."""
+        self._rung, self.loading = "file", True
+        return Wanted(None, None if self._has_env else self._newest())
+
+    def loaded(self, task: TaskDescription) -> None:
+        """`task` runs, and is the last good version from now on."""
+        self._good, self._has_env = task, True
+        self._rung, self.loading = "file", False
+
+    def failed(self, kept: bool) -> bool:
+        """A load failed in a worker that goes on. True if it has nothing now, and `wanted` says what to try."""
+        was_loading, self.loading = self.loading, False
+        if kept or not was_loading:
+            return False
+        self._step_down()
+        return self._rung != "nothing"
+
+    def died(self, file_waits: bool) -> None:
+        """The worker is gone; `file_waits`: it was ended because a newer file waited behind it."""
+        if file_waits:
+            self._rung = "file"
+        elif self.loading:
+            self._step_down()
+        elif self._rung != "nothing":
+            self._rung = "moment" if self._good is not None else "nothing"
+        self.loading = self._has_env = False
+
+    def restart_asked(self) -> None:
+        """Somebody had the worker replaced: what there was comes back, or the file if nothing ever ran."""
+        self._rung = "file" if self._good is None else "moment"
+        self.loading = self._has_env = False
+
+    def _step_down(self) -> None:
+        if self._good is None:
+            self._rung = "nothing"
+        elif self._rung == "file":
+            self._rung = "moment" if self._newest() is not None else "version"
+        elif self._rung == "moment" and self._newest() is not None:
+            self._rung = "version"
+        else:
+            self._rung = "nothing"
 
 
 class Versions:
@@ -49,7 +152,7 @@ class Versions:
         """
         with self._shared.lock:
             state = self._shared.state
-            request = state.load_request(self._recovery.file_asked(), level)
+            request = state.load_request(*self._recovery.file_asked(), level)
             stopped = state.now.state == "stopped"
         if stopped:
             self._replace_worker()  # it will be greeted with the file
@@ -92,7 +195,7 @@ class Versions:
             requests: list[Request] = [state.settings()]
             wanted = self._recovery.wanted()
             if wanted is not None:
-                requests.append(state.load_request(wanted))
+                requests.append(state.load_request(*wanted))
             else:
                 state.waits_for_the_file()
             if state.wants_play:
@@ -108,7 +211,7 @@ class Versions:
         """How another worker gets the version that runs."""
         with self._shared.lock:
             task = self._shared.state.now.task
-            return None if task is None else self._shared.state.load_request(_as_it_is(task))
+            return None if task is None else self._shared.state.load_request(dict(task.source))
 
     # --- what came of it -----------------------------------------------------------------------------
 
@@ -130,7 +233,7 @@ class Versions:
         """If it was a load of a fresh worker, that is to have the last good version."""
         with self._shared.lock:
             wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
-            request = None if wanted is None else self._shared.state.load_request(wanted)
+            request = None if wanted is None else self._shared.state.load_request(*wanted)
             task = self._shared.state.now.task
         if request is not None:
             self._send(request)
@@ -164,7 +267,3 @@ class Versions:
             return
         beside = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
         self._watcher.follow({own_file, *beside}, texts)
-
-
-def _as_it_is(task: TaskDescription) -> Wanted:
-    return Wanted(dict(task.source), None)

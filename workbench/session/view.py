@@ -20,7 +20,7 @@ from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
 from workbench.session.messages import ReloadReport, RulesBroken, Settings, TaskDescription
 from workbench.session.printed import NOTHING_PRINTED, Printed
-from workbench.session.studio_view import StudioView
+from workbench.session.studio_view import Progress, StudioView
 from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
@@ -30,16 +30,12 @@ State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 
 @dataclass(frozen=True)
 class KeepStatus:
-    active: bool = False
-    what: str = ""
-    """What is being done, while it is."""
-    done: int = 0
-    total: int = 0
-    """Moments; 0 while they are not counted yet."""
     said: str = ""
     """What came of the last one, once it has ended."""
     failed: bool = False
     """`said` is why it did not go well."""
+    progress: Progress | None = None
+    """In moments; None while nothing is kept."""
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,16 @@ from workbench.session.messages import (
 from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
 from workbench.session.pacing import Pacer, Rate, now_and_then
 from workbench.session.pulse import Doing, PulseWriter
-from workbench.session.questions import CameraQuestion, CaptureMoment, JudgeMoments, MakeScene, RunCameras
+from workbench.session.questions import (
+    CameraQuestion,
+    CaptureMoment,
+    JudgeMoments,
+    MakeScene,
+    Rescore,
+    RunCameras,
+)
 from workbench.session.relive import going_there, step_back
 from workbench.session.reload import Running, load_version, warm_up
-from workbench.session.rescore_messages import Rescore
 from workbench.session.step_events import StepEvents
 from workbench.session.worker_cameras import WorkerCameras
 

@@ -6,13 +6,11 @@ sent is bounded, and no more often than the eye follows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.curves import MOST, Curves, TermCurves
+from workbench.session.curves import MOST, Curves
 from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
@@ -26,7 +24,6 @@ COLOURS = (
     "#fab005", "#7950f2", "#fd7e14", "#15aabf", "#e64980", "#868e96",
 )  # fmt: skip
 NO_CURVES = Curves(0, np.zeros(0, np.int64), np.zeros((0, 1), np.float32), np.zeros((0, 1), np.float32))
-NO_TERMS = TermCurves(np.zeros(0, np.int64), {})
 NEWEST = slice(-LONGEST, None)
 HOW_TO = (
     'For a curve of each part of the reward, put info["reward_terms"] = {"reach": reach, ...} (tensors of shape '
@@ -35,15 +32,9 @@ HOW_TO = (
 
 
 class CurvesPanel(PagePart[SessionView]):
-    """
-    Args:
-        term_curves: The parts of the reward; None while there is no task.
-    """
-
     every = 0.2
 
-    def __init__(self, server: viser.ViserServer, term_curves: Callable[[], TermCurves | None]) -> None:
-        self._term_curves = term_curves
+    def __init__(self, server: viser.ViserServer) -> None:
         gui = server.gui
         folder = gui.add_folder(None)
         self._reward, self._success = (LineChart(server, folder, HEIGHT) for _ in range(2))
@@ -57,33 +48,27 @@ class CurvesPanel(PagePart[SessionView]):
         return drawn, view.task_serial, view.step_serial, view.selected_env, view.timeline.shown
 
     def draw(self, view: SessionView) -> None:
-        curves = NO_CURVES if view.curves is None else view.curves
-        self._empty.visible = len(curves.tick) < 2
+        curves = NO_CURVES if view.curves is None or len(view.curves.tick) < 2 else view.curves
+        self._empty.visible = curves is NO_CURVES
         lost = "" if self._empty.visible else said_of(curves.reward[-1])
         self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
-        x = curves.tick[NEWEST]
+        x, env, terms = curves.tick[NEWEST], view.selected_env, curves.terms
         for chart, title, values, span in (
             (self._reward, "reward", curves.reward, None),
             (self._success, "success", curves.success, YES_OR_NO),
         ):
-            lines = env_lines(values[NEWEST], view.selected_env)
+            lines = env_lines(values[NEWEST], env)
             shown = np.where(x == view.timeline.tick, lines[-1].values, np.nan)
             chart.draw(title, x, lines, None if view.timeline.shown is None else shown, span)
-        self._draw_terms(view)
-
-    def _draw_terms(self, view: SessionView) -> None:
-        curves, env = self._term_curves(), view.selected_env
-        if curves is None or len(curves.tick) < 2:
-            curves = NO_TERMS
-        dense = len(curves.tick) and view.task is not None and "dense" in view.task.reward_mode
-        text = HOW_TO if dense and not curves.terms else ""
+        dense = len(x) and view.task is not None and "dense" in view.task.reward_mode
+        text = HOW_TO if dense and not terms else ""
         text = no_curve_text(curves.no_curve) if curves.no_curve else text
         self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
         lines = [
             Line(name, values[NEWEST, min(env, values.shape[1] - 1)], colour, 1.6)
-            for (name, values), colour in zip(curves.terms.items(), COLOURS, strict=False)
+            for (name, values), colour in zip(terms.items(), COLOURS, strict=False)
         ]
-        self._terms.draw(f"reward terms, env {env}", curves.tick[NEWEST], lines)
+        self._terms.draw(f"reward terms, env {env}", x, lines)
 
 
 def said_of(reward: NDArray[np.float32]) -> str:

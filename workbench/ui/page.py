@@ -128,7 +128,7 @@ class Page:
             reward = [
                 NumbersPanel(server),
                 JudgedAbove(server),
-                CurvesPanel(server, session.term_curves),
+                CurvesPanel(server),
             ]
             self._judgement = JudgementPanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):

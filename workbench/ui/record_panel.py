@@ -72,7 +72,7 @@ class RecordPanel(PagePart[SessionView]):
 
     def keep(self) -> None:
         """Keep what was just seen, or give that up."""
-        if self._session.view().recording.keeping.active:
+        if self._session.view().recording.keeping.progress is not None:
             self._session.keeper.stop()
         else:
             self._session.keep_past(self._envs)
@@ -83,26 +83,26 @@ class RecordPanel(PagePart[SessionView]):
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
         shown = view.task_serial, view.state, view.selected_env, view.timeline.shown, self._which.value
-        stand = recording.active, recording.waiting, recording.keeping.active, view.timeline.moments == 0
-        return *shown, *stand
+        stand = recording.active, recording.waiting, recording.keeping.progress is None
+        return *shown, *stand, view.timeline.moments == 0
 
     def draw(self, view: SessionView) -> None:
-        recording, keeping = view.recording, view.recording.keeping
+        recording, keeping = view.recording, view.recording.keeping.progress is not None
         waits = recording.active and recording.waiting == len(recording.env_idx)
         self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
         self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
-        self._keep.label = STOP_KEEPING if keeping.active else KEEP
-        self._keep.icon = viser.Icon.PLAYER_STOP if keeping.active else viser.Icon.HISTORY
+        self._keep.label = STOP_KEEPING if keeping else KEEP
+        self._keep.icon = viser.Icon.PLAYER_STOP if keeping else viser.Icon.HISTORY
         can_record = view.task is not None and view.state != "stopped"
         self._button.disabled = not can_record and not recording.active
         # Hidden, the next button would move under the pointer.
         self._next.disabled = not can_record or recording.active
-        self._keep.disabled = view.timeline.moments == 0 and not keeping.active
+        self._keep.disabled = view.timeline.moments == 0 and not keeping
         self._which.disabled = not can_record
         self._which.visible = view.task is None or view.task.num_envs > 1
         about = what_keeping_means(view, self._which.value == ALL_ENVS)
-        self._about.content = render("note", text=about) if about and not keeping.active else ""
-        self._before.visible = has_one_before(view) and not keeping.active
+        self._about.content = render("note", text=about) if about and not keeping else ""
+        self._before.visible = has_one_before(view) and not keeping
         self._status.content = recording_html(recording)
 
 
