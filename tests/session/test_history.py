@@ -343,6 +343,13 @@ def way(history: History, env: int, serial: int) -> tuple[int, int, int]:
     return found.start, found.source, len(found.actions)
 
 
+def test_there_is_no_way_from_a_point_that_cannot_be_put_there() -> None:
+    history = filled(2)
+    history.add(stepped(2, jumped=(0, 1, 2), keys=(1, 99)))
+    history.add(stepped(3))
+    assert history.way_to(0, 3, 100) is None and way(history, 0, 1) == (0, 0, 1)
+
+
 def test_what_may_happen_can_happen_at_once() -> None:
     flags = (RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER)
     assert all(sum(bool(one & other) for other in flags) == 1 for one in flags)
