@@ -169,6 +169,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
             background.ask(job.check, JudgeCamera(("human", "nothing"), None, 0))
         first = background.pid
         assert first is not None
+        assert psutil.Process(first).nice() > psutil.Process().nice(), "what plays comes first"
         os.kill(first, signal.SIGKILL)
         with pytest.raises(JobFailed, match="the process in the background was killed by SIGKILL"):
             background.ask(job.check, Reset((1,), 7))
