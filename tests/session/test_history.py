@@ -343,6 +343,28 @@ def way(history: History, env: int, serial: int) -> tuple[int, int, int]:
     return found.start, found.source, len(found.actions)
 
 
+def test_pictures_of_moments_that_went_are_no_trouble_to_those_that_are_kept() -> None:
+    history = filled(30, 400_000)
+    history.add_pictures(PastPictures(2, (picture(0),)))
+    for number in range(30, 300):
+        history.add(stepped(number))
+    assert history.at(2) is None
+    for serial in range(260, 300):
+        history.add_pictures(PastPictures(serial, (picture(0),)))
+    pictured = [moment.serial for moment in history.between(0, 300) if moment.pictures]
+    assert pictured == list(range(pictured[0], 300)) and 260 < pictured[0] and history.used <= history.limit
+
+
+def test_a_going_back_that_was_dropped_is_told_no_more() -> None:
+    history = filled(3, 60_000)
+    for origin in (1, 2):
+        history.add(stepped(1, jumped=(0,), restored=Restored((0,), (0,), origin, None, {})))
+    assert history.jumps_back(0) == [(3, 1), (4, 2)]
+    for number in range(2, 300):
+        history.add(stepped(number))
+    assert history.first > 4 and history.jumps_back(0) == []
+
+
 def test_there_is_no_way_from_a_point_that_cannot_be_put_there() -> None:
     history = filled(2)
     history.add(stepped(2, jumped=(0, 1, 2), keys=(1, 99)))
