@@ -51,6 +51,14 @@ def test_a_step_is_plain_arrays_with_the_envs_first(push: TaskEnv) -> None:
     assert step.poses.shape == (N, len(scene_index(push.env).names), 7) and step.poses.dtype == np.float32
 
 
+def test_a_reward_that_could_be_learned_from_is_a_number_like_others(push: TaskEnv) -> None:
+    """As of a task that asks a network of torch's."""
+    reward = torch.ones(N, requires_grad=True) * 2
+    assert (
+        push.result({"success": torch.zeros(N, dtype=torch.bool)}, reward, None).reward.tolist() == [2.0] * N
+    )
+
+
 def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> None:
     push.reset(seed=0)
     step = push.step(np.ones((N, 8), np.float32))
