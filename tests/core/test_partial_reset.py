@@ -18,6 +18,7 @@ from mani_skill.utils.structs import Pose
 from tests.core.single_env_judge import Bare, batch_of, single
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.partial_reset import active_controllers
+from workbench.core.task_env import TaskEnv
 
 
 def made(task: str | type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any) -> Any:
@@ -152,6 +153,12 @@ def test_seeds_for_some_envs_are_theirs_and_the_others_keep_their_own(
     starts.reset()
     for env, seed in ((0, 5), (1, 41), (2, 7), (3, 40)):
         assert torch.equal(starts.box.pose.p[env], drawn_by_stock(stock, seed, resets=2)), env
+
+
+def test_a_seed_for_one_env_alone_is_its_own(starts: Any, stock: Any) -> None:
+    starts.reset(seed=[5, 6, 7, 8])
+    TaskEnv(starts).reset(seed=44, env_idx=[2])
+    assert torch.equal(starts.box.pose.p[2], drawn_by_stock(stock, 44))
 
 
 def test_the_process_draws_on_as_if_seeds_for_some_envs_had_not_been_given(starts: Any) -> None:
