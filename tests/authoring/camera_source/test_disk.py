@@ -66,8 +66,10 @@ def test_two_files_are_changed_together_or_not_at_all(tmp_path: Path) -> None:
     revert(edit)
     assert (one.read_text(), other.read_text()) == ("a = 1\n", "b = 1\n")
     other.write_text("b = 3\n")
+    before = one.stat().st_ctime_ns
     assert "other.py was edited" in refusal(apply, edit)
     assert (one.read_text(), other.read_text()) == ("a = 1\n", "b = 3\n")
+    assert one.stat().st_ctime_ns == before, "it was not written, only to be taken back"
 
 
 def test_mixed_line_ends_stay_where_they_are(tmp_path: Path) -> None:

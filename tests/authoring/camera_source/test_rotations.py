@@ -12,7 +12,7 @@ from mani_skill.utils import sapien_utils
 from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
-from workbench.authoring.source.numbers import look_at, quaternion_texts, to_euler
+from workbench.authoring.source.numbers import look_at, quaternion_texts, same_side, to_euler
 from workbench.core.camera_frames import angle_between
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)
@@ -73,6 +73,12 @@ def test_look_at_is_maniskills(
     assert found is not None and angle_between(found, wanted) < 1e-4
 
 
+def test_of_two_quaternions_the_one_on_the_side_of_the_old_one_is_taken() -> None:
+    assert same_side((0.6, 0, 0, 0.8), (-1, 0, 0, 0)) == pytest.approx([-0.6, 0, 0, -0.8])
+    assert same_side((-0.6, 0, 0, -0.8), (1, 0, 0, 0)) == pytest.approx([0.6, 0, 0, 0.8])
+    assert same_side((0, 0, 0, 1), (1, 0, 0, 0)) == [0, 0, 0, 1], "neither of them resembles it"
+
+
 def test_along_up_there_is_no_look_at() -> None:
     for target in ((1.0, 2.0, 9.0), (1.0, 2.0, -9.0), (1.0, 2.0, 3.0)):
         assert look_at((1.0, 2.0, 3.0), target) is None
@@ -81,6 +87,8 @@ def test_along_up_there_is_no_look_at() -> None:
 def test_a_quaternion_without_direction_is_refused() -> None:
     assert quaternion_texts((0, 0, 3, 4)) == ["0.0", "0.0", "0.6", "0.8"]
     assert quaternion_texts((-0.6, 0, 0, 0.8)) == ["-0.6", "0.0", "0.0", "0.8"], "on the side that it was on"
+    assert quaternion_texts((0.5 + 7e-8, 0.5 - 7e-8, 0.5, 0.5)) == ["0.5"] * 4, "as short as 1e-7 lets it be"
+    assert quaternion_texts((0.5 + 2e-7, 0.5 - 2e-7, 0.5, 0.5))[0] == "0.5000002"
     for wrong in ((0, 0, 0, 0), (math.nan, 0, 0, 1), (math.inf, 0, 0, 1)):
         with pytest.raises(ValueError, match="no rotation|not finite"):
             quaternion_texts(wrong)
