@@ -405,6 +405,7 @@ def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
         plan = planned(plan_edit, {FILE: source}, ("sensor", uid), before, after, run_class)
         assert isinstance(plan, SourceEdit), plan
         assert real_settings({FILE: plan.new_text}, uid) == plan.settings == after
+        assert "intrinsic=np.array([[110.5, 0.0, 64.0], [" in plan.new_text
         back = planned(plan_edit, {FILE: plan.new_text}, ("sensor", uid), after, before, run_class)
         assert isinstance(back, SourceEdit), back
         assert real_settings({FILE: back.new_text}, uid) == back.settings == before
