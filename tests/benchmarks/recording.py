@@ -21,7 +21,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,24 +129,14 @@ class _Rrd:
     def __init__(self) -> None:
         write = make_files.write_rrd
 
-        def write_rrd(survey: Any, pieces: Iterator[Any], path: Path) -> None:
+        def write_rrd(episode: Any, path: Path) -> None:
             began = time.thread_time()
             try:
-                write(survey, self._without(pieces), path)
+                write(episode, path)
             finally:
                 self.taken += time.thread_time() - began
 
         make_files.write_rrd = write_rrd
-
-    def _without(self, pieces: Iterator[Any]) -> Iterator[Any]:
-        """Reading them, and the .h5, which takes them first, are not the .rrd's."""
-        while True:
-            began = time.thread_time()
-            piece = next(pieces, None)
-            self.taken -= time.thread_time() - began
-            if piece is None:
-                return
-            yield piece
 
 
 rrd = _Rrd()

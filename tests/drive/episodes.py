@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,9 +17,9 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
-from workbench.recording.journal import Journal
+from workbench.recording.from_journal import Header, read_header
+from workbench.recording.journal import Entry, Journal, JournalReader
 from workbench.recording.scene_file import read_visuals
-from workbench.recording.survey import Header, read_header
 
 BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
 
@@ -86,9 +87,16 @@ def journal_of(writer: EpisodeWriter) -> Journal:
 
 def header_of(journal: Path) -> Header:
     """As `recover` reads it, of a journal that has one."""
-    header = read_header(journal, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
+    with contextlib.closing(JournalReader(journal)) as reader:
+        header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
     assert header is not None
     return header
+
+
+def entries_of(journal: Path) -> list[Entry]:
+    """All that can be read of it."""
+    with contextlib.closing(JournalReader(journal)) as reader:
+        return [entry for _, entries in reader for entry in entries]
 
 
 def write(folder: Path, episode: Episode, pictures: bool = True, every: int = 1) -> Path:

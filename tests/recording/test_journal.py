@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.drive.episodes import entries_of
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.recording import journal as journals
-from workbench.recording.journal import Entry, Journal, claim, read_journal
+from workbench.recording.journal import Entry, Journal, claim
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +35,7 @@ def journal(tmp_path: Path) -> Iterator[Journal]:
 
 
 def rows(path: Path) -> list[bytes]:
-    return [entry.value for entries in read_journal(path) for entry in entries if entry.kind == "row"]
+    return [entry.value for entry in entries_of(path) if entry.kind == "row"]
 
 
 def numbers(*values: int) -> list[bytes]:
@@ -149,7 +150,7 @@ def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(
     for _ in range(2):
         with pytest.raises(OSError, match="could not be encoded .*no room"):
             journal.finish()
-    assert list(read_journal(journal.path)) == [[Entry("row", 0, b"0")]]
+    assert entries_of(journal.path) == [Entry("row", 0, b"0")]
 
 
 def test_rows_that_come_while_the_disk_fails_keep_their_order(
@@ -261,6 +262,7 @@ def test_a_disk_that_does_not_give_what_was_written_is_no_end(
         class Failing:
             closed = False
             left = 3
+            mode = "rb"
 
             def read(self, size: int = -1) -> bytes:
                 self.left -= 1
@@ -268,14 +270,7 @@ def test_a_disk_that_does_not_give_what_was_written_is_no_end(
                     raise OSError(errno.EIO, "Input/output error")
                 return read(size)
 
-            def close(self) -> None:
-                file.close()
-
-            def __enter__(self):
-                return self
-
-            def __exit__(self, *_: object) -> None:
-                file.close()
+            seek, tell, close = file.seek, file.tell, file.close
 
         return Failing()
 

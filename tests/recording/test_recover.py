@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.episodes import Made, header_of, journal_of
+from tests.drive.episodes import Made, entries_of, header_of, journal_of
 from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.core.geometry import Mesh
 from workbench.recording import make_files as making
-from workbench.recording.journal import FOLDER, Entry, Journal, read_journal
+from workbench.recording.journal import FOLDER, Entry, Journal
 from workbench.recording.landing import RecordingError
 from workbench.recording.make_files import episode_stem
 from workbench.recording.read_episode import read_episode
@@ -37,10 +37,7 @@ def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp
             writer.acted_by("somebody else")
         append(writer, row)
     journal = next((tmp_path / FOLDER).glob("*.arrow"))
-    until(
-        lambda: sum(entry.kind == "row" for entries in read_journal(journal) for entry in entries) == 6,
-        "all rows",
-    )
+    until(lambda: sum(entry.kind == "row" for entry in entries_of(journal)) == 6, "all rows")
     assert recover(tmp_path) == []  # its writer lives
     writer.close()
     (files,) = recover(tmp_path)
@@ -66,7 +63,7 @@ def test_a_journal_may_end_anywhere(make_episode: Maker, tmp_path: Path) -> None
     cut = tmp_path / "cut.arrow"
     for end in [*ends, *(chance.randrange(len(whole)) for _ in range(40))]:
         cut.write_bytes(whole[:end])
-        rows = sum(entry.kind == "row" for entries in read_journal(cut) for entry in entries)
+        rows = sum(entry.kind == "row" for entry in entries_of(cut))
         assert rows == sum(one <= end for one in ends)
 
 
@@ -290,7 +287,7 @@ def of_another_version(make_episode: Maker, folder: Path) -> None:
 
 def changed(path: Path, kind: str, change: Callable[[bytes], bytes], more: Entry | None = None) -> None:
     """Write the journal again with another value of the entries of a kind, and one entry `more` before the last row."""
-    entries = [entry for batch in read_journal(path) for entry in batch]
+    entries = entries_of(path)
     path.unlink()
     journal = Journal(path)
     for number, entry in enumerate(entries):

@@ -24,8 +24,9 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording import rrd
 from workbench.recording.blueprint_in_file import blueprint_stream
+from workbench.recording.from_journal import episode_in
+from workbench.recording.journal import JournalReader
 from workbench.recording.read_episode import read_episode
-from workbench.recording.survey import read_pictures, read_survey
 
 Maker = Callable[..., Made]
 
@@ -40,14 +41,16 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
         append(writer, row)
     journal = journal_of(writer)
     journal.finish()
-    survey = read_survey(journal.path, header_of(journal.path))
+    reader = JournalReader(journal.path)
+    recorded = episode_in(reader, header_of(journal.path))
+    assert recorded is not None
     path = tmp_path / "some.rrd"
 
     def size_with_room(room: int) -> int:
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
         try:
-            rrd.write_rrd(survey, read_pictures(journal.path, survey), path)
+            rrd.write_rrd(recorded, path)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         return path.stat().st_size
@@ -68,6 +71,7 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
     assert len(os.listdir("/proc/self/fd")) == before
     assert size_with_room(whole + 64) > 0
     assert verify_rrd(path) is None
+    reader.close()
     writer.discard()
 
 

@@ -20,7 +20,7 @@ import contextlib
 import io
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -48,6 +48,8 @@ class EncodedPictures:
 
     modality: Modality
     blobs: Sequence[bytes]
+    decoded: Callable[[int], NDArray] | None = None
+    """Gives the picture of a number where it is decoded elsewhere; raises OSError."""
 
     def __len__(self) -> int:
         return len(self.blobs)
@@ -63,19 +65,24 @@ class EncodedPictures:
             IndexError: there is no such picture.
             OSError: its bytes are no picture.
         """
+        if self.decoded is not None:
+            return self.decoded(range(len(self))[index])
         return decode(self.modality, self.blobs[index])
 
 
 class LazyPictures(Sequence[bytes]):
     """Encoded pictures of which each is had when it is asked for; slices are lists."""
 
-    def one(self, number: int) -> bytes:
-        """The picture of this number, which is one of them."""
-        raise NotImplementedError
+    def __init__(self, count: int, one: Callable[[int], bytes]) -> None:
+        """`one` gives the picture of a number, which is one of them; it may raise OSError."""
+        self._count, self._one = count, one
+
+    def __len__(self) -> int:
+        return self._count
 
     def __getitem__(self, index: Any) -> Any:
-        numbers = range(len(self))[index]
-        return self.one(numbers) if isinstance(numbers, int) else [self.one(number) for number in numbers]
+        numbers = range(self._count)[index]
+        return self._one(numbers) if isinstance(numbers, int) else [self._one(number) for number in numbers]
 
 
 def encode(modality: Modality, picture: NDArray) -> bytes:

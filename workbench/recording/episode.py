@@ -21,7 +21,7 @@ from workbench.core.geometry import BodyKind, SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import OtherEntry
 from workbench.recording.columns import TextTrack, entry_at
-from workbench.recording.encoded_pictures import EncodedPictures
+from workbench.recording.encoded_pictures import MODALITIES, EncodedPictures, Modality
 
 
 def _now() -> str:
@@ -97,6 +97,11 @@ class CameraTrack:
     depth: EncodedPictures | None = None
     segmentation: EncodedPictures | None = None
 
+    @property
+    def pictures(self) -> dict[Modality, EncodedPictures]:
+        """Those that it has."""
+        return {m: held for m in MODALITIES if (held := getattr(self, m)) is not None}
+
 
 def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
     """What people know each by: its name, after which ``_human`` follows where a sensor has the same."""
@@ -163,8 +168,16 @@ class Episode:
         return len(self.reward)
 
     def flag(self, name: str) -> NDArray[np.bool_] | None:
-        """(T + 1,) of an entry of ``evaluate()`` that is one truth a state; None where it is another, or not there."""
-        return flag_of(self.evaluate.get(name))
+        """(T + 1,) of an entry of ``evaluate()`` that is one truth a state, NaN where it lacks it; None where it is another,
+        or not there."""
+        values = self.evaluate.get(name)
+        return None if values is None or values.ndim != 1 else np.nan_to_num(values.astype(np.float64)) != 0
+
+    @property
+    def flags(self) -> dict[str, NDArray[np.bool_]]:
+        """(T + 1,) ``success`` and ``fail``, those that the task has."""
+        found = {name: self.flag(name) for name in ("success", "fail")}
+        return {name: flag for name, flag in found.items() if flag is not None}
 
     def others_at(self, state: int) -> dict[str, OtherEntry]:
         """What ``evaluate()`` returned in this state besides `evaluate`."""
@@ -183,13 +196,6 @@ class Episode:
 
 def _is_nan(value: NDArray | None) -> bool:
     return value is None or (value.dtype.kind == "f" and bool(np.isnan(value).all()))
-
-
-def flag_of(values: NDArray | None) -> NDArray[np.bool_] | None:
-    """(T + 1,) of a column of ``evaluate()`` that is one truth a state, NaN where it lacks it; None for another column."""
-    if values is None or values.ndim != 1:
-        return None
-    return np.nan_to_num(values.astype(np.float64)) != 0
 
 
 def box_of_moving(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, NDArray]:

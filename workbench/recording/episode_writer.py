@@ -24,13 +24,13 @@ from workbench.recording.columns import TEXT, Layout, TextWriter
 from workbench.recording.encode_soon import encode_soon
 from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.from_journal import Header, header_text
 from workbench.recording.journal import FOLDER, Entry, Journal
 from workbench.recording.journal import Item as JournalItem
 from workbench.recording.landing import RecordingError, reason
 from workbench.recording.make_files import EpisodeFiles as EpisodeFiles
 from workbench.recording.make_files import make_files
 from workbench.recording.scene_file import keep_scene
-from workbench.recording.survey import Header, header_text
 
 SCENE_SUFFIX = ".scene"
 NO_OTHERS: Mapping[str, OtherEntry] = MappingProxyType({})

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from workbench.machine.atomic_files import new_file
 from workbench.machine.regular_file import open_regular_file
-from workbench.recording.encoded_pictures import MOST_PIXELS, LazyPictures, encode_jpeg
+from workbench.recording.encoded_pictures import MOST_PIXELS, encode_jpeg
 from workbench.recording.sources import UnreadableRecording
 
 MOST_FRAMES = 100_000
@@ -167,7 +167,7 @@ class FilmWriter:
 # --- taken apart -----------------------------------------------------------------------------------
 
 
-class FilmPictures(LazyPictures):
+class FilmPart:
     """The frames of a part of a film as JPEG; all of the part is taken out when one is first asked for."""
 
     def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
@@ -177,9 +177,6 @@ class FilmPictures(LazyPictures):
         self._film, self._begin, self._count, self._fps = film, begin, count, fps
         self._blobs: list[bytes] | None = None
         self._taking = threading.Lock()
-
-    def __len__(self) -> int:
-        return self._count
 
     def one(self, number: int) -> bytes:
         """Raises UnreadableRecording where the film cannot be read."""

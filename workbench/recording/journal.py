@@ -275,22 +275,48 @@ def before_writing(flush: Callable[[], None]) -> None:
     _keeper.before.append(weakref.WeakMethod(flush))
 
 
-def read_journal(path: Path) -> Iterator[list[Entry]]:
-    """The entries of the journal `path`, a batch at a time, as far as it was written whole. Raises OSError."""
-    with open_regular_file(path) as file:
-        reader = None
-        while True:
-            try:
-                reader = reader or pa.ipc.open_stream(file)
-                batch = reader.read_next_batch()
-                columns = [column.to_pylist() for column in batch.columns]
-            except (StopIteration, pa.ArrowInvalid):
+class JournalReader:
+    """A journal that is read, as far as it was written whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError."""
+        self.path = path
+        self._file = open_regular_file(path)
+        self._last: tuple[int, int, list[Entry]] = -1, -1, []
+        """The batch that was looked at last, where it begins and where it ends."""
+
+    def __iter__(self) -> Iterator[tuple[int, list[Entry]]]:
+        """Its entries, a batch at a time, and where that begins. Raises OSError."""
+        try:
+            self._file.seek(0)
+            if pa.ipc.read_schema(self._file) != _SCHEMA:
                 return
-            except OSError as error:
-                if error.errno is not None:  # of the disk, and not Arrow's, whose own has no number
-                    raise
-                return
-            yield [Entry(*row) for row in zip(*columns)]
+            begin = self._file.tell()
+            while True:
+                entries, end = self.batch(begin), self._last[1]
+                yield begin, entries
+                begin = end
+        except (EOFError, pa.ArrowInvalid):
+            return
+        except OSError as error:
+            if error.errno is not None:  # of the disk, and not Arrow's, whose own has no number
+                raise
+
+    def batch(self, begin: int) -> list[Entry]:
+        """The one that begins there. Raises OSError, EOFError or ArrowInvalid where there is none."""
+        if self._last[0] != begin:
+            self._file.seek(begin)
+            batch = pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA)
+            entries = [Entry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))]
+            self._last = begin, self._file.tell(), entries
+        return self._last[2]
+
+    def value(self, place: tuple[int, int]) -> bytes:
+        """Of the entry of that number in the batch that begins there."""
+        return self.batch(place[0])[place[1]].value
+
+    def close(self) -> None:
+        self._file.close()
 
 
 def claim(path: Path) -> int | None:

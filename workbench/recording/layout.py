@@ -25,8 +25,9 @@ import math
 import threading
 import weakref
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -37,11 +38,9 @@ from transforms3d.quaternions import qconjugate, qmult
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.recording.columns import BATCH, EVALUATE, OBS
-from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
-from workbench.recording.episode import camera_names
+from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode
+from workbench.recording.episode import CameraTrack, Episode, camera_names
 from workbench.recording.rerun_chunks import TimedChunks, series_chunk, static_chunk, still_pose
-from workbench.recording.survey import CameraSurvey, Pictures, Survey
 
 WORLD = "/world"
 CAMERAS = "/world/cameras"
@@ -53,6 +52,10 @@ OBSERVATION = "/observation/state"
 REWARD_TERMS = "reward_terms/"
 """What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
+_MOST_PIXELS, _MOST_PICTURES = 8 << 20, 1024
+"""Of the pictures of one chunk, which are in memory together."""
+_PNG_RGBA = 6
+"""Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
@@ -62,56 +65,64 @@ _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
 
 
-def static_chunks(survey: Survey) -> Iterator[Chunk]:
-    """What an episode is as a whole, and what happened in it in words.
+def chunks(episode: Episode) -> Iterator[Chunk]:
+    """All of an episode that has a scene, what does not change first; of its pictures some at a time.
 
     Raises:
         ValueError: rerun refuses something in it.
+        OSError: one of its pictures cannot be read.
     """
-    yield from _scene(survey)
-    yield from _lenses(survey)
-    yield from _series(survey)
-    yield _events(survey)
-    if survey.texts:
-        yield _texts(survey)
-
-
-def time_chunks(survey: Survey, pictures: Iterable[Pictures]) -> Iterator[Chunk]:
-    """What is in time: numbers and poses whole, an entity a chunk; of pictures a chunk for each of `pictures`."""
-    timed = TimedChunks(survey.info.control_dt)
-    states = np.arange(survey.states, dtype=np.int64)
-    moving = {body: entity for body, entity in _present(survey) if not survey.still[body]}
-    yield from timed.poses(list(moving.values()), states, survey.poses[:, list(moving)][..., _XYZW])
-    cameras = camera_entities([camera.info for camera in survey.cameras])
-    for camera, entity in zip(survey.cameras, cameras):
-        if not camera.still:
+    geometry, poses = episode.geometry, episode.poses
+    assert geometry is not None and poses is not None
+    still, present = _still(poses), np.asarray(np.isfinite(poses).any(axis=(0, 2)))
+    bodies = {body: entity for body, entity in enumerate(body_entities(geometry)) if present[body]}
+    cameras = list(zip(episode.cameras, camera_entities([camera.info for camera in episode.cameras])))
+    numbers, ids = _numbers(episode), [_ids(camera) for camera, _ in cameras]
+    yield _world()
+    for body, entity in bodies.items():
+        if still[body]:
+            yield still_pose(entity, poses[0, body, :3], xyzw(poses[0, body, 3:]))
+    yield from _meshes(geometry, episode.info.env_index, bodies)
+    if cameras:
+        yield _classes(episode.segmentation)
+    for (camera, entity), kind in zip(cameras, ids):
+        yield from _lens(camera, entity, kind)
+    yield from _series(numbers)
+    timed = TimedChunks(episode.info.control_dt)
+    yield _log(timed, EVENTS, events(episode))
+    if episode.texts:
+        yield _log(timed, ENTRY_TEXTS, _texts(episode))
+    states = np.arange(len(poses), dtype=np.int64)
+    moving = {body: entity for body, entity in bodies.items() if not still[body]}
+    yield from timed.poses(list(moving.values()), states, poses[:, list(moving)][..., _XYZW])
+    for camera, entity in cameras:
+        if not _still(camera.pose):
             pose = np.concatenate(optical_pose(camera.pose), axis=1)
-            yield from timed.poses([entity], np.array(camera.frames, dtype=np.int64), pose[:, None])
-    for entity, steps, values in _numbers_in_time(survey, states):
-        if np.size(values):
-            yield timed.scalars(entity, steps, values)
-    for some in pictures:
-        yield _pictures(timed, survey.cameras[some.camera], cameras[some.camera], some)
+            yield from timed.poses([entity], camera.frame, pose[:, None])
+    for entity, _, values in numbers:
+        if values.size:
+            yield timed.scalars(entity, states[len(states) - len(values) :], values)
+    for number, some in _pieces(episode.cameras):
+        camera, entity = cameras[number]
+        for modality, pictures in camera.pictures.items():
+            columns = _picture_columns(modality, pictures.blobs[some], ids[number])
+            yield timed.of(f"{entity}/{modality}", camera.frame[some], columns)
 
 
-def _numbers_in_time(
-    survey: Survey, states: NDArray[np.int64]
-) -> Iterator[tuple[str, NDArray[np.int64], NDArray]]:
-    for name, entity, _ in _numbers(survey):
-        # State 0 is a reset: nothing led to it.
-        first = 1 if name in ("action", "reward", "terminated", "truncated") else 0
-        yield entity, states[first:], survey.columns[name][first:]
-    for name, values in survey.flags.items():
-        yield f"/episode/{name}", states, values
-    if observed := survey.named(OBS).values():
-        flat = [np.asarray(v, dtype=np.float64).reshape(len(v), math.prod(v.shape[1:])) for v in observed]
-        yield OBSERVATION, states, np.concatenate(flat, axis=1)
+def _still(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(...) of poses (R, ..., 7): whether it never moved."""
+    bits = poses.view(np.int32)  # a NaN is no movement
+    return np.asarray((bits == bits[0]).all(axis=(0, -1)))
 
 
-def _present(survey: Survey) -> list[tuple[int, str]]:
-    """Bodies of the episode's env and what they are called."""
-    entities = body_entities(survey.header.geometry)
-    return [(body, entity) for body, entity in enumerate(entities) if survey.present[body]]
+def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
+    """Which pictures of which camera go into one chunk, in order of time."""
+    found = []
+    for number, camera in enumerate(cameras):
+        many = min(max(_MOST_PIXELS // (camera.info.width * camera.info.height), 1), _MOST_PICTURES)
+        for begin in range(0, len(camera.frame), many):
+            found.append((camera.frame[begin], number, slice(begin, begin + many)))
+    return [(number, some) for _, number, some in sorted(found, key=lambda piece: piece[:2])]
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -156,18 +167,11 @@ def batch_entity(name: str) -> str:
 # --- scene ----------------------------------------------------------------------------------------
 
 
-def _scene(survey: Survey) -> Iterator[Chunk]:
-    yield _world()
-    entities = dict(_present(survey))
-    for body, entity in entities.items():
-        if survey.still[body]:
-            pose = survey.poses[0, body]
-            yield still_pose(entity, pose[:3], xyzw(pose[3:]))
+def _meshes(geometry: SceneGeometry, env: int, bodies: Mapping[int, str]) -> Iterator[Chunk]:
     worn: Counter[int] = Counter()
-    for visual in survey.header.geometry.visuals:
-        worn_by = [int(body) for body in visual.bodies[visual.envs == survey.info.env_index]]
-        for body in worn_by:
-            if body in entities and (drawn := _drawn(visual, f"{entities[body]}/{worn[body]}")) is not None:
+    for visual in geometry.visuals:
+        for body in map(int, visual.bodies[visual.envs == env]):
+            if body in bodies and (drawn := _drawn(visual, f"{bodies[body]}/{worn[body]}")) is not None:
                 yield drawn
                 worn[body] += 1
 
@@ -236,72 +240,73 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
 # --- cameras --------------------------------------------------------------------------------------
 
 
-def _lenses(survey: Survey) -> Iterator[Chunk]:
-    if not survey.cameras:
-        return
-    names = {0: "background", **survey.header.segmentation}
+def _classes(segmentation: Mapping[int, str]) -> Chunk:
+    names = {0: "background", **segmentation}
     # Class ids are 16 bit in rerun; a name beyond that has nowhere to go (ManiSkill's ids are int16).
     classes = [(int(id_), name) for id_, name in sorted(names.items()) if 0 <= id_ <= 0xFFFF]
-    yield static_chunk(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
-    for camera, entity in zip(survey.cameras, camera_entities([camera.info for camera in survey.cameras])):
-        info = camera.info
-        if camera.still:
-            translation, quaternion = optical_pose(camera.pose[:1])
-            yield still_pose(entity, translation[0], quaternion[0])
-        pinhole = rr.Pinhole(
-            image_from_camera=info.intrinsic,
-            resolution=[info.width, info.height],
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=FRUSTUM_METRES,
+    return static_chunk(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
+
+
+def _lens(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]:
+    info = camera.info
+    if _still(camera.pose):
+        translation, quaternion = optical_pose(camera.pose[:1])
+        yield still_pose(entity, translation[0], quaternion[0])
+    pinhole = rr.Pinhole(
+        image_from_camera=info.intrinsic,
+        resolution=[info.width, info.height],
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=FRUSTUM_METRES,
+    )
+    yield static_chunk(entity, pinhole)
+    if camera.rgb is not None:
+        yield static_chunk(f"{entity}/rgb", rr.EncodedImage.from_fields(media_type="image/jpeg"))
+    if camera.depth is not None:
+        meter = rr.EncodedDepthImage.from_fields(media_type="image/png", meter=MILLIMETRES_PER_METRE)
+        yield static_chunk(f"{entity}/depth", meter)
+    if camera.segmentation is not None:
+        form = rr.components.ImageFormat(
+            width=info.width, height=info.height, channel_datatype=rr.ChannelDatatype.from_np_dtype(ids)
         )
-        yield static_chunk(entity, pinhole)
-        if "rgb" in camera.modalities:
-            yield static_chunk(f"{entity}/rgb", rr.EncodedImage.from_fields(media_type="image/jpeg"))
-        if "depth" in camera.modalities:
-            meter = rr.EncodedDepthImage.from_fields(media_type="image/png", meter=MILLIMETRES_PER_METRE)
-            yield static_chunk(f"{entity}/depth", meter)
-        if "segmentation" in camera.modalities:
-            form = rr.components.ImageFormat(
-                width=info.width,
-                height=info.height,
-                channel_datatype=rr.ChannelDatatype.from_np_dtype(_ids(camera)),
-            )
-            yield static_chunk(f"{entity}/segmentation", rr.SegmentationImage.from_fields(format=form))
+        yield static_chunk(f"{entity}/segmentation", rr.SegmentationImage.from_fields(format=form))
 
 
-def _ids(camera: CameraSurvey) -> np.dtype:
-    return np.dtype(np.int32 if camera.wide else np.uint16)
+def _ids(camera: CameraTrack) -> np.dtype:
+    """Of its segmentation; wide where one of its pictures has ids that 16 bits do not hold."""
+    blobs = () if camera.segmentation is None else camera.segmentation.blobs
+    return np.dtype(np.int32 if any(blob[25] == _PNG_RGBA for blob in blobs) else np.uint16)
 
 
-def _pictures(timed: TimedChunks, camera: CameraSurvey, entity: str, some: Pictures) -> Chunk:
-    steps, modality, blobs = np.array(some.frames, dtype=np.int64), some.modality, some.blobs
+def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype) -> Iterable[Any]:
     if modality == "rgb":
-        columns = rr.EncodedImage.columns(blob=blobs)
-    elif modality == "depth":
-        columns = rr.EncodedDepthImage.columns(blob=blobs)
-    else:
-        # Rerun shows names over ids only where they are plain; its files compress them again.
-        ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(_ids(camera))
-        columns = rr.SegmentationImage.columns(buffer=ids.reshape(len(ids), -1).view(np.uint8))
-    return timed.of(f"{entity}/{modality}", steps, columns)
+        return rr.EncodedImage.columns(blob=blobs)
+    if modality == "depth":
+        return rr.EncodedDepthImage.columns(blob=blobs)
+    # Rerun shows names over ids only where they are plain; its files compress them again.
+    ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(kind)
+    return rr.SegmentationImage.columns(buffer=ids.reshape(len(ids), -1).view(np.uint8))
 
 
 # --- numbers and words ----------------------------------------------------------------------------
 
 
-def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
-    """Column, entity and the name of each number in it, of all that is drawn as curves."""
+def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
+    """Entity, the name of each number in it, and their rows: one a state, or one less where a reset has none."""
     found = [
-        ("action", "/action", list(survey.header.action_names)),
-        ("reward", "/reward", ["reward"]),
-        ("terminated", "/episode/terminated", ["terminated"]),
-        ("truncated", "/episode/truncated", ["truncated"]),
+        ("/action", list(episode.action_names), episode.action),
+        ("/reward", ["reward"], episode.reward),
+        ("/episode/terminated", ["terminated"], episode.terminated),
+        ("/episode/truncated", ["truncated"], episode.truncated),
     ]
-    for name, column in survey.evaluate().items():
+    for name, column in episode.evaluate.items():
         series = series_names(name.removeprefix(REWARD_TERMS), column)
-        found.append((EVALUATE + name, evaluate_entity(name), series))
-    for name, column in survey.named(BATCH).items():
-        found.append((BATCH + name, batch_entity(name), series_names(name, column)))
+        found.append((evaluate_entity(name), series, column))
+    found += [(batch_entity(name), series_names(name, held), held) for name, held in episode.batch.items()]
+    found += [(f"/episode/{name}", [name], flag) for name, flag in episode.flags.items()]
+    if observed := episode.obs.items():
+        names = [one for name, column in observed for one in series_names(name or "obs", column)]
+        flat = [np.asarray(v, dtype=np.float64).reshape(len(v), math.prod(v.shape[1:])) for _, v in observed]
+        found.append((OBSERVATION, names, np.concatenate(flat, axis=1)))
     return found
 
 
@@ -312,32 +317,27 @@ def series_names(name: str, column: NDArray) -> list[str]:
     return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape[1:])]
 
 
-def _series(survey: Survey) -> Iterator[Chunk]:
+def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
-    found: list[tuple[str, list[str], int]] = []
-    for _, entity, series in _numbers(survey):
+    for entity, series, _ in numbers:
         # One view shows all entities of a folder, and those of the whole batch with those of the env.
         folder = entity.split("/")[1].replace("batch", "evaluate")
-        found.append((entity, series, drawn[folder] if folder in ("evaluate", "reward") else 0))
-        drawn[folder] += len(series)
-    found += [(f"/episode/{name}", [name], 0) for name in survey.flags]
-    observed = survey.named(OBS).items()
-    names = [one for name, column in observed for one in series_names(name or "obs", column)]
-    found.append((OBSERVATION, names, 0))
-    for entity, series, first_color in found:
         if series:
-            yield series_chunk(entity, tuple(series), first_color)
+            yield series_chunk(
+                entity, tuple(series), drawn[folder] if folder in ("evaluate", "reward") else 0
+            )
+        drawn[folder] += len(series)
 
 
-def events(survey: Survey) -> list[tuple[int, str, str]]:
+def events(episode: Episode) -> list[tuple[int, str, str]]:
     """(step, level, text) of every moment at which something began, in order of time."""
-    seed = survey.info.seed
+    seed, flags = episode.info.seed, episode.flags
     found = [(0, "INFO", f"reset with seed {seed}" if seed >= 0 else "reset")]
     for name, level in (("success", "INFO"), ("fail", "WARN")):
-        if name in survey.flags:
-            found += [(step, level, name) for step in onsets(survey.flags[name])]
-    for name, values in ((name, survey.columns[name]) for name in ("terminated", "truncated")):
-        found += [(step, "INFO", name) for step in onsets(values)]
+        if name in flags:
+            found += [(step, level, name) for step in onsets(flags[name])]
+    for name, values in (("terminated", episode.terminated), ("truncated", episode.truncated)):
+        found += [(step + 1, "INFO", name) for step in onsets(values)]
     return sorted(found, key=lambda event: event[0])
 
 
@@ -347,25 +347,24 @@ def onsets(values: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(values & ~before).tolist()
 
 
-def _events(survey: Survey) -> Chunk:
-    steps, levels, texts = zip(*events(survey))
-    columns = rr.TextLog.columns(text=list(texts), level=list(levels))
-    return TimedChunks(survey.info.control_dt).of(EVENTS, np.array(steps, dtype=np.int64), columns)
-
-
-def _texts(survey: Survey) -> Chunk:
+def _texts(episode: Episode) -> list[tuple[int, str, str]]:
     """Entries that are no numbers, where they change."""
     said = [
         (
             state,
+            "INFO",
             f"{name}: {''.join(entry.texts)}" if entry is not None else f"{name} is not returned any more",
         )
-        for name, track in survey.texts.items()
+        for name, track in episode.texts.items()
         for state, entry in track
     ]
-    steps, texts = zip(*sorted(said, key=lambda line: line[0]))
-    columns = rr.TextLog.columns(text=list(texts), level=["INFO"] * len(texts))
-    return TimedChunks(survey.info.control_dt).of(ENTRY_TEXTS, np.array(steps, dtype=np.int64), columns)
+    return sorted(said, key=lambda line: line[0])
+
+
+def _log(timed: TimedChunks, entity: str, lines: Sequence[tuple[int, str, str]]) -> Chunk:
+    steps, levels, texts = zip(*lines)
+    columns = rr.TextLog.columns(text=list(texts), level=list(levels))
+    return timed.of(entity, np.array(steps, dtype=np.int64), columns)
 
 
 # --- frames ---------------------------------------------------------------------------------------

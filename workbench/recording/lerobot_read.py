@@ -25,9 +25,9 @@ from workbench.core.pictures import CameraInfo
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording import lerobot_format as form
 from workbench.recording.document import read_json
-from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures
+from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures, LazyPictures
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
-from workbench.recording.films import FilmPictures
+from workbench.recording.films import FilmPart
 from workbench.recording.library_row import Facts, text, whole
 from workbench.recording.sources import UnreadableRecording
 
@@ -192,6 +192,7 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
         "video_key": key,
     }
     film = _inside(folder, _filled(info["video_path"], where))
+    part = FilmPart(film, float(entry[f"videos/{key}/from_timestamp"]), length, float(info["fps"]))
     pose = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (length, 1))
     return CameraTrack(
         CameraInfo(
@@ -208,10 +209,7 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
         ),
         np.arange(length),
         pose,
-        rgb=EncodedPictures(
-            "rgb",
-            FilmPictures(film, float(entry[f"videos/{key}/from_timestamp"]), length, float(info["fps"])),
-        ),
+        rgb=EncodedPictures("rgb", LazyPictures(length, part.one)),
     )
 
 

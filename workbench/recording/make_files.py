@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.from_journal import Header, episode_in
+from workbench.recording.journal import JournalReader
 from workbench.recording.landing import RecordingError, make_last, publish, reason
 from workbench.recording.maniskill_h5 import write_h5, write_json
 from workbench.recording.rrd import write_rrd
-from workbench.recording.survey import Header, read_pictures, read_survey
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -40,19 +41,19 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
     """
     temporaries = temporary_files(journal)
     try:
-        survey = read_survey(journal, header)
-        if survey.states == 0:
-            raise ValueError("the episode has no state yet: its first row is the state after the reset.")
-        if states is not None and survey.states != states:
-            raise OSError(
-                errno.EIO, f"{survey.states} of {states} states can be read back from {journal.name}"
-            )
-        for path in temporaries:
-            path.unlink(missing_ok=True)
-        rrd, h5, json = temporaries
-        write_h5(survey, h5)
-        write_rrd(survey, read_pictures(journal, survey), rrd)
-        write_json(survey, json, folder, (rrd, h5))
+        with contextlib.closing(JournalReader(journal)) as reader:
+            episode = episode_in(reader, header)
+            if episode is None:
+                raise ValueError("the episode has no state yet: its first row is the state after the reset.")
+            if states is not None and episode.length + 1 != states:
+                there = f"{episode.length + 1} of {states} states"
+                raise OSError(errno.EIO, f"{there} can be read back from {journal.name}")
+            for path in temporaries:
+                path.unlink(missing_ok=True)
+            rrd, h5, json = temporaries
+            write_h5(episode, h5)
+            write_rrd(episode, rrd)
+            write_json(episode, json, folder, (rrd, h5), header.made_here)
         make_last(temporaries)
         return EpisodeFiles(*publish(temporaries, folder, episode_stem(header.info)))
     except OSError as error:

@@ -19,10 +19,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.recording.columns import OBS, STATE
 from workbench.recording.description import describe_beside
 from workbench.recording.document import json_text
-from workbench.recording.survey import Survey
+from workbench.recording.episode import Episode
 
 TRAJECTORY = "traj_0"
 _WORTH_PACKING = 8 << 10
@@ -33,8 +32,8 @@ _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
 
 
-def write_h5(survey: Survey, path: Path) -> None:
-    """Write the episode of `survey` to `path`, which must not exist.
+def write_h5(episode: Episode, path: Path) -> None:
+    """Write `episode` to `path`, which must not exist.
 
     Raises:
         OSError: it cannot be written.
@@ -43,13 +42,13 @@ def write_h5(survey: Survey, path: Path) -> None:
     # In memory: HDF5 does not take a failing disk well, and leaves files half open.
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
-        _put_columns(survey, file.create_group(TRAJECTORY, track_order=True))
+        _put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
     with path.open("xb") as file:
         file.write(content.getbuffer())
     h5py.File(path, "r").close()  # refuses a file that is shorter than it says of itself
 
 
-def _put_columns(survey: Survey, trajectory: h5py.Group) -> None:
+def _put_columns(episode: Episode, trajectory: h5py.Group) -> None:
     # What is in the file, so that h5py, which is slow to say, need not be asked.
     groups: dict[tuple[str, ...], h5py.Group] = {(): trajectory}
     taken: set[tuple[str, ...]] = set()
@@ -70,17 +69,16 @@ def _put_columns(survey: Survey, trajectory: h5py.Group) -> None:
         taken.add((*inside, leaf))
         _put(groups[inside], leaf, values)
 
-    columns = survey.columns
-    for name, values in survey.named(OBS).items():
+    for name, values in episode.obs.items():
         add("/".join(["obs", *_parts(name)]), values)
-    add("actions", columns["action"][1:].astype(np.float32))
-    add("terminated", columns["terminated"][1:])
-    add("truncated", columns["truncated"][1:])
-    for name, flags in survey.flags.items():
+    add("actions", episode.action)
+    add("terminated", episode.terminated)
+    add("truncated", episode.truncated)
+    for name, flags in episode.flags.items():
         add(name, flags[1:])
-    for name, values in survey.named(STATE).items():
+    for name, values in episode.env_states.items():
         add("/".join(["env_states", *_parts(name)]), values)
-    add("rewards", survey.reward.astype(np.float32))
+    add("rewards", episode.reward)
 
 
 def _put(parent: h5py.Group, name: str, values: NDArray) -> None:
@@ -108,25 +106,30 @@ def _packing(shape: tuple[int, ...], dtype: np.dtype) -> h5py.h5p.PropDCID:
     return packing
 
 
-def write_json(survey: Survey, path: Path, folder: Path, files: Sequence[Path]) -> None:
-    """Write what is to be said of the episode, and of its other `files`, to `path`; they will lie in `folder`. Raises OSError."""
-    content = json_text(_document(survey, folder, files), indent=2).encode()
+def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path], sealed: bool) -> None:
+    """Write what is to be said of the episode, and of its other `files`, to `path`; they will lie in `folder`. Raises OSError.
+
+    Args:
+        sealed: say by a seal that this installation recorded it.
+    """
+    described = describe_beside(episode, folder, files, sealed)
+    content = json_text({**_maniskills(episode), "workbench": described}, indent=2).encode()
     with path.open("xb") as file:
         file.write(content)
 
 
-def _document(survey: Survey, folder: Path, files: Sequence[Path]) -> dict[str, Any]:
-    info = survey.info
+def _maniskills(episode: Episode) -> dict[str, Any]:
+    info = episode.info
     seed = info.seed if info.seed >= 0 else None
-    episode: dict[str, Any] = {
+    said: dict[str, Any] = {
         "episode_id": 0,
         "episode_seed": seed,
         "control_mode": info.control_mode,
-        "elapsed_steps": survey.length,
+        "elapsed_steps": episode.length,
         "reset_kwargs": {"options": info.reset_options, **({} if seed is None else {"seed": seed})},
     }
-    for name, values in survey.flags.items():
-        episode[name] = bool(values[-1])
+    for name, values in episode.flags.items():
+        said[name] = bool(values[-1])
     return {
         "env_info": {
             "env_id": info.task,
@@ -134,10 +137,9 @@ def _document(survey: Survey, folder: Path, files: Sequence[Path]) -> dict[str, 
             "max_episode_steps": info.max_episode_steps,
         },
         "commit_info": None,
-        "episodes": [episode],
+        "episodes": [said],
         "source_type": "workbench",
         "source_desc": f"recorded with maniskill-workbench {info.versions.get('maniskill-workbench', '')}".strip(),
-        "workbench": describe_beside(survey, folder, files),
     }
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -168,32 +169,21 @@ def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str,
 # --- cameras --------------------------------------------------------------------------------------
 
 
-class _H5Pictures(LazyPictures):
-    """Pictures of a dataset (P, H, W, C), read and encoded when they are asked for."""
-
-    def __init__(self, path: Path, dataset: str, count: int, modality: Modality) -> None:
-        self._path = path
-        self._dataset = dataset
-        self._count = count
-        self._modality: Modality = modality
-
-    def __len__(self) -> int:
-        return self._count
-
-    def one(self, number: int) -> bytes:
-        with open_h5(self._path) as file:
-            dataset = file[self._dataset]
-            if not isinstance(dataset, H5Dataset):
-                raise OSError(f"{self._path.name} has changed since it was opened")
-            picture = dataset.row(number)
-        if self._modality == "rgb":
-            return encode("rgb", np.ascontiguousarray(picture[..., :3]))
-        plain = picture.reshape(picture.shape[:2])
-        if self._modality == "depth":
-            # Whole millimetres if they are integers, metres otherwise (textures of the ray tracers).
-            scale = MILLIMETRES_PER_METRE if plain.dtype.kind in "iu" else 1.0
-            return encode("depth", plain.astype(np.float32) / scale)
-        return encode("segmentation", plain.astype(np.int32))
+def _picture(path: Path, place: str, modality: Modality, number: int) -> bytes:
+    """Of a dataset (P, H, W, C), read and encoded when it is asked for."""
+    with open_h5(path) as file:
+        dataset = file[place]
+        if not isinstance(dataset, H5Dataset):
+            raise OSError(f"{path.name} has changed since it was opened")
+        picture = dataset.row(number)
+    if modality == "rgb":
+        return encode("rgb", np.ascontiguousarray(picture[..., :3]))
+    plain = picture.reshape(picture.shape[:2])
+    if modality == "depth":
+        # Whole millimetres if they are integers, metres otherwise (textures of the ray tracers).
+        scale = MILLIMETRES_PER_METRE if plain.dtype.kind in "iu" else 1.0
+        return encode("depth", plain.astype(np.float32) / scale)
+    return encode("segmentation", plain.astype(np.int32))
 
 
 def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
@@ -220,7 +210,8 @@ def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
                 raise RefusedH5(
                     f"claims pictures of {dataset.shape[2]} x {dataset.shape[1]} pixels (at {dataset.name})"
                 )
-            held[modality] = EncodedPictures(modality, _H5Pictures(path, dataset.name, count, modality))
+            one = partial(_picture, path, dataset.name, modality)
+            held[modality] = EncodedPictures(modality, LazyPictures(count, one))
         if held:
             parameters = obs.group(f"sensor_param/{name}")
             info = _lens(name, size, tuple(held), parameters)

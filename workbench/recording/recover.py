@@ -7,6 +7,7 @@ process that lives is left alone.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,8 @@ from pathlib import Path
 from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import SCENE_SUFFIX, tidy
-from workbench.recording.journal import FOLDER, claim
+from workbench.recording.from_journal import episode_in, read_header, recovered
+from workbench.recording.journal import FOLDER, JournalReader, claim
 from workbench.recording.landing import RecordingError, candidates, reason
 from workbench.recording.make_files import (
     SUFFIXES,
@@ -24,7 +26,6 @@ from workbench.recording.make_files import (
     temporary_files,
 )
 from workbench.recording.scene_file import read_visuals
-from workbench.recording.survey import read_header, read_survey, recovered
 
 
 def recover(folder: Path) -> list[EpisodeFiles]:
@@ -68,12 +69,14 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
     if descriptor is None:
         return None
     try:
-        header = read_header(journal, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
         files = None
-        if header is not None and not _already_made(header.info, journal, folder):
-            header = recovered(header)
-            if read_survey(journal, header).length > 0:
-                files = make_files(journal, header, folder)
+        with contextlib.closing(JournalReader(journal)) as reader:
+            header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
+            if header is not None and not _already_made(header.info, journal, folder):
+                header = recovered(header)
+                episode = episode_in(reader, header)
+                if episode is not None and episode.length > 0:
+                    files = make_files(journal, header, folder)
         journal.unlink(missing_ok=True)
         return files
     finally:

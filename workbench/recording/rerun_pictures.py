@@ -21,7 +21,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from workbench.machine.regular_file import open_regular_file
-from workbench.recording.encoded_pictures import LazyPictures, Modality, encode
+from workbench.recording.encoded_pictures import EncodedPictures, LazyPictures, Modality, encode
 from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_seam import IndexedChunk, decode_chunk
 
@@ -92,51 +92,31 @@ class _Kept:
 _kept = _Kept()
 
 
-class PicturesInFile(LazyPictures):
-    """One modality of one camera, encoded."""
+def pictures_in(
+    file: OpenFile, places: Sequence[IndexedChunk], modality: Modality, height: int, width: int
+) -> tuple[NDArray[np.int64], EncodedPictures]:
+    """One modality of one camera, and (P,) the state of each picture; `places` are its chunks, in order of time. Raises OSError."""
+    component, ends = PICTURE_COMPONENTS[modality], np.cumsum([place.rows for place in places])
 
-    def __init__(self, file: OpenFile, places: Sequence[IndexedChunk], modality: Modality) -> None:
-        """
-        Args:
-            places: its chunks, in order of time.
-        """
-        self._file, self._places, self._modality = file, tuple(places), modality
-        self._component = PICTURE_COMPONENTS[modality]
-        self._ends = np.cumsum([place.rows for place in places])
-
-    def frames(self) -> NDArray[np.int64]:
-        """(P,) the state of each. Raises OSError."""
-        return np.concatenate([self._steps(place) for place in self._places])
-
-    def _steps(self, place: IndexedChunk) -> NDArray[np.int64]:
-        if place.rows > MOST_ROWS:
-            raise OSError(f"{self._file.name} claims {place.rows:,} pictures in one piece")
-        if place.steps is not None and place.steps[1] - place.steps[0] + 1 == place.rows:
-            return np.arange(place.steps[0], place.steps[1] + 1)
-        # A picture here and there: only the chunk itself says of which states.
-        return self._file.chunk(place).column(STEP).cast(pa.int64(), safe=False).to_numpy()
-
-    def __len__(self) -> int:
-        return int(self._ends[-1])
-
-    def one(self, number: int) -> bytes:
-        part = int(np.searchsorted(self._ends, number, side="right"))
-        rows = _kept.rows(self._file, self._places[part], self._component)
-        return rows[number - int(self._ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
-
-
-class IdsInFile(LazyPictures):
-    """Plain ids as the PNG that they were, or would have been."""
-
-    def __init__(self, pictures: PicturesInFile, height: int, width: int) -> None:
-        self._pictures = pictures
-        self._shape = (height, width)
-
-    def __len__(self) -> int:
-        return len(self._pictures)
-
-    def one(self, number: int) -> bytes:
-        content = self._pictures.one(number)
-        wide = len(content) == 4 * self._shape[0] * self._shape[1]
-        ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(self._shape)
+    def one(number: int) -> bytes:
+        part = int(np.searchsorted(ends, number, side="right"))
+        rows = _kept.rows(file, places[part], component)
+        content = rows[number - int(ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
+        if modality != "segmentation":
+            return content
+        # Plain ids, as the PNG that they were, or would have been.
+        wide = len(content) == 4 * height * width
+        ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(height, width)
         return encode("segmentation", ids.astype(np.int32))
+
+    frames = np.concatenate([_steps(file, place) for place in places])
+    return frames, EncodedPictures(modality, LazyPictures(int(ends[-1]), one))
+
+
+def _steps(file: OpenFile, place: IndexedChunk) -> NDArray[np.int64]:
+    if place.rows > MOST_ROWS:
+        raise OSError(f"{file.name} claims {place.rows:,} pictures in one piece")
+    if place.steps is not None and place.steps[1] - place.steps[0] + 1 == place.rows:
+        return np.arange(place.steps[0], place.steps[1] + 1)
+    # A picture here and there: only the chunk itself says of which states.
+    return file.chunk(place).column(STEP).cast(pa.int64(), safe=False).to_numpy()

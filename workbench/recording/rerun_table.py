@@ -24,7 +24,7 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes,
 from workbench.core.pictures import CameraInfo
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.rerun_chunks import STEP
-from workbench.recording.rerun_pictures import PICTURE_COMPONENTS, IdsInFile, OpenFile, PicturesInFile
+from workbench.recording.rerun_pictures import PICTURE_COMPONENTS, OpenFile, pictures_in
 from workbench.recording.rerun_seam import IndexedChunk, index_of
 
 _PROPERTIES = "/__properties"
@@ -59,10 +59,8 @@ class RerunTable:
                 if index < 0:
                     continue
                 steps = batch.column(index).cast(pa.int64(), safe=False).to_numpy()
-            for field, column in zip(batch.schema, batch.columns):
-                if (field.metadata or {}).get(b"rerun:kind") != b"data":
-                    continue
-                key = (chunk.entity_path, field.name)
+            for name, column in _data_of(batch):
+                key = (chunk.entity_path, name)
                 if steps is not None:
                     self._timed.setdefault(key, []).append((steps, column))
                 elif len(column) and column[len(column) - 1].is_valid:
@@ -149,9 +147,7 @@ class RerunTable:
         if not places:
             return None
         places = sorted(places, key=lambda place: (place.steps or (0, 0))[0])
-        pictures = PicturesInFile(self._file, places, modality)
-        blobs = IdsInFile(pictures, info.height, info.width) if modality == "segmentation" else pictures
-        return pictures.frames(), EncodedPictures(modality, blobs)
+        return pictures_in(self._file, places, modality, info.height, info.width)
 
     def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
         """`bare` with the meshes that its bodies wear, shared with other recordings; `entities` are theirs."""
@@ -256,10 +252,15 @@ def read_properties(path: Path) -> dict[str, dict[str, Any]]:
             continue
         name = chunk.entity_path[len(_PROPERTIES) :].lstrip("/")
         batch = chunk.to_record_batch()
-        for field, column in zip(batch.schema, batch.columns):
-            if (field.metadata or {}).get(b"rerun:kind") == b"data" and batch.num_rows:
-                value = column[batch.num_rows - 1].as_py()
-                if value is not None:
-                    component = field.name.rsplit(":", 1)[-1]
-                    found.setdefault(name, {})[component] = value[0] if len(value) == 1 else value
+        for component, column in _data_of(batch) if batch.num_rows else ():
+            if (value := column[batch.num_rows - 1].as_py()) is not None:
+                key = component.rsplit(":", 1)[-1]
+                found.setdefault(name, {})[key] = value[0] if len(value) == 1 else value
     return found
+
+
+def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
+    """The columns of a chunk but its timelines and the ids of its rows."""
+    for field, column in zip(batch.schema, batch.columns):
+        if (field.metadata or {}).get(b"rerun:kind") == b"data":
+            yield field.name, column

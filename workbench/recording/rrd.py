@@ -16,7 +16,7 @@ import math
 import os
 import re
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -29,11 +29,9 @@ from rerun.chunk import Chunk, LazyChunkStream
 from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.blueprint_in_file import BlueprintBytes, add_blueprint, encode_blueprint
-from workbench.recording.columns import BATCH
 from workbench.recording.description import describe
 from workbench.recording.document import fields_of, json_text
-from workbench.recording.encoded_pictures import MODALITIES
-from workbench.recording.episode import EpisodeInfo, acted_by_in_words, box_of_moving
+from workbench.recording.episode import Episode, EpisodeInfo, acted_by_in_words, box_of_moving
 from workbench.recording.layout import (
     EVENTS,
     LOGS,
@@ -41,12 +39,10 @@ from workbench.recording.layout import (
     WORLD,
     batch_entity,
     camera_entities,
+    chunks,
     evaluate_entity,
-    static_chunks,
-    time_chunks,
 )
 from workbench.recording.rerun_chunks import STEP, property_chunk, static_chunk
-from workbench.recording.survey import Pictures, Survey
 
 MAX_SERIES = 32
 """An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
@@ -56,30 +52,28 @@ EYE_DIRECTION = (0.75, 0.85, 0.6)
 """From where the scene is looked at, seen from its middle: ManiSkill's render cameras do likewise."""
 
 
-def write_rrd(survey: Survey, pictures: Iterable[Pictures], path: Path) -> None:
-    """Write the episode of `survey` with its `pictures` to `path`; what lies there is written over.
+def write_rrd(episode: Episode, path: Path) -> None:
+    """Write `episode`, which has a scene, to `path`; what lies there is written over.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: it cannot be written, or one of its pictures not be read.
         ValueError: rerun refuses something in it.
-        Whatever `pictures` raises.
     """
-    application_id = _application_id(survey.info)
+    application_id = _application_id(episode.info)
     # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
     with catch_and_log_exceptions(strict=True):
-        write_chunks(_chunks(survey, pictures), path, application_id)
-        add_blueprint(path, _blueprint(application_id, arrangement(survey)))
+        write_chunks(_chunks(episode), path, application_id)
+        add_blueprint(path, _blueprint(application_id, arrangement(episode)))
 
 
-def _chunks(survey: Survey, pictures: Iterable[Pictures]) -> Iterator[Chunk]:
-    written = datetime.datetime.fromisoformat(survey.info.written_at).timestamp()
+def _chunks(episode: Episode) -> Iterator[Chunk]:
+    written = datetime.datetime.fromisoformat(episode.info.written_at).timestamp()
     started = rr.encodings.TimeInt(seconds=written)
-    info = rr.archetypes.RecordingInfo(name=_title(survey), start_time=started)
+    info = rr.archetypes.RecordingInfo(name=_title(episode), start_time=started)
     yield static_chunk("/__properties", info)
-    for name, values in properties(survey).items():
+    for name, values in properties(episode).items():
         yield property_chunk(name, values)
-    yield from static_chunks(survey)
-    yield from time_chunks(survey, pictures)
+    yield from chunks(episode)
 
 
 def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> None:
@@ -123,8 +117,8 @@ def _application_id(info: EpisodeInfo) -> str:
     return f"workbench {info.task}".replace("/", "-")
 
 
-def _title(survey: Survey) -> str:
-    flags = survey.flags
+def _title(episode: Episode) -> str:
+    flags = episode.flags
     outcome = (
         "success"
         if "success" in flags and flags["success"][-1]
@@ -132,28 +126,28 @@ def _title(survey: Survey) -> str:
         if "fail" in flags and flags["fail"][-1]
         else "no success"
     )
-    info = survey.info
+    info = episode.info
     seed = f"seed {info.seed}" if info.seed >= 0 else "no seed"
-    return f"{info.task} {seed} env {info.env_index}: {outcome}, {survey.length} steps"
+    return f"{info.task} {seed} env {info.env_index}: {outcome}, {episode.length} steps"
 
 
-def properties(survey: Survey) -> dict[str, dict[str, Any]]:
+def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     """What the file says of the episode as a whole, property by property.
 
     ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as
     in ManiSkill's own metrics. ``source`` holds the text of the task's files, so that the episode can
     be made again where the files have changed since. ``workbench`` is the `Description` for programs.
     """
-    said = fields_of(describe(survey))
+    said = fields_of(describe(episode))
     words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
     words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered")
-    episode = {name: said[name] for name in words}
+    plain = {name: said[name] for name in words}
     for name in ("success", "success_once", "fail", "fail_once"):
-        episode[name] = bool(said[name])
-    episode["acted_by"] = acted_by_in_words(survey.info.acted_by)
+        plain[name] = bool(said[name])
+    plain["acted_by"] = acted_by_in_words(episode.info.acted_by)
     for name in ("env_kwargs", "reset_options"):
-        episode[name] = json_text(said[name])
-    values: dict[str, dict[str, Any]] = {"episode": episode}
+        plain[name] = json_text(said[name])
+    values: dict[str, dict[str, Any]] = {"episode": plain}
     if said["versions"]:
         values["versions"] = dict(said["versions"])
     if said["source"]:
@@ -183,26 +177,25 @@ class Arrangement:
     looked_at: tuple[float, float, float]
 
 
-def arrangement(survey: Survey) -> Arrangement:
-    cameras = survey.cameras
+def arrangement(episode: Episode) -> Arrangement:
+    cameras = episode.cameras
     entities = camera_entities([camera.info for camera in cameras])
     entries = [
         (evaluate_entity(name), column)
-        for name, column in survey.evaluate().items()
+        for name, column in episode.evaluate.items()
         if not name.startswith(REWARD_TERMS)
     ]
-    entries += [(batch_entity(name), column) for name, column in survey.named(BATCH).items()]
+    entries += [(batch_entity(name), column) for name, column in episode.batch.items()]
     drawn = (entity for entity, column in entries if 0 < math.prod(column.shape[1:]) <= MAX_SERIES)
-    eye, looked_at = _eye(survey)
+    eye, looked_at = _eye(episode)
     return Arrangement(
         cameras=tuple(
-            (camera.info.name, entity, tuple(m for m in MODALITIES if m in camera.modalities))
-            for camera, entity in zip(cameras, entities)
+            (camera.info.name, entity, tuple(camera.pictures)) for camera, entity in zip(cameras, entities)
         ),
         drawn=tuple(drawn),
-        texts=bool(survey.texts),
-        acted=bool(survey.header.action_names),
-        fps=1.0 / survey.info.control_dt if survey.info.control_dt > 0 else None,
+        texts=bool(episode.texts),
+        acted=bool(episode.action_names),
+        fps=1.0 / episode.info.control_dt if episode.info.control_dt > 0 else None,
         eye=eye,
         looked_at=looked_at,
     )
@@ -274,9 +267,10 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
     return rrb.Horizontal(*views)
 
 
-def _eye(survey: Survey) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def _eye(episode: Episode) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Where the eye is and what it looks at: what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
-    low, high = box_of_moving(survey.poses[0], survey.header.geometry.body_kinds)
+    assert episode.poses is not None and episode.geometry is not None
+    low, high = box_of_moving(episode.poses[0], episode.geometry.body_kinds)
     # Of what differs by centimetres from episode to episode nothing hangs on, and the same blueprint is made once.
     middle = np.round((low + high).astype(np.float64) / 2, 1)
     direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)

@@ -19,7 +19,6 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes,
 from workbench.recording.columns import MOST_LINES
 from workbench.recording.document import CameraWords
 from workbench.recording.encoded_pictures import (
-    MODALITIES,
     MOST_PIXELS,
     EncodedPictures,
     LazyPictures,
@@ -73,8 +72,7 @@ def packed(episode: Episode, source_path: str | None, opened: int, sent: SentSha
 
 
 def _camera(track: CameraTrack) -> CameraRead:
-    held: dict[Modality, EncodedPictures | None] = {m: getattr(track, m) for m in MODALITIES}
-    counts: dict[Modality, int] = {m: len(pictures) for m, pictures in held.items() if pictures is not None}
+    counts: dict[Modality, int] = {modality: len(pictures) for modality, pictures in track.pictures.items()}
     return CameraRead(CameraWords.of(track.info), track.frame, track.pose, counts)
 
 
@@ -97,42 +95,25 @@ class KnownShapes:
         return self._of[shapes]
 
 
-class PicturesRead(EncodedPictures):
-    """Pictures of a recording that a reader has open, decoded there when one is asked for."""
+def _pictures(modality: Modality, camera: int, count: int, fetch: FetchPicture) -> EncodedPictures:
+    """Of a recording that a reader has open, decoded there when one is asked for."""
 
-    def __init__(self, modality: Modality, camera: int, count: int, fetch: FetchPicture) -> None:
-        super().__init__(modality, _Blobs(modality, camera, count, fetch))
-
-    def __getitem__(self, index: int) -> NDArray:
-        blobs = self.blobs
-        assert isinstance(blobs, _Blobs)
-        return blobs.decoded(index)
-
-
-class _Blobs(LazyPictures):
-    def __init__(self, modality: Modality, camera: int, count: int, fetch: FetchPicture) -> None:
-        self._modality: Modality = modality
-        self._camera, self._count, self._fetch = camera, count, fetch
-
-    def __len__(self) -> int:
-        return self._count
-
-    def one(self, number: int) -> bytes:
-        """Raises OSError where it cannot be read."""
-        blob = self._fetch(self._camera, self._modality, number, True).blob
+    def one(number: int) -> bytes:
+        blob = fetch(camera, modality, number, True).blob
         if blob is None:
             raise OSError("the reader gave no picture")
         return blob
 
-    def decoded(self, index: int) -> NDArray:
-        """As `EncodedPictures.__getitem__`."""
-        picture = self._fetch(self._camera, self._modality, range(self._count)[index], False).array
-        dtype, ndim = {"rgb": ("u1", 3), "depth": ("f4", 2), "segmentation": ("i4", 2)}[self._modality]
+    def decoded(number: int) -> NDArray:
+        picture = fetch(camera, modality, number, False).array
+        dtype, ndim = {"rgb": ("u1", 3), "depth": ("f4", 2), "segmentation": ("i4", 2)}[modality]
         if picture is None or picture.dtype != dtype or picture.ndim != ndim or not picture.size:
             raise OSError("the reader gave no picture")
         if picture.shape[0] * picture.shape[1] > MOST_PIXELS or (ndim == 3 and picture.shape[2] != 3):
             raise OSError(f"the reader gave a picture of shape {picture.shape}")
         return picture
+
+    return EncodedPictures(modality, LazyPictures(count, one), decoded)
 
 
 def unpacked(
@@ -257,7 +238,7 @@ def _track(read: CameraRead, number: int, fetch: FetchPicture) -> CameraTrack:
     )
     for count in read.pictures.values():
         _must(count == len(frame), f"{info.name}: {len(frame)} frames and {count} pictures")
-    held = {m: PicturesRead(m, number, count, fetch) for m, count in read.pictures.items()}
+    held = {m: _pictures(m, number, count, fetch) for m, count in read.pictures.items()}
     return CameraTrack(info, frame, pose, **held)
 
 
