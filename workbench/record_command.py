@@ -15,7 +15,7 @@ from workbench.authoring.problem import TaskError
 from workbench.core.backends import gpu_left_alone
 from workbench.jobs.pool import PoolError
 from workbench.recording.landing import try_folder
-from workbench.recording.mend import mend
+from workbench.recording.reading import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
 from workbench.session.rescore import hidden_in_words
 from workbench.terminal import err, print_finding, print_problem, progress_bar, refuse, say, warn

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
-from workbench.recording.mend import mend
 from workbench.recording.read_episode import read_episode
+from workbench.recording.reading import mend
 
 GOLDEN = Path(__file__).parent
 PLACE = Path("/tmp/golden")

@@ -18,8 +18,8 @@ from tests.drive.episodes import made as small
 from tests.recording.verify_rrd import verify_rrd
 from workbench.recording.journal import FOLDER
 from workbench.recording.landing import RecordingError
-from workbench.recording.mend import mend
 from workbench.recording.read_episode import read_episode
+from workbench.recording.reading import mend
 from workbench.recording.recover import recover
 
 pytestmark = pytest.mark.usefixtures("child_process")

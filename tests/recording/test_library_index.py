@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 
 from workbench.recording import library_index
-from workbench.recording.library_index import LibraryIndex
+from workbench.recording.library_index import LibraryIndex, index_path
 from workbench.recording.library_row import Facts
+from workbench.recording.library_scan import Found
 
-SIGNATURE = ".json:5:7"
+
+def found(key: str, size: int = 5) -> Found:
+    return Found(key, {".json": size}, {".json": 7})
 
 
 @pytest.fixture
@@ -23,14 +26,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def keep(index: LibraryIndex, *keys: str) -> None:
-    index.store([(key, SIGNATURE, [(Facts(kind="workbench"), key.encode())]) for key in keys])
+    index.store([(found(key), [(Facts(kind="workbench"), os.fsencode(key))]) for key in keys])
 
 
 def test_an_index_that_another_process_holds_is_left_as_it_is(folder: Path) -> None:
     index = LibraryIndex(folder)
     keep(index, "a", "b")
-    path = index.path
-    assert path is not None
+    path = index_path(folder)
     inode = os.stat(path).st_ino
     other = sqlite3.connect(path, isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
@@ -47,11 +49,33 @@ def test_what_was_read_again_takes_the_place_of_what_was_kept_and_what_is_gone_g
     index = LibraryIndex(folder)
     keep(index, "a", "b", "c")
     facts = Facts(kind="workbench")
-    index.store([("a", ".json:6:8", [(facts, None), (facts, b"second")])], gone=["b"])
+    index.store([(found("a", size=6), [(facts, None), (facts, b"second")])], gone=["b"])
     index.close()
     index = LibraryIndex(folder)
     kept = index.load()
-    assert kept.keys() == {"a", "c"} and kept["a"].signature == ".json:6:8" and len(kept["a"].rows) == 2
+    assert kept.keys() == {"a", "c"} and kept["a"].found == found("a", size=6) and len(kept["a"].rows) == 2
     wanted = [("a", 0), ("a", 1), ("b", 0), ("c", 0)]
     assert index.thumbnails(wanted) == {("a", 1): b"second", ("c", 0): b"c"}
+    index.close()
+
+
+def test_a_name_that_is_no_text_is_kept_like_any_other(folder: Path) -> None:
+    name = os.fsdecode(b"\xff\xfe")
+    index = LibraryIndex(folder)
+    keep(index, name)
+    index.close()
+    index = LibraryIndex(folder)
+    assert index.load()[name].found == found(name)
+    assert index.thumbnails([(name, 0)]) == {(name, 0): b"\xff\xfe"}
+    index.close()
+
+
+def test_an_index_that_was_closed_holds_nothing_and_takes_nothing(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a")
+    index.close()
+    keep(index, "b")
+    assert index.load() == {} and index.thumbnails([("a", 0)]) == {}
+    index = LibraryIndex(folder)
+    assert index.load().keys() == {"a"}
     index.close()

@@ -29,7 +29,7 @@ def row(id: str, **facts: Any) -> LibraryRow:
     kind = facts.pop("kind", "workbench")
     paths = facts.pop("paths", (Path(f"{id}.json"), Path(f"{id}.h5")))
     values = {"task": "Push-v1", "written": NOW.timestamp(), **facts}
-    return LibraryRow(kind, **values, id=id, name=f"name-{id}", paths=paths, size=1000)
+    return LibraryRow(kind, **values, id=id, name=f"name-{id}", place=(id, 0), paths=paths, size=1000)
 
 
 ROWS = (

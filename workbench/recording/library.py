@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -24,7 +25,7 @@ from workbench.machine.watched_thread import watched_thread
 from workbench.recording.annotations import write_into_description, write_notes
 from workbench.recording.library_index import Kept, LibraryIndex
 from workbench.recording.library_row import Entry, Facts, LibraryRow, clean_note, clean_tags, text
-from workbench.recording.library_scan import DATASET_KEY, NOTES, Found, Scan, found_of, key_of, scan_folder
+from workbench.recording.library_scan import DATASET_KEY, NOTES, Found, Scan, key_of, scan_folder
 from workbench.recording.reading import read_rows
 from workbench.recording.trash import (
     Trash,
@@ -77,13 +78,10 @@ class Library:
         self._looking = threading.Lock()
         """Held while the folder is looked through: by one thread at a time."""
         self._changing = threading.RLock()
-        """Held while `_found` and `_kept` are changed, but not while all that changed is read."""
+        """Held while `_kept` is changed, but not while all that changed is read."""
         self._changed = threading.Lock()
         self._view = LibraryView(reading=(0, 0))
-        self._places: dict[str, tuple[str, int]] = {}
-        """Id to key and number of the row in what its files gave."""
         self._by_id: dict[str, LibraryRow] = {}
-        self._found: dict[str, Found] = {}
         self._scan = Scan(fresh=True)
         self._thorough_at = -1e9
         self._index: LibraryIndex | None = LibraryIndex(self.folder) if self.folder.is_dir() else None
@@ -106,11 +104,10 @@ class Library:
 
     def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
         """Small jpegs of those of these recordings that have one."""
-        with self._changed:
-            places = {id: self._places[id] for id in ids if id in self._places}
-        index = self._index
-        jpegs = {} if index is None or not places else index.thumbnails(list(places.values()))
-        return {id: jpegs[place] for id, place in places.items() if place in jpegs}
+        by_id, index = self._by_id, self._index
+        rows = [by_id[id] for id in ids if id in by_id]
+        jpegs = {} if index is None else index.thumbnails([row.place for row in rows])
+        return {row.id: jpegs[row.place] for row in rows if row.place in jpegs}
 
     # --- keeping up with the folder ------------------------------------------------------------------
 
@@ -164,36 +161,37 @@ class Library:
                     self._index = LibraryIndex(self.folder)
                 if self._view.serial == 0 and self._kept:
                     # What the index knows, as if it were all still so, until that is known.
-                    self._found = {key: found_of(key, kept.signature) for key, kept in self._kept.items()}
                     self._show(reading=(0, 0))
             self._thorough_at = time.monotonic()
-            self._scan = scan_folder(self.folder)
-            self._read_changed(self._scan)
+            scan = scan_folder(self.folder)
+            self._scan = replace(scan, found={})  # what was read is kept with what it was read of
+            self._read_changed(scan)
 
-    def _read_changed(self, scan: Scan) -> None:
+    def _read_changed(self, scan: Scan, only: Collection[str] | None = None) -> None:
+        """Of all keys, or of those alone with which something was just done here: whoever did it sees it at once."""
         with self._changing:
-            self._found = scan.found
+            before = self._view.reading
             changed = [
                 found
                 for key, found in scan.found.items()
-                if key not in self._kept or self._kept[key].signature != found.signature
+                if (only is None or key in only) and (key not in self._kept or self._kept[key].found != found)
             ]
-            gone = self._kept.keys() - scan.found.keys()
+            gone = {key for key in self._kept if key not in scan.found and (only is None or key in only)}
             for key in gone:
                 del self._kept[key]
             # Where not all could be looked at, what is not seen may be there: the index keeps it.
             forgotten = [] if scan.problem else sorted(gone)
         changed.sort(key=lambda found: found.newest, reverse=True)
-        unsaved: list[tuple[str, str, list[Entry]]] = []
+        unsaved: list[tuple[Found, list[Entry]]] = []
         published = time.monotonic()
         for done, (found, entries) in enumerate(read_rows(self.folder, changed)):
             if self._stopping.is_set():
                 break
             with self._changing:
-                if found.key not in self._found:
-                    continue  # deleted on this page since
-                self._kept[found.key] = Kept(found.signature, tuple(facts for facts, _ in entries))
-                unsaved.append((found.key, found.signature, entries))
+                if not os.path.lexists(found.paths(self.folder)[0]):
+                    continue  # deleted since, on this page perhaps
+                self._kept[found.key] = Kept(found, tuple(facts for facts, _ in entries))
+                unsaved.append((found, entries))
                 if time.monotonic() - published > PUBLISH_EVERY:
                     self._save(unsaved, forgotten)
                     unsaved, forgotten = [], []
@@ -201,38 +199,21 @@ class Library:
                     published = time.monotonic()
         with self._changing:
             self._save(unsaved, forgotten)
-            self._show(reading=None, problem=scan.problem)
+            self._show(reading=None if only is None else before, problem=scan.problem)
 
-    def _read_again(self, keys: Collection[str]) -> None:
-        """Of what was just done here, so that whoever did it sees it at once."""
-        self._found = scan_folder(self.folder).found
-        read = []
-        gone = [key for key in keys if key not in self._found]
-        for key in gone:
-            self._kept.pop(key, None)
-        for found, entries in read_rows(
-            self.folder, [self._found[key] for key in keys if key in self._found]
-        ):
-            self._kept[found.key] = Kept(found.signature, tuple(facts for facts, _ in entries))
-            read.append((found.key, found.signature, entries))
-        self._save(read, gone)
-        self._show(reading=self._view.reading, problem=self._view.problem)
-
-    def _save(self, read: list[tuple[str, str, list[Entry]]], gone: list[str]) -> None:
+    def _save(self, read: list[tuple[Found, list[Entry]]], gone: list[str]) -> None:
         if self._index is not None and (read or gone):
             self._index.store(read, gone)
 
     def _show(self, reading: tuple[int, int] | None, problem: str | None = None) -> None:
-        rows: list[LibraryRow] = []
-        places: dict[str, tuple[str, int]] = {}
-        for key in sorted(self._kept.keys() & self._found.keys()):
-            for number, facts in enumerate(self._kept[key].rows):
-                row = self._row(self._found[key], facts, places)
-                places[row.id] = (key, number)
-                rows.append(row)
-        self._publish(rows=tuple(rows), places=places, reading=reading, problem=problem)
+        rows: dict[str, LibraryRow] = {}
+        for _, kept in sorted(self._kept.items()):
+            for number, facts in enumerate(kept.rows):
+                row = self._row(kept.found, number, facts, rows)
+                rows[row.id] = row
+        self._publish(rows=tuple(rows.values()), reading=reading, problem=problem)
 
-    def _row(self, found: Found, facts: Facts, taken: dict[str, tuple[str, int]]) -> LibraryRow:
+    def _row(self, found: Found, number: int, facts: Facts, taken: Collection[str]) -> LibraryRow:
         id = facts.uid if facts.uid.isalnum() and facts.uid.isascii() else ""
         if not id or id in taken:
             # No id of its own, or a copy of a recording that is in the table already.
@@ -241,14 +222,14 @@ class Library:
         name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
         name += "" if facts.trajectory is None else f"#{facts.trajectory}"
         # A file's name may hold bytes that are no text, which no page can be sent.
+        name, place = text(name, 400), (found.key, number)
         paths, size = found.paths(self.folder), sum(found.sizes.values())
-        return LibraryRow(**vars(facts), id=id, name=text(name, 400), paths=paths, size=size)
+        return LibraryRow(**vars(facts), id=id, name=name, place=place, paths=paths, size=size)
 
-    def _publish(self, places: dict[str, tuple[str, int]] | None = None, **changes: object) -> None:
+    def _publish(self, **changes: object) -> None:
         with self._changed:
             view = replace(self._view, trash=look_into_trash(self.folder), **changes)  # type: ignore[arg-type]
-            if places is not None:
-                self._places = places
+            if view.rows is not self._view.rows:
                 self._by_id = {row.id: row for row in view.rows}
             if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
                 self._view = replace(view, serial=self._view.serial + 1)
@@ -293,7 +274,7 @@ class Library:
                             "They are written beside the recording, so its folder must be writable."
                         ) from error
             finally:
-                self._read_again(touched)
+                self._read_changed(scan_folder(self.folder), touched)
 
     def delete(self, ids: Iterable[str]) -> str:
         """Move all files of these recordings to the trash; returns the name of the deletion, for `undo_delete`.
@@ -304,13 +285,13 @@ class Library:
         """
         with self._changing:
             keys = self._keys_to_delete(ids)
-            paths = [self._found[key].paths(self.folder) for key in sorted(keys)]
+            paths = [self._kept[key].found.paths(self.folder) for key in sorted(keys)]
             try:
                 batch = put_into_trash(self.folder, paths)
             except TrashError as error:
                 raise LibraryError(f"Not everything was deleted. {error}") from error
             finally:
-                self._read_again(keys)
+                self._read_changed(scan_folder(self.folder), keys)
             if batch is None:
                 raise LibraryError("Those files were gone already.")
             return batch
@@ -324,12 +305,12 @@ class Library:
         wanted = set(ids)
         keys = {self._there(id)[1].key for id in wanted}
         for key in keys:
-            if self._found[key].key.split("/")[-2:] == DATASET_KEY and "/" in key:
+            if key.split("/")[-2:] == DATASET_KEY and "/" in key:
                 raise LibraryError(
                     f"{text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
                     "deleted from here: delete the folder."
                 )
-            of_file = {id for id, (other, _) in self._places.items() if other == key}
+            of_file = {row.id for row in self.rows() if row.place[0] == key}
             if not wanted >= of_file:
                 raise LibraryError(
                     f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
@@ -351,7 +332,7 @@ class Library:
                 back = take_out_of_trash(self.folder, batches[-1])
             except TrashError as error:
                 raise LibraryError(f"Not everything could be brought back. {error}") from error
-            self._read_again({key_of(path) for path in back})
+            self._read_changed(scan_folder(self.folder), {key_of(path) for path in back})
 
     def empty_trash(self) -> None:
         """Delete for good what was deleted. Raises LibraryError."""
@@ -364,7 +345,8 @@ class Library:
                 self._publish()
 
     def _there(self, id: str) -> tuple[LibraryRow, Found]:
-        row, place = self.row(id), self._places.get(id)
-        if row is None or place is None or place[0] not in self._found:
+        row = self.row(id)
+        kept = None if row is None else self._kept.get(row.place[0])
+        if row is None or kept is None:
             raise LibraryError("That recording is not in the library any more.")
-        return row, self._found[place[0]]
+        return row, kept.found

@@ -35,7 +35,7 @@ from workbench.recording.library_row import (
     truth,
     whole,
 )
-from workbench.recording.library_scan import DATASET_KEY, NOTES, Found
+from workbench.recording.library_scan import DATASET_KEY, NOTES, Found, broken
 from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
 from workbench.recording.sources import UnreadableRecording
 
@@ -55,7 +55,7 @@ def read_found(folder: Path, found: Found) -> list[Entry]:
         entries = _read(folder, found)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
         # Files of strangers: what they can be wrong in has no end, and one of them must not hide the others.
-        entries = [_broken(folder, found, f"cannot be read ({error})")]
+        entries = [_broken(found, f"cannot be read ({error})")]
     if NOTES in found.sizes:
         notes = read_notes(found.path(folder, NOTES))
         entries = [
@@ -70,7 +70,7 @@ def _read(folder: Path, found: Found) -> list[Entry]:
         try:
             document = read_document(found.path(folder, ".json"))
         except WrongDocument as error:
-            return [_broken(folder, found, str(error))]
+            return [_broken(found, str(error))]
         if document.is_ours:
             return [_ours(found, document)]
         if document.said and found.key.split("/")[-2:] == DATASET_KEY:
@@ -78,21 +78,19 @@ def _read(folder: Path, found: Found) -> list[Entry]:
         if document.is_maniskills:
             return _maniskills(folder, found, document)
         if ".h5" in found.sizes:
-            return [_broken(folder, found, "names neither an env nor episodes")]
+            return [_broken(found, "names neither an env nor episodes")]
     elif ".h5" in found.sizes:
         name = Path(found.key).name
-        problem = f"{name}.h5 needs {name}.json beside it, which names the env and the episodes."
-        return [(Facts("maniskill", written=found.newest / 1e9, problem=problem), None)]
+        return [
+            broken(found, f"{name}.h5 needs {name}.json beside it, which names the env and the episodes.")
+        ]
     if ".rrd" in found.sizes:
         return [_rrd_only(folder, found)]
     return []
 
 
-def _broken(folder: Path, found: Found, what: str) -> Entry:
-    suffix = next(iter(found.sizes))
-    kind = "rrd only" if suffix == ".rrd" else "maniskill"
-    problem = text(f"{found.path(folder, suffix).name} {what}.", 500)
-    return Facts(kind, written=found.newest / 1e9, problem=problem), None
+def _broken(found: Found, what: str) -> Entry:
+    return broken(found, f"{Path(found.key).name}{next(iter(found.sizes))} {what}.")
 
 
 def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts:
@@ -284,10 +282,10 @@ def _rrd_only(folder: Path, found: Found) -> Entry:
         open_regular_file(path).close()
         said = read_properties(path)
     except NotARegularFile as error:
-        return _broken(folder, found, str(error.strerror))
+        return _broken(found, str(error.strerror))
     except (OSError, ValueError, RuntimeError):
-        return _broken(folder, found, "is no recording that rerun can read, or was cut short")
+        return _broken(found, "is no recording that rerun can read, or was cut short")
     episode = said.get("episode", {})
     if not episode:
-        return _broken(folder, found, "is a recording of rerun, but not of an episode")
+        return _broken(found, "is a recording of rerun, but not of an episode")
     return _episode("rrd only", episode, found.newest / 1e9), None

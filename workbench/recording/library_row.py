@@ -69,6 +69,8 @@ class LibraryRow(Facts):
     recording's own id, or one that is made of the place of a file that has none."""
     name: str
     """Of its files, with the folder below the library's and without suffix; and ``#traj_3`` of a file with several."""
+    place: tuple[str, int]
+    """Key of its files (`library_scan`), and which of the recordings in them it is."""
     paths: tuple[Path, ...]
     """Its files, the one to open it by first. All of them are what *delete* takes."""
     size: int

@@ -1,7 +1,7 @@
 """Which recordings lie below a folder, by names, sizes and times alone: nothing is opened.
 
-A recording is a handful of files with one name and different endings, so files are put together by that name. Sizes
-and times of all of them make the signature by which the index knows whether it has read them as they are.
+A recording is a handful of files with one name and different endings, so files are put together by that name. By sizes
+and times of all of them the index knows whether it has read them as they are.
 
 A folder's own time changes when a name in it comes, goes or is given to another file, which is how every recording of
 ours is written. So between two full looks it is enough to ask a few folders for their time (`Scan.looks_the_same`).
@@ -15,6 +15,8 @@ import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from workbench.recording.library_row import Entry, Facts, text
 
 SUFFIXES = (".json", ".h5", ".rrd")
 """In the order in which a recording is opened by them."""
@@ -31,7 +33,7 @@ MOST_ENTRIES = 500_000
 
 @dataclass(frozen=True)
 class Found:
-    """The files of one name."""
+    """The files of one name; another when any of them was written to, came or went."""
 
     key: str
     """Path of the name below the library's folder, with ``/``."""
@@ -39,11 +41,6 @@ class Found:
     """Suffix to bytes, in the order of `SUFFIXES`, `NOTES` last."""
     times: dict[str, int]
     """Suffix to nanoseconds."""
-
-    @property
-    def signature(self) -> str:
-        """Differs when any of the files was written to, came or went."""
-        return " ".join(f"{suffix}:{self.sizes[suffix]}:{self.times[suffix]}" for suffix in self.sizes)
 
     @property
     def newest(self) -> int:
@@ -57,10 +54,10 @@ class Found:
         return tuple(self.path(folder, suffix) for suffix in self.sizes)
 
 
-def found_of(key: str, signature: str) -> Found:
-    """The files as they were when they had this signature."""
-    parts = [part.split(":") for part in signature.split()]
-    return Found(key, {s: int(size) for s, size, _ in parts}, {s: int(at) for s, _, at in parts})
+def broken(found: Found, problem: str) -> Entry:
+    """The row of files of which nothing else is known."""
+    kind = "rrd only" if found.sizes.keys() <= {".rrd", NOTES} else "maniskill"
+    return Facts(kind, written=found.newest / 1e9, problem=text(problem, 500)), None
 
 
 def key_of(path: str) -> str:

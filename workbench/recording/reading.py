@@ -1,4 +1,4 @@
-"""Recordings are read in processes of their own, which may read their folder and do nothing else (`reader`).
+"""Recordings are read, and mended, in processes of their own, which may do that with their folder and nothing else (`reader`).
 
 What a page shows and what is exported may come from anybody, and it is read by HDF5, Arrow, rerun, ffmpeg and Pillow:
 millions of lines in C, C++ and Rust. So none of them opens a recording in the process that serves the page. Whatever
@@ -20,8 +20,9 @@ from workbench.core.geometry import SharedShapes
 from workbench.recording.document import task_file
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode
-from workbench.recording.library_row import Entry, Facts, clean_facts, text
-from workbench.recording.library_scan import NOTES, Found
+from workbench.recording.landing import RecordingError
+from workbench.recording.library_row import Entry, clean_facts, text
+from workbench.recording.library_scan import NOTES, Found, broken
 from workbench.recording.reader.episode_wire import Garbled, KnownShapes, unpacked
 from workbench.recording.reader.processes import Answered, NotThere, Reader, ReaderEnded, nursery
 from workbench.recording.reader.requests import (
@@ -31,6 +32,8 @@ from workbench.recording.reader.requests import (
     Open,
     PictureAt,
     PictureRead,
+    Recover,
+    Recovered,
     Rows,
     RowsRead,
     Sources,
@@ -43,6 +46,8 @@ ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0
 PICTURE_SECONDS = 70.0
 """A film is taken apart when its first frame is looked at."""
+MENDING_SECONDS = 1800.0
+"""An hour with four cameras takes some minutes."""
 PICTURE_PATIENCE = 0.2
 """Seconds that a picture waits for another recording to be opened."""
 MOST_READERS = 4
@@ -83,7 +88,7 @@ def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, li
     reader.allow(_beyond(path for found in wanted for path in found.paths(folder)))
     for begin in range(0, len(wanted), _AT_ONCE):
         some = wanted[begin : begin + _AT_ONCE]
-        asked = [Rows(Path(folder), os.fsencode(found.key), found.signature) for found in some]
+        asked = [Rows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some]
         answers = reader.ask_all(asked, ROW_SECONDS)
         for found, answer in zip(some, answers, strict=True):
             yield found, _entries(found, answer)
@@ -143,6 +148,39 @@ def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
     return told.store, told.blueprint
 
 
+def mend(folder: Path) -> tuple[Path, ...]:
+    """Make what dead writers left in `folder` episodes; returns the .rrd of each.
+
+    A folder that came from elsewhere may bring journals along. So it is done by a process that may write below that folder
+    alone, and has a limit on memory and time; it is started only where something was left.
+
+    Raises:
+        RecordingError: files cannot be written, or the folder not read, or it was given up; the journals stay.
+    """
+    from workbench.recording.journal import FOLDER  # with Arrow, which a server need not wait for
+
+    failed = f"Cannot recover what lies in {folder}: "
+    try:
+        if not any(os.scandir(folder / FOLDER)):
+            return ()
+    except FileNotFoundError:
+        return ()
+    except OSError as error:
+        raise RecordingError(f"{failed}{error.strerror}") from error
+    reader = Reader(Path("/"), episodes=False, writes=folder.absolute())
+    try:
+        answer = reader.ask(Recover(folder.absolute()), MENDING_SECONDS).answer
+    except OSError as error:
+        raise RecordingError(f"{failed}it {error}") from error
+    finally:
+        reader.close()
+    if isinstance(answer, Recovered):
+        # Names alone: the process that says them has read what came from elsewhere.
+        return tuple(folder / Path(name).name for name in answer.made)
+    why = answer if isinstance(answer, Failed) else Failed("unreadable", f"it gave {type(answer).__name__}.")
+    raise RecordingError(why.words if why.why == "system" else f"{failed}{why.words}")
+
+
 def _found(path: Path, trajectories: bool) -> list[Source]:
     path = Path(path).absolute()
     reader = _reader(path if path.is_dir() else path.parent, episodes=True)
@@ -173,10 +211,8 @@ def _beyond(paths: Iterable[Path]) -> list[Path]:
 
 def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
     answer = answered.answer if isinstance(answered, Answered) else answered
-    if isinstance(answer, RowsRead) and len(answer.facts) == len(answer.thumbnails):
-        return [
-            (clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in zip(answer.facts, answer.thumbnails)
-        ]
+    if isinstance(answer, RowsRead):
+        return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
     why = "gave something that is no row"
     if isinstance(answer, Failed):
         why = answer.words
@@ -184,10 +220,8 @@ def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
         # It is read again when it has changed, or by who opens it.
         why = f"{answer}, and is left alone until it changes"
     # Which of them it was, nobody knows any more.
-    suffixes = [suffix for suffix in found.sizes if suffix != NOTES]
-    problem = text(f"{Path(found.key).name} ({', '.join(suffixes)}) {why}.", 500)
-    kind = "rrd only" if suffixes == [".rrd"] else "maniskill"
-    return [(Facts(kind, written=found.newest / 1e9, problem=problem), None)]
+    suffixes = ", ".join(suffix for suffix in found.sizes if suffix != NOTES)
+    return [broken(found, f"{Path(found.key).name} ({suffixes}) {why}.")]
 
 
 def _thumbnail(jpeg: bytes | None) -> bytes | None:

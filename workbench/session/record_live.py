@@ -19,7 +19,7 @@ from pathlib import Path
 
 from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
-from workbench.recording.mend import mend
+from workbench.recording.reading import mend
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.view import RecordingStatus

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from workbench.recording.library import Library
-from workbench.recording.mend import mend
+from workbench.recording.reading import mend
 from workbench.session.clearance import Clearances
 from workbench.session.messages import TaskOptions
 from workbench.session.record_live import recovered_in_words

@@ -23,7 +23,7 @@ from workbench.recording.encoded_pictures import EncodedPictures
 from workbench.recording.episode import CameraTrack
 from workbench.recording.library_read import read_found
 from workbench.recording.library_row import text
-from workbench.recording.library_scan import found_of
+from workbench.recording.library_scan import Found
 from workbench.recording.reader.episode_wire import SentShapes, packed
 from workbench.recording.reader.requests import (
     Answer,
@@ -36,6 +36,8 @@ from workbench.recording.reader.requests import (
     Open,
     PictureAt,
     PictureRead,
+    Recover,
+    Recovered,
     Request,
     Rows,
     RowsRead,
@@ -48,6 +50,8 @@ from workbench.recording.sources import Source, UnreadableRecording
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
 LONGEST = 1 << 20
+MOST_MENDING = 4 << 30
+"""Of one that writes."""
 MOST_SHARED = 4
 """Groups of episodes whose shapes are remembered."""
 LONGEST_WORDS = 600
@@ -86,7 +90,10 @@ def _be_a_reader(end: socket.socket, wanted: NewReader, nursery: int) -> None:
         os.setpgid(0, 0)
         if wanted.episodes:
             warm_up()
-        confine(wanted.paths, MOST_MEMORY)
+        if wanted.writes is None:
+            confine(wanted.paths, MOST_MEMORY)
+        else:
+            confine(wanted.paths, MOST_MENDING, [wanted.writes])
         serve(Line(end, get_args(Request)))
     finally:
         os._exit(0)
@@ -147,17 +154,20 @@ class _Reader:
 
     def _answer(self, wanted: Request) -> Answer:
         if isinstance(wanted, Rows):
-            found = found_of(os.fsdecode(wanted.key), wanted.signature)
-            entries = read_found(wanted.folder, found)
-            return RowsRead([facts for facts, _ in entries], [thumbnail for _, thumbnail in entries])
+            found = Found(os.fsdecode(wanted.key), wanted.sizes, wanted.times)
+            return RowsRead(read_found(wanted.folder, found))
         if isinstance(wanted, Open):
             return self._open(wanted)
         if isinstance(wanted, PictureAt):
             return self._picture(wanted)
         if isinstance(wanted, Sources):
             return _sources(wanted)
-        assert isinstance(wanted, ForRerun)
-        return _told_rerun(wanted)
+        if isinstance(wanted, ForRerun):
+            return _told_rerun(wanted)
+        assert isinstance(wanted, Recover)
+        from workbench.recording.recover import recover
+
+        return Recovered([files.rrd.name for files in recover(wanted.folder)])
 
     def _open(self, wanted: Open) -> EpisodeRead:
         from workbench.recording.lerobot_read import read_lerobot

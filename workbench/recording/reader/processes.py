@@ -67,10 +67,10 @@ class _Nursery:
         with self._lock:
             self._start()
 
-    def new_reader(self, paths: Sequence[Path], episodes: bool) -> tuple[int, Line]:
+    def new_reader(self, wanted: NewReader) -> tuple[int, Line]:
         """Its process id and the line to it. Raises OSError."""
         ours, theirs = socket.socketpair()
-        message = pack(NewReader(list(paths), episodes))
+        message = pack(wanted)
         with theirs, self._lock:
             for _ in range(2):
                 control = self._start()
@@ -141,12 +141,13 @@ class Reader:
 
     _numbers = itertools.count(1)
 
-    def __init__(self, folder: Path, episodes: bool) -> None:
+    def __init__(self, folder: Path, episodes: bool, writes: Path | None = None) -> None:
         """
         Args:
             episodes: it is for whole episodes, not for rows.
+            writes: below which it may write too.
         """
-        self._folder, self._episodes = Path(folder), episodes
+        self._folder, self._episodes, self._writes = Path(folder), episodes, writes
         self._allowed: set[Path] = set()
         """Further files: what links in the folder lead to."""
         self._turns = _Turns()
@@ -242,7 +243,8 @@ class Reader:
         if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
         if self._line is None:
-            self._pid, self._line = nursery.new_reader(paths, self._episodes)
+            wanted = NewReader(list(paths), self._episodes, self._writes)
+            self._pid, self._line = nursery.new_reader(wanted)
             self.process, self._there = next(self._numbers), there
         return self._line
 

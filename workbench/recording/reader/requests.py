@@ -12,7 +12,7 @@ from workbench.core.geometry import Material, Mesh
 from workbench.recording.document import CameraWords
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode
-from workbench.recording.library_row import Facts
+from workbench.recording.library_row import Entry
 from workbench.recording.sources import Kind, Source
 
 
@@ -22,6 +22,8 @@ class NewReader(msgspec.Struct, tag=True):
     paths: list[Path]
     episodes: bool
     """It will read whole episodes: import what that needs at once."""
+    writes: Path | None = None
+    """Below which it may write too."""
 
 
 class Ended(msgspec.Struct, tag=True):
@@ -35,8 +37,9 @@ class Rows(msgspec.Struct, frozen=True):
 
     folder: Path
     key: bytes
-    """As the system has it, which need not be text."""
-    signature: str
+    """As the system has it, which need not be text; with `sizes` and `times` a `library_scan.Found`."""
+    sizes: dict[str, int]
+    times: dict[str, int]
 
 
 class Open(msgspec.Struct, frozen=True):
@@ -80,12 +83,17 @@ class ForRerun(msgspec.Struct, frozen=True):
     path: Path
 
 
-Request = Rows | Open | PictureAt | Forget | Sources | ForRerun
+class Recover(msgspec.Struct, frozen=True):
+    """Make episodes of what dead writers left in a folder (`recover`); answered by `Recovered`."""
+
+    folder: Path
+
+
+Request = Rows | Open | PictureAt | Forget | Sources | ForRerun | Recover
 
 
 class RowsRead(msgspec.Struct, frozen=True):
-    facts: list[Facts]
-    thumbnails: list[bytes | None]
+    entries: list[Entry]
 
 
 class CameraRead(msgspec.Struct, frozen=True):
@@ -136,6 +144,11 @@ class ToldRerun(msgspec.Struct, frozen=True):
     blueprint: bytes | None
 
 
+class Recovered(msgspec.Struct, frozen=True):
+    made: list[str]
+    """Names of their ``.rrd``."""
+
+
 class Failed(msgspec.Struct, frozen=True):
     """It cannot be had."""
 
@@ -144,4 +157,4 @@ class Failed(msgspec.Struct, frozen=True):
     words: str
 
 
-Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | ToldRerun | Failed
+Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | ToldRerun | Recovered | Failed
