@@ -40,19 +40,15 @@ class MadeHere(Enum):
 
 
 def seal(said: Description, source_file: str | None) -> SealWords | None:
-    """For the description `said` of a recording that is being made; None, which is told once, where there can be no key.
+    """For the description `said` of a recording that is being made; None as `seal_text`.
 
     Args:
         source_file: the absolute path of the task's file.
     """
-    try:
-        key = _key() or _new_key()
-    except OSError as error:
-        _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
-        return None
     values = {name: getattr(said, name) for name in _COVERED}
-    content = _content(values, said.source_file, said.files, said.acted_by)
-    return SealWords(_mac(key, "content", content), _mac(key, "place", source_file or ""))
+    content = seal_text(_content(values, said.source_file, said.files, said.acted_by), "content")
+    place = seal_text(source_file or "", "place")
+    return None if content is None or place is None else SealWords(content, place)
 
 
 def made_here(info: EpisodeInfo) -> MadeHere:
@@ -60,39 +56,43 @@ def made_here(info: EpisodeInfo) -> MadeHere:
     found = info.seal
     if found is None:
         return MadeHere.NO
+    values = {name: getattr(info, name) for name in _COVERED}
+    values["seed"] = info.seed if info.seed >= 0 else None
     try:
-        key = _key()
-        values = {name: getattr(info, name) for name in _COVERED}
-        values["seed"] = info.seed if info.seed >= 0 else None
         content = _content(values, found.main, found.files, info.acted_by)
-    except OSError as error:
-        _tell_once(f"Recordings that were made here cannot be told from others: {error}")
-        return MadeHere.NO
     except (TypeError, ValueError, RecursionError):
         return MadeHere.NO
-    if key is None or not _same(found.content, _mac(key, "content", content)):
+    if not is_sealed(content, found.content, "content"):
         return MadeHere.NO
-    place = _mac(key, "place", info.source_file or "")
-    there = info.source_file is not None and os.path.isabs(info.source_file) and _same(found.place, place)
+    place = info.source_file
+    there = place is not None and os.path.isabs(place) and is_sealed(place, found.place, "place")
     return MadeHere.CONTENT_AND_PLACE if there else MadeHere.CONTENT
 
 
-def seal_text(text: str) -> str | None:
-    """A seal of any other text that this installation writes and reads back, such as the head of a journal; None as `seal`."""
+def seal_text(text: str, what: str = "text") -> str | None:
+    """A seal of a text that this installation writes and reads back, such as the head of a journal; None, which is told once,
+    where there can be no key.
+
+    Args:
+        what: it is; a seal of something else does not fit.
+    """
     try:
-        return _mac(_key() or _new_key(), "text", text)
+        return _mac(_key() or _new_key(), what, text)
     except OSError as error:
         _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
         return None
 
 
-def is_sealed(text: str, found: object) -> bool:
-    """Whether `found` is what `seal_text` gave for `text` here."""
+def is_sealed(text: str, found: object, what: str = "text") -> bool:
+    """Whether `found` is what `seal_text` gave for this here."""
     try:
         key = _key()
-    except OSError:
+    except OSError as error:
+        _tell_once(f"Recordings that were made here cannot be told from others: {error}")
         return False
-    return key is not None and isinstance(found, str) and _same(found, _mac(key, "text", text))
+    if key is None or not isinstance(found, str):
+        return False
+    return hmac.compare_digest(found.encode("utf-8", "surrogatepass"), _mac(key, what, text).encode())
 
 
 def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequence[Sequence[Any]]) -> str:
@@ -102,10 +102,6 @@ def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequenc
 
 def _mac(key: bytes, what: str, text: str) -> str:
     return hmac.new(key, f"{what}\0{text}".encode("utf-8", "surrogatepass"), sha256).hexdigest()
-
-
-def _same(left: str, right: str) -> bool:
-    return hmac.compare_digest(left.encode("utf-8", "surrogatepass"), right.encode())
 
 
 def _key() -> bytes | None:
