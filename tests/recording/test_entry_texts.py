@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -23,12 +23,13 @@ from workbench.core.step import OtherEntry
 from workbench.recording.columns import (
     CUT,
     MOST_BYTES,
+    TextEntry,
+    TextTrack,
     TextWriter,
     entry_at,
-    tracks_from,
     tracks_of,
-    tracks_words,
 )
+from workbench.recording.document import as_json
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
@@ -59,12 +60,13 @@ def test_a_line_is_written_where_a_text_changes() -> None:
     lines = [writer.news(state, others) for state, others in enumerate(states)]
     assert [len(found) for found in lines] == [0, 1, 0, 2, 2]
     tracks = tracks_of([line for found in lines for line in found])
-    assert tracks == {"a": ((1, said("x")), (3, said("y")), (4, None)), "b": ((3, said("z")), (4, None))}
-    assert tracks_from(json.loads(json.dumps(tracks_words(tracks)))) == tracks
+    x, y, z = (TextEntry("str", text, False, True) for text in "xyz")
+    assert tracks == {"a": ((1, x), (3, y), (4, None)), "b": ((3, z), (4, None))}
+    assert msgspec.convert(as_json(tracks), dict[str, TextTrack]) == tracks
     assert [entry_at(tracks["a"], state) for state in range(5)] == [
         None,
-        *[said("x")] * 2,
-        said("y"),
+        *[x] * 2,
+        y,
         None,
     ]
 
@@ -79,8 +81,8 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
     assert sum(len(line[1]) for line in lines) < MOST_BYTES + 400
     tracks = tracks_of(lines)
     last_state, last = tracks["clock"][-1]
-    assert last is not None and last.texts == (CUT,) and not last.whole and 100 < last_state < 5000
-    assert tracks["a"] == ((0, said("x")),)
+    assert last is not None and last.text == CUT and not last.whole and 100 < last_state < 5000
+    assert tracks["a"] == ((0, TextEntry("str", "x", False, True)),)
 
 
 def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Maker, tmp_path: Path) -> None:

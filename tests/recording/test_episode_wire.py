@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.core.step import OtherEntry
 from workbench.jobs.wire import Unpacker, pack_message
-from workbench.recording.columns import MOST_LINES
+from workbench.recording.columns import MOST_LINES, TextEntry
 from workbench.recording.encoded_pictures import EncodedPictures, Modality, encode
 from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo, Unread
 from workbench.recording.reader.episode_wire import Garbled, KnownShapes, SentShapes, packed, unpacked
@@ -57,7 +56,7 @@ def an_episode() -> Episode:
         {"actors/box": np.ones((T + 1, 13), np.float32)},
         {"": np.ones((T + 1, 5))},
         {"mean": np.ones(T + 1)},
-        {"phase": ((0, OtherEntry("str", ("reach",))), (2, None))},
+        {"phase": ((0, TextEntry("str", "reach", False, True)), (2, None))},
         (Unread("a.h5", "is broken."),),
     )
 

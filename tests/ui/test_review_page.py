@@ -14,7 +14,7 @@ import viser
 from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
-from workbench.core.step import OtherEntry
+from workbench.recording.columns import TextEntry
 from workbench.recording.library import Library
 from workbench.session.messages import TaskOptions
 from workbench.session.review import Review
@@ -258,7 +258,9 @@ def test_what_is_not_per_env_is_shown_marked_and_drawn(shown: Shown, folder: Pat
     for seed in (11, 12):
         odd = made(4, seed=seed)
         odd.batch = {"progress: all": np.linspace(0, 1, 5), "goal": np.ones((5, 2)) * seed}
-        odd.texts = {"phase": ((0, OtherEntry("str", ("reach",))), (2, OtherEntry("str", ("push",))))}
+        odd.texts = {
+            "phase": ((0, TextEntry("str", "reach", False, True)), (2, TextEntry("str", "push", False, True)))
+        }
         odd.evaluate["reward"] = np.arange(5.0)
         write(folder, odd, pictures=False)
     shown.library.refresh()

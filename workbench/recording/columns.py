@@ -18,9 +18,10 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from msgspec import Struct, convert
+from msgspec.structs import astuple
 from numpy.typing import NDArray
 
 from workbench.core.step import OtherEntry
@@ -143,7 +144,17 @@ Line = tuple[int, bytes]
 """The state from which on a text holds, and what a journal has of it. A plain pair, since a reader of rows must not
 import what writes journals: Arrow would start a thread in the process that forks."""
 
-TextTrack = tuple[tuple[int, OtherEntry | None], ...]
+
+class TextEntry(Struct, frozen=True, array_like=True):
+    """What one env has of an entry of ``evaluate()`` that is no number; as in `OtherEntry`."""
+
+    what: str
+    text: str
+    per_env: bool
+    whole: bool
+
+
+TextTrack = tuple[tuple[int, TextEntry | None], ...]
 """States, and what an entry was from each of them on; None where ``evaluate()`` did not return it, or as numbers."""
 
 
@@ -151,7 +162,7 @@ class TextWriter:
     """What a journal is told of the texts of one episode, state by state."""
 
     def __init__(self) -> None:
-        self._last: dict[str, OtherEntry] = {}
+        self._last: dict[str, TextEntry] = {}
         self._left = MOST_BYTES
         self._cut: set[str] = set()
 
@@ -164,7 +175,11 @@ class TextWriter:
         """Lines for what is another than in the state before; `others` as in an `EpisodeRow`."""
         if not others and not self._last:
             return []
-        now = {name: entry for name, entry in others.items() if entry.numbers is None}
+        now = {
+            name: TextEntry(entry.what, "".join(entry.texts), entry.per_env, entry.whole)
+            for name, entry in others.items()
+            if entry.numbers is None
+        }
         found: list[Line] = []
         for name, entry in now.items():
             if name in self._cut or self._last.get(name) == entry:
@@ -172,7 +187,7 @@ class TextWriter:
             line = _line(state, name, entry)
             if len(line[1]) > self._left:
                 self._cut.add(name)
-                line = _line(state, name, OtherEntry(entry.what, (CUT,), per_env=entry.per_env, whole=False))
+                line = _line(state, name, TextEntry(entry.what, CUT, entry.per_env, False))
             self._left -= len(line[1])
             found.append(line)
         found += [
@@ -182,35 +197,20 @@ class TextWriter:
         return found
 
 
-def _line(state: int, name: str, entry: OtherEntry | None) -> Line:
-    return state, json.dumps([name, _said(entry)]).encode()
+def _line(state: int, name: str, entry: TextEntry | None) -> Line:
+    return state, json.dumps([name, None if entry is None else astuple(entry)]).encode()
 
 
 def tracks_of(lines: Sequence[Line]) -> dict[str, TextTrack]:
     """The tracks of an episode whose journal has these lines."""
-    found: dict[str, list[tuple[int, OtherEntry | None]]] = {}
+    found: dict[str, list[tuple[int, TextEntry | None]]] = {}
     for state, value in lines:
-        name, said = json.loads(value)
-        found.setdefault(name, []).append((state, _entry(said)))
+        name, entry = convert(json.loads(value), tuple[str, TextEntry | None])
+        found.setdefault(name, []).append((state, entry))
     return {name: tuple(track) for name, track in found.items()}
 
 
-def tracks_words(tracks: Mapping[str, TextTrack]) -> dict[str, Any]:
-    """`tracks` as JSON."""
-    return {name: [[state, _said(entry)] for state, entry in track] for name, track in tracks.items()}
-
-
-def tracks_from(said: Mapping[str, Any]) -> dict[str, TextTrack]:
-    """The inverse of `tracks_words`. Raises ValueError, TypeError or AttributeError where it is none, or far too much."""
-    if sum(map(len, said.values())) > MOST_LINES:
-        raise ValueError(f"it has more than {MOST_LINES} lines of entries that are no numbers")
-    return {
-        str(name): tuple((int(state), _entry(entry)) for state, entry in track)
-        for name, track in said.items()
-    }
-
-
-def entry_at(track: TextTrack, state: int) -> OtherEntry | None:
+def entry_at(track: TextTrack, state: int) -> TextEntry | None:
     """What the entry is in this state."""
     found = None
     for begin, entry in track:
@@ -218,14 +218,3 @@ def entry_at(track: TextTrack, state: int) -> OtherEntry | None:
             break
         found = entry
     return found
-
-
-def _said(entry: OtherEntry | None) -> list[Any] | None:
-    return None if entry is None else [entry.what, "".join(entry.texts), entry.per_env, entry.whole]
-
-
-def _entry(said: Sequence[Any] | None) -> OtherEntry | None:
-    if said is None:
-        return None
-    what, text, per_env, whole = said
-    return OtherEntry(str(what), (str(text),), per_env=bool(per_env), whole=bool(whole))

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from workbench.recording.columns import tracks_words
 from workbench.recording.document import SHARED, CameraWords, ColumnWords, Description, SceneWords, checksum
 from workbench.recording.encoded_pictures import small_jpeg
 from workbench.recording.episode import Episode
@@ -46,7 +45,7 @@ def describe(episode: Episode) -> Description:
         scene=SceneWords(geometry.body_names, geometry.body_kinds, geometry.body_hidden),
         evaluate=_columns(episode.evaluate),
         batch=_columns(episode.batch),
-        texts=tracks_words(episode.texts),
+        texts=episode.texts,
         obs=_columns(episode.obs),
     )
 

@@ -29,6 +29,7 @@ from workbench.machine.regular_file import (
     open_regular_file,
     read_regular_file,
 )
+from workbench.recording.columns import TextTrack
 from workbench.recording.episode import NO_SEED, ActedBy, EpisodeInfo, Seal
 
 FORMAT = 1
@@ -41,10 +42,6 @@ MOST_PARTS = 40
 T = TypeVar("T")
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Row = tuple[float, float, float]
-EntryWords = tuple[str, str, bool, bool]
-"""Of an entry of ``evaluate()`` that is no number: type, text, whether it is per env, whether that is all of it."""
-TracksWords = dict[str, list[tuple[int, EntryWords | None]]]
-"""Of such entries, from each state on where they change; None where one is not there."""
 ColumnWords = tuple[str, tuple[int, ...]]
 """numpy's type, and the shape of one row."""
 
@@ -143,7 +140,7 @@ class Description(Struct, frozen=True, kw_only=True):
     evaluate: dict[str, ColumnWords]
     batch: dict[str, ColumnWords] = {}
     """Numbers that ``evaluate()`` returned without a row for each env."""
-    texts: TracksWords = {}
+    texts: dict[str, TextTrack] = {}
     """Entries of ``evaluate()`` that are no numbers."""
     obs: dict[str, ColumnWords]
     # In the .json alone:
@@ -300,7 +297,9 @@ def fields_of(words: Struct) -> dict[str, Any]:
 
 
 def _plain(value: object) -> Any:
-    return fields_of(value) if isinstance(value, Struct) else str(value)
+    if not isinstance(value, Struct):
+        return str(value)
+    return msgspec.structs.astuple(value) if value.__struct_config__.array_like else fields_of(value)
 
 
 def _typed(said: object, kind: type[T], place: str) -> T:

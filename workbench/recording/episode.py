@@ -190,7 +190,7 @@ class Episode:
             number = found.get(name)
             # A state in which it was no number is NaN in the column.
             if entry is not None and (number is None or _is_nan(number.numbers)):
-                found[name] = entry
+                found[name] = OtherEntry(entry.what, (entry.text,), None, entry.per_env, entry.whole)
         return found
 
 

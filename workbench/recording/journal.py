@@ -32,7 +32,7 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -282,7 +282,7 @@ class JournalReader:
         """Raises OSError."""
         self.path = path
         self._file = open_regular_file(path)
-        self._last: tuple[int, int, list[Entry]] = -1, -1, []
+        self._last: tuple[int, int, Any] = -1, -1, None
         """The batch that was looked at last, where it begins and where it ends."""
 
     def __iter__(self) -> Iterator[tuple[int, list[Entry]]]:
@@ -293,8 +293,8 @@ class JournalReader:
                 return
             begin = self._file.tell()
             while True:
-                entries, end = self.batch(begin), self._last[1]
-                yield begin, entries
+                columns, end = [column.to_pylist() for column in self._batch(begin).columns], self._last[1]
+                yield begin, [Entry(*row) for row in zip(*columns)]
                 begin = end
         except (EOFError, pa.ArrowInvalid):
             return
@@ -302,18 +302,17 @@ class JournalReader:
             if error.errno is not None:  # of the disk, and not Arrow's, whose own has no number
                 raise
 
-    def batch(self, begin: int) -> list[Entry]:
+    def value(self, place: tuple[int, int]) -> bytes:
+        """Of the entry of that number in the batch that begins there."""
+        return self._batch(place[0]).column(2)[place[1]].as_py()
+
+    def _batch(self, begin: int) -> pa.RecordBatch:
         """The one that begins there. Raises OSError, EOFError or ArrowInvalid where there is none."""
         if self._last[0] != begin:
             self._file.seek(begin)
             batch = pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA)
-            entries = [Entry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))]
-            self._last = begin, self._file.tell(), entries
+            self._last = begin, self._file.tell(), batch
         return self._last[2]
-
-    def value(self, place: tuple[int, int]) -> bytes:
-        """Of the entry of that number in the batch that begins there."""
-        return self.batch(place[0])[place[1]].value
 
     def close(self) -> None:
         self._file.close()

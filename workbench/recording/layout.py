@@ -353,7 +353,7 @@ def _texts(episode: Episode) -> list[tuple[int, str, str]]:
         (
             state,
             "INFO",
-            f"{name}: {''.join(entry.texts)}" if entry is not None else f"{name} is not returned any more",
+            f"{name}: {entry.text}" if entry is not None else f"{name} is not returned any more",
         )
         for name, track in episode.texts.items()
         for state, entry in track

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry, SharedShapes
-from workbench.recording.columns import tracks_from
+from workbench.recording.columns import MOST_LINES
 from workbench.recording.document import (
     CameraWords,
     ColumnWords,
@@ -170,6 +170,8 @@ def _episode(said: Description, table: RerunTable | None) -> Episode:
     states = said.length + 1
     if not 0 < states <= MOST_STATES:
         raise ValueError(f"it says that it has {said.length} steps")
+    if sum(map(len, said.texts.values())) > MOST_LINES:
+        raise ValueError(f"it has more than {MOST_LINES} lines of entries that are no numbers")
     geometry = poses = None
     cameras: list[CameraTrack] = []
     if table is not None:
@@ -194,7 +196,7 @@ def _episode(said: Description, table: RerunTable | None) -> Episode:
         evaluate=_columns(table, said.evaluate, evaluate_entity, states),
         cameras=cameras,
         batch=_columns(table, said.batch, batch_entity, states),
-        texts=tracks_from(said.texts),
+        texts=said.texts,
     )
 
 
