@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from transforms3d.quaternions import mat2quat, quat2mat
+from transforms3d.quaternions import quat2mat
 
-from workbench.core.camera_frames import triple
+from workbench.core.camera_frames import quaternion_from_axes, quaternion_of, triple, upright
 from workbench.recording.episode import CameraTrack, Episode, box_of_moving, camera_names
 
 SMALLEST_SIDE = 256
@@ -172,14 +172,12 @@ class Eye:
     @property
     def pose(self) -> NDArray[np.float32]:
         """(7,) position and wxyz in ManiSkill's camera frame: x forward, y left, z up."""
-        forward = np.subtract(self.look_at, self.position).astype(np.float64)
-        forward /= max(float(np.linalg.norm(forward)), 1e-9)
-        left = np.cross(self.up, forward)
-        if np.linalg.norm(left) < 1e-6:  # straight up or down
-            left = np.cross([1.0, 0.0, 0.0] if abs(forward[0]) < 0.9 else [0.0, 1.0, 0.0], forward)
-        left /= np.linalg.norm(left)
-        axes = np.stack([forward, left, np.cross(forward, left)], axis=1)
-        return np.concatenate([self.position, mat2quat(axes)]).astype(np.float32)
+        forward = np.subtract(self.look_at, self.position)
+        try:
+            quaternion = quaternion_from_axes(forward, self.up)
+        except ValueError:  # straight up or down
+            quaternion = quaternion_of(upright(forward))
+        return np.concatenate([self.position, quaternion]).astype(np.float32)
 
 
 def usual_eye(episode: Episode) -> Eye:

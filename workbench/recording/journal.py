@@ -31,8 +31,9 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -43,6 +44,8 @@ SYNC_SECONDS = 0.4
 """How long a row may wait before it is written."""
 _BATCH_BYTES = 2 << 20
 """More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
+_MOST_BATCHES = 8
+"""Of a journal that is read: pictures of some states are asked for camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
 
@@ -282,8 +285,7 @@ class JournalReader:
         """Raises OSError."""
         self.path = path
         self._file = open_regular_file(path)
-        self._last: tuple[int, int, Any] = -1, -1, None
-        """The batch that was looked at last, where it begins and where it ends."""
+        self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
 
     def __iter__(self) -> Iterator[tuple[int, list[Entry]]]:
         """Its entries, a batch at a time, and where that begins. Raises OSError."""
@@ -293,8 +295,8 @@ class JournalReader:
                 return
             begin = self._file.tell()
             while True:
-                columns, end = [column.to_pylist() for column in self._batch(begin).columns], self._last[1]
-                yield begin, [Entry(*row) for row in zip(*columns)]
+                batch, end = self._batch(begin)
+                yield begin, [Entry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))]
                 begin = end
         except (EOFError, pa.ArrowInvalid):
             return
@@ -304,17 +306,15 @@ class JournalReader:
 
     def value(self, place: tuple[int, int]) -> bytes:
         """Of the entry of that number in the batch that begins there."""
-        return self._batch(place[0]).column(2)[place[1]].as_py()
+        return self._batch(place[0])[0].column(2)[place[1]].as_py()
 
-    def _batch(self, begin: int) -> pa.RecordBatch:
-        """The one that begins there. Raises OSError, EOFError or ArrowInvalid where there is none."""
-        if self._last[0] != begin:
-            self._file.seek(begin)
-            batch = pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA)
-            self._last = begin, self._file.tell(), batch
-        return self._last[2]
+    def _read(self, begin: int) -> tuple[pa.RecordBatch, int]:
+        """The batch that begins there, and where it ends. Raises OSError, EOFError or ArrowInvalid where there is none."""
+        self._file.seek(begin)
+        return pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA), self._file.tell()
 
     def close(self) -> None:
+        self._batch.cache_clear()
         self._file.close()
 
 

@@ -52,7 +52,7 @@ OBSERVATION = "/observation/state"
 REWARD_TERMS = "reward_terms/"
 """What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
-_MOST_PIXELS, _MOST_PICTURES = 8 << 20, 1024
+_MOST_PIXELS, _MOST_PICTURES = 4 << 20, 1024
 """Of the pictures of one chunk, which are in memory together."""
 _PNG_RGBA = 6
 """Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
@@ -77,7 +77,8 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     still, present = _still(poses), np.asarray(np.isfinite(poses).any(axis=(0, 2)))
     bodies = {body: entity for body, entity in enumerate(body_entities(geometry)) if present[body]}
     cameras = list(zip(episode.cameras, camera_entities([camera.info for camera in episode.cameras])))
-    numbers, ids = _numbers(episode), [_ids(camera) for camera, _ in cameras]
+    numbers, pieces = _numbers(episode), _pieces(episode.cameras)
+    ids = _ids(episode.cameras, pieces)
     yield _world()
     for body, entity in bodies.items():
         if still[body]:
@@ -102,7 +103,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     for entity, _, values in numbers:
         if values.size:
             yield timed.scalars(entity, states[len(states) - len(values) :], values)
-    for number, some in _pieces(episode.cameras):
+    for number, some in pieces:
         camera, entity = cameras[number]
         for modality, pictures in camera.pictures.items():
             columns = _picture_columns(modality, pictures.blobs[some], ids[number])
@@ -271,10 +272,14 @@ def _lens(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]:
         yield static_chunk(f"{entity}/segmentation", rr.SegmentationImage.from_fields(format=form))
 
 
-def _ids(camera: CameraTrack) -> np.dtype:
-    """Of its segmentation; wide where one of its pictures has ids that 16 bits do not hold."""
-    blobs = () if camera.segmentation is None else camera.segmentation.blobs
-    return np.dtype(np.int32 if any(blob[25] == _PNG_RGBA for blob in blobs) else np.uint16)
+def _ids(cameras: Sequence[CameraTrack], pieces: Iterable[tuple[int, slice]]) -> list[np.dtype]:
+    """Of the segmentation of each camera; wide where one of its pictures has ids that 16 bits do not hold."""
+    wide = set()
+    for number, some in pieces:
+        held = cameras[number].segmentation
+        if held is not None and any(blob[25] == _PNG_RGBA for blob in held.blobs[some]):
+            wide.add(number)
+    return [np.dtype(np.int32 if number in wide else np.uint16) for number in range(len(cameras))]
 
 
 def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype) -> Iterable[Any]:
