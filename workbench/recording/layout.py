@@ -52,7 +52,7 @@ OBSERVATION = "/observation/state"
 REWARD_TERMS = "reward_terms/"
 """What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
-_MOST_PIXELS, _MOST_PICTURES = 4 << 20, 1024
+_MOST_PIXELS, _MOST_PICTURES = 1 << 20, 1024
 """Of the pictures of one chunk, which are in memory together."""
 _PNG_RGBA = 6
 """Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
