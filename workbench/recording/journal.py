@@ -44,7 +44,7 @@ SYNC_SECONDS = 0.4
 """How long a row may wait before it is written."""
 _BATCH_BYTES = 2 << 20
 """More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
-_MOST_BATCHES = 8
+_MOST_BATCHES = 4
 """Of a journal that is read: pictures of some states are asked for camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
