@@ -7,6 +7,7 @@ import pickle
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -79,6 +80,21 @@ def test_what_came_whole_is_received_before_the_end_and_without_a_time_it_is_wai
     assert [ends.line.receive(0) for _ in sent[1:]] == sent[1:]
     with pytest.raises(EOFError):
         ends.line.receive(None)
+
+
+def test_what_was_read_is_let_go_of_also_where_the_next_message_has_always_begun(ends: Ends) -> None:
+    whole = framed(pack_message(Loading("x" * 100_000)))
+    ends.theirs.sendall(whole[:1])
+    for _ in range(30):
+        ends.theirs.sendall(whole[1:] + whole[:1])
+        assert ends.line.receive(10) == Loading("x" * 100_000)
+        assert len(ends.line._came) < 3 * len(whole)
+
+
+def test_it_is_waited_for_no_shorter_than_was_asked_for(ends: Ends) -> None:
+    begun = time.monotonic()
+    assert ends.line.receive(0.2) is None
+    assert time.monotonic() - begun >= 0.2
 
 
 def test_a_message_that_stops_in_the_middle_is_not_waited_for(ends: Ends) -> None:
