@@ -117,7 +117,7 @@ class MarkerFirst(PushCubeEnv):
 
 
 def test_the_first_body_of_all_may_be_hidden_too() -> None:
-    env: Any = begun(batched(MarkerFirst, 2))
+    env: Any = begun(batched(MarkerFirst, 3))
     assert scene_index(env).names[0] == "marker"
     shown = read_poses(env)
     env.marker.hide_visual()
