@@ -23,7 +23,7 @@ from workbench.core.camera_report import join_reports
 from workbench.core.scene_index import read_poses, scene_index
 from workbench.core.take_pictures import step_pictures, take_pictures
 from workbench.core.task_env import TaskEnv
-from workbench.core.visibility import judge_camera
+from workbench.core.visibility import judge_placement, placement_of
 
 # That they are set and not applied is what these tests are about.
 pytestmark = [
@@ -133,7 +133,9 @@ def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
         assert (on_cube.pose[2] > AWAY / 2) == (e == 1)
         (human,) = take_pictures(hiding, e, [HUMAN])
         np.testing.assert_array_equal(human.rgb, people[e])
-    report = join_reports([judge_camera(hiding, ("sensor", "base_camera"), e) for e in range(N)])
+    report = join_reports(
+        [judge_placement(hiding, e, placement_of(hiding, ("sensor", "base_camera"), e)) for e in range(N)]
+    )
     cube = next(seen for seen in report.objects if seen.name == "cube")
     assert (cube.pixels > 0).tolist() == [True, False]
     observed = step_pictures(_task(hiding, obs), range(N), [ON_CUBE])

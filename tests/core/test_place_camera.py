@@ -55,6 +55,7 @@ def said(env: Any, key: CameraKey) -> CameraSettings:
 def configured(env: Any, key: CameraKey, settings: CameraSettings) -> Any:
     """`env` with cameras that ManiSkill made, of a config with these settings."""
     values = dict(vars(settings))
+    del values["distance"]  # is nothing of a config
     pose = sapien.Pose(values.pop("position"), values.pop("quaternion"))
     intrinsic = values.pop("intrinsic")
     values["intrinsic"] = None if intrinsic is None else np.array(intrinsic)

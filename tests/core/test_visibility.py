@@ -15,15 +15,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.drive.envs import batched
 from workbench.core.camera_frames import LookAt, compose, pose_from_look_at, relative_to, with_pose
 from workbench.core.camera_report import CameraReport, ObjectSeen, join_reports
-from workbench.core.camera_settings import CameraSettings
+from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.scene_index import read_poses, scene_index
 from workbench.core.take_pictures import cameras_of, list_cameras, segmentation_names, take_pictures
 from workbench.core.visibility import (
     Placement,
-    judge_camera,
     judge_placement,
     list_objects,
     objects_to_see,
+    placement_of,
     settings_of,
     small_size,
 )
@@ -31,9 +31,15 @@ from workbench.core.visibility import (
 pytestmark = pytest.mark.usefixtures("renderer")
 
 N = 3
-SENSOR = ("sensor", "base_camera")
-PEOPLE = ("human", "render_camera")
+SENSOR: CameraKey = ("sensor", "base_camera")
+PEOPLE: CameraKey = ("human", "render_camera")
 FAR_FLOOR = LookAt((-1.5, 0.0, 0.5), (0.0, 0.0, 0.3))
+
+
+def judge_camera(
+    env: Any, camera: CameraKey, e: int, settings: CameraSettings | None = None, **how: Any
+) -> CameraReport:
+    return judge_placement(env, e, placement_of(env, camera, e, settings), **how)
 
 
 def built(task: str, **kwargs: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tests.ui.scenes import camera, description, step_of, table_scene
-from workbench.core.pictures import Picture
+from workbench.core.pictures import CameraInfo, Picture
 from workbench.core.step import StepResult
 from workbench.session.kept_worker import Death, KeptWorker, Vitals, WorkerOptions
 from workbench.session.last_words import Busy
@@ -160,9 +160,11 @@ class ScriptedWorker:
         self._tell(Pictures(tuple(wanted), 1.0, len(self._lived)))
 
 
-def scripted(num_envs: int, evaluate: Evaluate = no_success) -> Callable[..., KeptWorker]:
+def scripted(
+    num_envs: int, evaluate: Evaluate = no_success, info: CameraInfo | None = None
+) -> Callable[..., KeptWorker]:
     """For `Session`'s ``make_worker``: the table scene with so many envs and one camera."""
     geometry, poses = table_scene(num_envs)
     # No file of it is there to be followed.
-    task = replace(description(geometry, (camera(),)), file=None, source_files=(), source={})
+    task = replace(description(geometry, (info or camera(),)), file=None, source_files=(), source={})
     return partial(ScriptedWorker, task, poses, evaluate)  # type: ignore[return-value]

@@ -14,6 +14,7 @@ import pytest
 from tests.drive.session import start_over, step, wait_until
 from tests.drive.waiting import until
 from tests.session.studio import BASE, PEOPLE, camera, moved, said
+from workbench.core.camera_frames import target_of
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session
@@ -51,7 +52,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
         wait_until(session, lambda view: view.task is not None, "the first load")
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
-        session.studio.plan(Wish("edit", BASE))
+        session.studio.file.plan(Wish("edit", BASE))
         refused = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
         session.studio.file.copy_task()
         planned = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
@@ -79,12 +80,13 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
 
 @pytest.fixture
 def session(studio_session: Session) -> Session:
-    """At rest, and every camera as the file has it."""
+    """At rest, and every camera as the file has it; one of them is worked on."""
     studio_session.pause()
     studio_session.past.seek(None)
     for one in studio_session.view().studio.cameras:
         studio_session.studio.back_to_file(one.key)
     wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
+    studio_session.studio.select(BASE)
     return studio_session
 
 
@@ -107,7 +109,7 @@ def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_
 ) -> None:
     start = camera(session, BASE).now
     for k in range(30):
-        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), gesture=1)
+        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), hand=1)
     rest = replace(start, position=(0.29, 0.0, 0.8))
     view = wait_until(session, seen_from(BASE, rest), "the picture from there")
     assert moved(view) == {BASE} and view.studio.undo == "moved base_camera"
@@ -141,14 +143,12 @@ def test_size_and_lens_change_the_live_camera_and_the_observation(session: Sessi
 
 def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
     start = camera(session, BASE).now
-    session.studio.select(BASE)
     session.studio.set_quick_scale(0.25)
     there = replace(start, position=(0.31, 0.02, 0.55))
     session.studio.place(BASE, there)
 
     def looked(view: SessionView) -> bool:
-        if view.studio.wants_quick:
-            session.studio.look()  # as the page does
+        session.studio.look()  # as the page does
         picture = view.studio.quick
         return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
 
@@ -165,8 +165,7 @@ def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alon
     assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
     session.studio.set_quick_scale(1.0)
     view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
-    assert view.studio.quick is None and not view.studio.wants_quick
-    session.studio.select(None)
+    assert view.studio.quick is None
 
 
 def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
@@ -206,7 +205,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     task_file.write_bytes(before)
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
-    studio.plan(Wish("edit", BASE))
+    studio.file.plan(Wish("edit", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
     assert task_file.read_bytes() == before and "+" in view.studio.writing.edit.diff
@@ -241,7 +240,13 @@ def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_mad
     asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
     studio = session.studio
     file = StudioFile(
-        studio._cameras, lambda: None, lambda *_: None, studio.file._asker, studio.file._load, patience=0.5
+        studio._cameras,
+        lambda: None,
+        lambda *_: None,
+        studio.file._asker,
+        studio.file._load,
+        session.past.shown_moment,
+        patience=0.5,
     )
     try:
         task_file.write_text(good.replace(hook, hook + asks))
@@ -252,7 +257,7 @@ def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_mad
         until(lambda: file.view.stage == "refused", "the end of waiting")
         assert "the task did not answer" in file.view.message
         waits.unlink()
-        studio.plan(Wish("edit", BASE))
+        studio.file.plan(Wish("edit", BASE))
         wait_until(session, said(lambda v: v.writing.stage == "planned"), "the plan of who waits longer")
         studio.file.drop_plan()
     finally:
@@ -268,7 +273,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio, before = session.studio, task_file.read_text()
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
     studio.place(BASE, there)
-    studio.plan(Wish("remove", BASE))
+    studio.file.plan(Wish("remove", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
     studio.file.write()
@@ -283,16 +288,19 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
 
 def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Path) -> None:
     good = task_file.read_text()
-    assert camera(session, BASE).info.target == pytest.approx((0.08, 0, 0))
+
+    def target(view: SessionView) -> object:
+        """Of the file."""
+        return pytest.approx(target_of(view.studio.camera(BASE).info.settings), abs=1e-6)
+
+    assert target(session.view()) == (0.08, 0, 0)
     task_file.write_text(good.replace("target=[0.08, 0, 0]", "target=[0.08, 0, 0.2]"))
-    view = wait_until(
-        session, lambda v: v.studio.camera(BASE).info.target == pytest.approx((0.08, 0, 0.2)), "the other"
-    )
+    view = wait_until(session, lambda v: target(v) == (0.08, 0, 0.2), "the other")
     session.studio.place(BASE, replace(view.studio.camera(BASE).now, position=(0.2, 0.1, 0.7)))
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement")
-    assert view.studio.camera(BASE).info.target == pytest.approx((0.08, 0, 0.2))
+    assert target(view) == (0.08, 0, 0.2)
     task_file.write_text(good)
-    wait_until(session, lambda v: v.studio.camera(BASE).info.target[2] == 0, "the first")
+    wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
     wait_until(
         session, said(lambda s: "stands where the file says" in s.problem), "that the placement is dropped"
     )
@@ -311,12 +319,12 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
 
 
 def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
-    session.studio.judging.judge(BASE)
+    session.studio.judging.judge()
     report = settled(session, lambda s: s.looked.report_of == BASE, "the judgement").looked.report
     assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.studio.judging.make_sheet(BASE)
+    session.studio.judging.make_sheet()
     sheet = settled(session, lambda s: len(s.looked.sheet) == 2, "the pictures of all envs").looked.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
     # Turned to the sky.
@@ -324,10 +332,10 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
     session.studio.place(BASE, away)
     assert session.view().studio.report_stale
-    session.studio.judging.judge(BASE)
+    session.studio.judging.judge()
     studio = settled(session, lambda s: s.looked.report is not report, "the judgement of the placement")
     assert studio.looked.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
-    session.studio.judging.compare(BASE, start)
+    session.studio.judging.compare(start)
     pair = settled(session, lambda s: s.looked.compared is not None, "the comparison").looked.compared
     assert pair is not None
     here, there = pair
@@ -338,7 +346,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
 def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
     start_over(session, 0)
     step(session, 4)
-    session.studio.judging.judge_steps(BASE)
+    session.studio.judging.judge_steps()
     studio = settled(session, lambda s: len(s.looked.report_moments) == 5, "five moments")
     assert [moment.step for moment in studio.looked.report_moments] == [0, 1, 2, 3, 4]
     assert {moment.env for moment in studio.looked.report_moments} == {0} == set(studio.looked.report.envs)
@@ -346,7 +354,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     assert cube.summary().seen == 1.0
     session.past.seek(studio.looked.report_moments[2].serial)
     assert session.view().step.elapsed_steps[0] == 2
-    session.studio.judging.judge_steps(BASE, 2)
+    session.studio.judging.judge_steps(2)
     moments = settled(session, lambda s: len(s.looked.report_moments) == 2, "its ends").looked.report_moments
     assert [moment.step for moment in moments] == [0, 4], (
         "of the whole episode, also where a moment in it is shown"
@@ -354,7 +362,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     session.reset()
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
     session.past.seek(None)
-    session.studio.judging.judge_steps(BASE)
+    session.studio.judging.judge_steps()
     settled(session, lambda s: len(s.looked.report_moments) == 1, "the episode that has just begun")
 
 
@@ -365,7 +373,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
     x, y, z = (float(v) for v in cube[:3])
     beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
     session.studio.place(BASE, beside)
-    session.studio.judging.pick(BASE, 0.5, 0.5)
+    session.studio.judging.pick(0.5, 0.5)
     picked = settled(session, lambda s: s.looked.picked is not None, "the pixel").looked.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
     assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
@@ -373,16 +381,16 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
 
 def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
     studio = session.studio
-    studio.judging.judge(BASE, 3)
+    studio.judging.judge(3)
     assert session.view().studio.progress is not None
     found = settled(session, lambda s: s.looked.report_seeds == 3, "three seeds")
     assert len(found.looked.report.envs) == 3 and found.looked.report_of == BASE and not found.looked.judging
-    studio.judging.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+    studio.judging.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
     offered = settled(session, lambda s: len(s.looked.suggestions) > 0, "suggestions").looked.suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
     studio.take_suggestion(0)
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
-    studio.judging.judge(BASE, 500)
+    studio.judging.judge(500)
     wait_until(
         session,
         said(lambda s: s.looked.judging and s.looked.report is not None),
@@ -393,7 +401,7 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     )
     studio.judging.stop()
     wait_until(session, said(lambda s: s.progress is None and not s.looked.judging), "its end")
-    studio.judging.suggest(BASE, ("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
+    studio.judging.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
     wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
 
 

@@ -91,24 +91,24 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
-    studio.plan(Wish("add", ("human", "side"), new))
+    studio.file.plan(Wish("add", ("human", "side"), new))
     assert written(session).message == f"side is in {task_file.name}, and the env has it."
     assert not differences(there(session, ("human", "side")), new, close=3e-4), "but for what is rounded"
     assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
     # What is not written yet is in the copy, and stays with the original.
     away = replace(new, position=(0.61, 0.1, 0.7))
     studio.place(("human", "side"), away)
-    studio.plan(Wish("duplicate", ("human", "side"), name="other"))
+    studio.file.plan(Wish("duplicate", ("human", "side"), name="other"))
     assert "a copy of side" in written(session).message
     assert names(session) == ["render_camera", "side", "other"]
     assert ("human", "side") in moved(session.view())
     assert camera(session, ("human", "other")).now.position == away.position
-    studio.plan(Wish("rename", ("human", "side"), name="front"))
+    studio.file.plan(Wish("rename", ("human", "side"), name="front"))
     assert written(session).message == f"side is front in {task_file.name} now."
     assert names(session) == ["render_camera", "front", "other"]
     assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
     for name in ("front", "other"):
-        studio.plan(Wish("remove", ("human", name)))
+        studio.file.plan(Wish("remove", ("human", name)))
         assert f"{name} is no longer in" in written(session).message
     assert names(session) == ["render_camera"] and task_file.read_text().count(
         "CameraConfig("
@@ -121,17 +121,18 @@ def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_i
 ) -> None:
     studio = session.studio
     new = replace(there(session, ("human", "render_camera")), position=(0.5, 0.2, 0.6))
-    studio.plan(Wish("add", ("human", "side"), new))
+    studio.file.plan(Wish("add", ("human", "side"), new))
     assert planned(session).message.startswith("This adds side to")
-    view = wait_until(session, said(lambda s: s.first_sight is not None), "its picture")
-    picture = view.studio.first_sight
+    view = wait_until(session, said(lambda s: s.writing.picture is not None), "its picture")
+    picture = view.studio.writing.picture
     assert picture.rgb.shape == (new.height, new.width, 3) and picture.rgb.std() > 5
     assert [c.key[1] for c in view.studio.cameras] == ["base_camera", "render_camera"], "it is there already"
     studio.place(BASE, replace(there(session, BASE), fov=0.9))
-    studio.plan(Wish("edit", BASE))
-    view = wait_until(session, said(lambda s: s.writing.what == "edit"), "the other plan")
+    studio.file.plan(Wish("edit", BASE))
+    other = said(lambda s: (s.writing.what, s.writing.stage) == ("edit", "planned"))
+    view = wait_until(session, other, "the other plan")
     assert view.studio.writing.message.startswith("side was not added. This changes base_camera in")
-    assert view.studio.first_sight is None
+    assert view.studio.writing.picture is None
     studio.back_to_file(BASE)
     studio.file.drop_plan()
 
@@ -142,10 +143,10 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     studio, texts = session.studio, [task_file.read_text()]
     for fov in (0.9, 0.95):
         studio.place(BASE, replace(there(session, BASE), fov=fov))
-        studio.plan(Wish("edit", BASE))
+        studio.file.plan(Wish("edit", BASE))
         written(session)
         texts.append(task_file.read_text())
-    studio.plan(Wish("remove", BASE))
+    studio.file.plan(Wish("remove", BASE))
     planned(session)
     studio.file.drop_plan()
     for wanted in (texts[1], texts[0]):
@@ -214,7 +215,7 @@ class Inherits(PushCubeEnv):
         assert 'cameras["base_camera"] = CameraConfig(' in refused.snippet
 
         session.studio.place(BASE, wanted)
-        session.studio.plan(Wish("edit", BASE))
+        session.studio.file.plan(Wish("edit", BASE))
         notes = planned(session).edit.notes
         assert "base_camera is made by PushCubeEnv, from which Inherits inherits" in notes[0]
         assert written(session).message == "base_camera is written to task.py, and the new env has it."
@@ -238,7 +239,7 @@ class Inherits(PushCubeEnv):
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.9))
-    studio.plan(Wish("edit", BASE))
+    studio.file.plan(Wish("edit", BASE))
     written(session)
     edited = task_file.read_text() + "# more\n"
     task_file.write_text(edited)
@@ -256,7 +257,7 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.7))
-    studio.plan(Wish("edit", BASE))
+    studio.file.plan(Wish("edit", BASE))
     message = written(session, "mismatch").message
     assert (
         "base_camera is not what was written (fov: 0.8, not 0.7)" in message
@@ -280,7 +281,7 @@ def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_
 ) -> None:
     before = task_file.read_text()
     session.studio.place(BASE, replace(there(session, BASE), fov=fov))
-    session.studio.plan(Wish("edit", BASE))
+    session.studio.file.plan(Wish("edit", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
     assert why in view.studio.writing.message and f"fov={fov}" in view.studio.writing.snippet
     assert task_file.read_text() == before and there(session, BASE).fov == 1.0
@@ -306,7 +307,7 @@ def test_what_the_constructor_sets_is_edited_there_and_the_batch_stands_as_it_st
     step = view.step
     wanted = replace(there(session, BASE), position=(0.45, 0.1, 0.7))
     session.studio.place(BASE, wanted)
-    session.studio.plan(Wish("edit", BASE))
+    session.studio.file.plan(Wish("edit", BASE))
     planned(session)
     assert session.view().step is step, "asking moved the batch"
     assert written(session).message.startswith("base_camera is written")
@@ -323,7 +324,7 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.4))
-    studio.plan(Wish("edit", BASE))
+    studio.file.plan(Wish("edit", BASE))
     planned(session)
     studio.file.write()
     view = wait_until(session, said(lambda s: "does not load" in s.writing.message), "the failure")
@@ -363,7 +364,9 @@ def test_what_was_not_done_is_said_until_something_else_happens(session: Session
     edit = SourceEdit("/author/task.py", "a = 1\n", "a = 2\n", (), None)
     for stage in ("written", "undone"):
         asker = session.studio.file._asker
-        writing = StudioFile(StudioCameras(), lambda: None, lambda *_: None, asker, lambda: None)
+        writing = StudioFile(
+            StudioCameras(), lambda: None, lambda *_: None, asker, lambda: None, session.past.shown_moment
+        )
         message = "Not done: task.py was edited since the camera was written into it."
         writing.view = Writing(stage, Wish("edit", key, None), edit, "", message, loading=True)
         writing.failed_to_load()

@@ -7,8 +7,9 @@ import pytest
 import viser
 
 from tests.drive.panels import Clock, Panels
-from tests.drive.scripted import Evaluate, scripted
+from tests.drive.scripted import Evaluate, no_success, scripted
 from tests.drive.session import wait_until
+from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.ui.door import Door, DoorOptions, open_door
@@ -46,9 +47,9 @@ def scripted_session(tmp_path: Path) -> Iterator[Callable[..., Session]]:
     """Makes sessions on a worker that answers with the table scene; each has loaded it."""
     made: list[Session] = []
 
-    def make(num_envs: int, *evaluate: Evaluate) -> Session:
+    def make(num_envs: int, evaluate: Evaluate = no_success, camera: CameraInfo | None = None) -> Session:
         options = TaskOptions(num_envs=num_envs)
-        worker = scripted(num_envs, *evaluate)
+        worker = scripted(num_envs, evaluate, camera)
         session = Session(
             str(tmp_path / "push.py"), options, recordings=tmp_path / "kept", make_worker=worker
         )

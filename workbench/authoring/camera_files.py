@@ -27,7 +27,6 @@ from transforms3d.axangles import axangle2mat
 from workbench.core.camera_frames import (
     Convention,
     Direction,
-    compose,
     horizontal_fov,
     intrinsic_of,
     make_pose,
@@ -35,7 +34,7 @@ from workbench.core.camera_frames import (
     opencv_extrinsic,
     opengl_model_matrix,
     pose_from_matrix,
-    pose_of,
+    pose_in_env,
     vertical_fov,
 )
 from workbench.core.camera_settings import CameraKey, CameraSettings
@@ -75,11 +74,9 @@ class CameraToExport:
         Raises:
             ValueError: it is mounted, and `mount_pose` is not given.
         """
-        if self.mount is None:
-            return pose_of(self.settings)
-        if self.mount_pose is None:
+        if self.mount is not None and self.mount_pose is None:
             raise ValueError(f"camera {self.key[1]!r} rides on {self.mount}: say where that is")
-        return compose(self.mount_pose, pose_of(self.settings))
+        return pose_in_env(self.settings, self.mount_pose)
 
 
 @dataclass(frozen=True)

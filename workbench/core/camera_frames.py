@@ -189,6 +189,11 @@ def pose_of(settings: CameraSettings) -> Floats:
     return make_pose(settings.position, settings.quaternion)
 
 
+def pose_in_env(settings: CameraSettings, mount: ArrayLike | None) -> Floats:
+    """(7,) in the env's frame; `mount` (7,) is where the body is that it rides on, None for one that stands still."""
+    return pose_of(settings) if mount is None else compose(mount, pose_of(settings))
+
+
 def with_pose(settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
     """The same camera at another pose (7,), said in the frame of its mount."""
     p = _vector(pose, 7, "a pose")
@@ -199,6 +204,11 @@ def with_pose(settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
 def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
     """(7,) of a position (3,) and a quaternion (4,) wxyz of any length."""
     return np.concatenate([_vector(position, 3, "a position"), normalised(quaternion)])
+
+
+def target_of(settings: CameraSettings) -> Floats:
+    """(3,) the point that a camera looks at, in the frame of its mount: a metre ahead where it names none."""
+    return settings.position + (settings.distance or 1.0) * axes_of(settings.quaternion)[0]
 
 
 def inverse(pose: ArrayLike) -> Floats:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 CameraKind = Literal["sensor", "human"]
@@ -38,6 +38,8 @@ class CameraSettings:
     far: float
     shader_pack: str
     """``minimal``, ``default``, ``rt`` ...: what draws it, and so which modalities it has."""
+    distance: float | None = field(default=None, compare=False)
+    """Metres along its line of sight to the point that it looks at; None where none is named. Nothing that is drawn."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,10 @@ def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> t
     """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
     turned = tuple(-x for x in b.quaternion)
     found = []
-    for field in fields(a):
-        mine, other = getattr(a, field.name), getattr(b, field.name)
-        if field.name != "quaternion":
-            found += [] if _alike(mine, other, close) else [field.name]
+    for name in [f.name for f in fields(a) if f.compare]:
+        mine, other = getattr(a, name), getattr(b, name)
+        if name != "quaternion":
+            found += [] if _alike(mine, other, close) else [name]
         elif not _alike(mine, other, close) and not _alike(mine, turned, close):
             found.append("orientation")
     return tuple(found)

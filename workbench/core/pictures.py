@@ -42,8 +42,6 @@ class CameraInfo:
     """Its pose differs between envs, or is another than its config says: the task's code moves it."""
     site: CallSite | None = None
     """Where the config was made; None where that was not noted."""
-    target: tuple[float, float, float] | None = None
-    """The point that the config's ``look_at`` names, in the frame of `settings`; None where its pose has no such point."""
 
     @property
     def key(self) -> CameraKey:
@@ -81,3 +79,8 @@ class Picture:
         """Roughly what it takes in memory."""
         planes = self.rgb, self.depth, self.segmentation, self.position, self.normal, self.albedo
         return 300 + sum(plane.nbytes for plane in planes if plane is not None)
+
+    @property
+    def key(self) -> CameraKey:
+        """Of its camera."""
+        return self.kind, self.camera

@@ -13,6 +13,7 @@ after which `PlacedCameras.put_back` is to be called.
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -173,8 +174,8 @@ def _of_env(value: Any, env_index: int) -> float:
 def settings_of(config: Any) -> CameraSettings | None:
     """A ``CameraConfig`` as plain numbers; of the first env where poses differ.
 
-    A quaternion that is not of unit length (``look_at`` straight down gives one) is made so. None where it cannot
-    be said: a lens, near or far that differs between envs, or a pose that is none.
+    A quaternion that is not of unit length (``look_at`` straight down gives one) is made so. Its distance is that of the
+    target where ``look_at`` made its pose. None where it cannot be said: a lens, near or far that differs between envs, or a pose that is none.
     """
     pose = rows_of_pose(config)[0].astype(np.float64)
     length = float(np.linalg.norm(pose[3:]))
@@ -186,6 +187,7 @@ def settings_of(config: Any) -> CameraSettings | None:
     if near is None or far is None or (fov is None) == (intrinsic is None):
         return None
     w, i, j, k = (pose[3:] / length).tolist()
+    target = seams.camera_target(config)
     return CameraSettings(
         position=triple(pose[:3]),
         quaternion=(w, i, j, k),
@@ -196,18 +198,8 @@ def settings_of(config: Any) -> CameraSettings | None:
         near=near,
         far=far,
         shader_pack=str(config.shader_pack),
+        distance=None if target is None else math.dist(_numbers(target).reshape(-1, 3)[0], pose[:3]),
     )
-
-
-def target_of(config: Any) -> tuple[float, float, float] | None:
-    """The point that the config's ``look_at`` names, in the frame of its pose, of the first env where it differs.
-
-    None where the pose was not made by ``look_at``, or not noted.
-    """
-    target = seams.camera_target(config)
-    if target is None:
-        return None
-    return triple(_numbers(target).reshape(-1, 3)[0])
 
 
 def rows_of_pose(config: Any) -> np.ndarray:

@@ -37,7 +37,7 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
 from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
-from workbench.core.place_camera import rows_of_pose, settings_of, target_of
+from workbench.core.place_camera import rows_of_pose, settings_of
 from workbench.core.scene_index import hidden_poses, scene_index
 from workbench.core.task_env import TaskEnv
 
@@ -75,7 +75,6 @@ def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
                 settings=settings_of(camera.config),
                 varies=_varies(camera.config, components),
                 site=seams.camera_site(camera.config),
-                target=target_of(camera.config),
             )
         )
     return tuple(infos)

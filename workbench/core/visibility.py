@@ -26,7 +26,7 @@ from mani_skill.utils.scene_builder import SceneBuilder
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.camera_frames import compose, make_pose, matrix3, triple
+from workbench.core.camera_frames import compose, matrix3, pose_of, triple
 from workbench.core.camera_report import (
     DEPTH_EDGES,
     CameraReport,
@@ -68,6 +68,7 @@ class Placement:
     kind: CameraKind = "sensor"
     mount: str | None = None
     """Name of the body whose frame `settings` speaks of; None for the env's."""
+    name: str = "suggested"
 
 
 def list_objects(env: Any) -> tuple[SceneObject, ...]:
@@ -147,36 +148,20 @@ def _is_drawn(entity: Any) -> bool:
     return body is not None and len(body.render_shapes) > 0
 
 
-def judge_camera(
-    env: Any,
-    camera: CameraKey,
-    e: int,
-    *,
-    settings: CameraSettings | None = None,
-    size: tuple[int, int] | None = None,
-    poses: NDArray[np.float32] | None = None,
-) -> CameraReport:
-    """Judge a camera of the env, as it stands or as `settings` would have it, in one env at its present moment.
-
-    Args:
-        settings: in the frame of the camera's mount; None for the env's own camera.
-        size: of the pictures that are judged, None for the camera's own; the view stays the same (`small_size`).
-        poses: (B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
+def placement_of(env: Any, camera: CameraKey, e: int, settings: CameraSettings | None = None) -> Placement:
+    """A camera of one env, as it stands or as `settings` would have it, which are of the frame of its mount.
 
     Raises:
-        ValueError: there is no such camera, or no such lens.
+        ValueError: there is no such camera.
         IndexError: there is no such env.
-        RuntimeError: the renderer failed.
     """
     cameras = cameras_of(env)
     if camera not in cameras:
         there = ", ".join(f"{name} ({kind})" for kind, name in cameras) or "none"
         raise ValueError(f"there is no {camera[0]} camera {camera[1]!r} to judge; there are: {there}")
     require_env(e, env.num_envs)
-    placement = Placement(
-        settings or settings_of(cameras[camera], e), camera[0], mount_of(env, cameras[camera])
-    )
-    return judge_placement(env, e, placement, poses, size, camera[1])
+    found, (kind, name) = cameras[camera], camera
+    return Placement(settings or settings_of(found, e), kind, mount_of(env, found), name)
 
 
 def judge_placement(
@@ -185,17 +170,22 @@ def judge_placement(
     placement: Placement,
     poses: NDArray[np.float32] | None = None,
     size: tuple[int, int] | None = None,
-    name: str = "suggested",
 ) -> CameraReport:
-    """Judge a camera that need not exist; arguments and errors as `judge_camera`'s.
+    """Judge a camera, which need not exist, in one env.
+
+    Args:
+        poses: (B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
+        size: of the pictures that are judged, None for the camera's own; the view stays the same (`small_size`).
 
     Raises:
-        ValueError: also where no body is called as the mount.
+        ValueError: there is no such lens, or no body is called as the mount.
+        IndexError: there is no such env.
+        RuntimeError: the renderer failed.
     """
     index = scene_index(env)
     pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, index)
     with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
-        camera = placement.kind, name
+        camera = placement.kind, placement.name
         return measure(view, pose, e, list_objects(env), index, camera, placement.settings)
 
 
@@ -246,13 +236,12 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 
 def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneIndex) -> NDArray[np.float64]:
     """(7,) of a placement in the env's frame, where the bodies stand at `bodies` (B, 7)."""
-    local = make_pose(placement.settings.position, placement.settings.quaternion)
     if placement.mount is None:
-        return local
+        return pose_of(placement.settings)
     mount = bodies[mount_column(index, placement.mount)]
     if not np.isfinite(mount).all():
         raise ValueError(f"this env has no body {placement.mount!r} to mount a camera on")
-    return compose(mount, local)
+    return compose(mount, pose_of(placement.settings))
 
 
 def mount_column(index: SceneIndex, name: str) -> int:

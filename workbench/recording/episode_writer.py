@@ -208,7 +208,7 @@ class EpisodeWriter:
         return seen, items
 
     def _check(self, picture: Picture, seen: Mapping[int, object]) -> int:
-        index = self._cameras.get((picture.kind, picture.camera))
+        index = self._cameras.get(picture.key)
         if index is None:
             raise ValueError(f"a picture of {picture.kind} camera {picture.camera}, which the task has not.")
         if index in seen:

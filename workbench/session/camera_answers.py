@@ -23,7 +23,7 @@ from workbench.core.exchange import put_class, undone
 from workbench.core.pictures import Picture
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import take_pictures
-from workbench.core.visibility import Placement, judge_camera, picture_of, small_size
+from workbench.core.visibility import Placement, judge_placement, picture_of, placement_of, small_size
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.pacing import now_and_then
 from workbench.session.questions import (
@@ -104,10 +104,10 @@ def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> P
 
 
 def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
-    key, settings = question.key, question.settings
-    own = settings or opened.description.camera(key)
-    size = None if own is None else small_size(own.width, own.height, JUDGED_SIDE)
-    return judge_camera(opened.env.env, key, question.env, settings=settings, size=size, poses=question.poses)
+    env = opened.env.env
+    placement = placement_of(env, question.key, question.env, question.settings)
+    size = small_size(placement.settings.width, placement.settings.height, JUDGED_SIDE)
+    return judge_placement(env, question.env, placement, question.poses, size)
 
 
 # --- the hooks of another text ---------------------------------------------------------------------

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_frames import compose
 from workbench.core.camera_report import CameraReport, OfferedPlacement, SearchSpace, join_reports
-from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
+from workbench.core.camera_settings import CameraSettings, why_no_camera
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
 from workbench.session.history import ShownMoment
@@ -82,29 +82,29 @@ class CameraJudging:
 
     # --- jobs ------------------------------------------------------------------------------------------
 
-    def judge(self, key: CameraKey, seeds: int = 0) -> None:
-        """Judge a camera as it is placed over all envs.
+    def judge(self, seeds: int = 0) -> None:
+        """Judge the selected camera as it is placed over all envs.
 
         Args:
             seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background; what is
                 known so far can be seen all the while.
         """
-        camera = self._asked_for(key)
+        camera = self._asked_for()
         if camera is not None and seeds <= 0:
             moment = self._past.shown_moment()
             cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
-            self._judge_live(f"judging {key[1]} in all envs", camera, cases, len(cases))
+            self._judge_live("in all envs", camera, cases, len(cases))
         elif camera is not None and (load := self._load()) is not None:
             self._judge_seeds(camera, load, min(seeds, MOST_SEEDS))
 
-    def judge_steps(self, key: CameraKey, most: int = MOST_STEPS) -> None:
-        """Judge a camera as it is placed over the steps of the episode that the selected env is in; what is known so far
-        can be seen all the while.
+    def judge_steps(self, most: int = MOST_STEPS) -> None:
+        """Judge the selected camera as it is placed over the steps of the episode that the selected env is in; what is
+        known so far can be seen all the while.
 
         Args:
             most: how many of them, evenly spread.
         """
-        camera = self._asked_for(key)
+        camera = self._asked_for()
         moments = self._past.episode_moments(min(max(1, most), MOST_STEPS))
         if camera is not None and moments:
             cases: list[Case] = [
@@ -112,15 +112,15 @@ class CameraJudging:
                 for moment, env in moments
                 for step in [moment.step]
             ]
-            self._judge_live(f"judging {key[1]} over {len(moments)} steps", camera, cases, _TELL_EVERY)
+            self._judge_live(f"over {len(moments)} steps", camera, cases, _TELL_EVERY)
 
-    def _judge_live(self, what: str, camera: StudioCamera, cases: Sequence[Case], every: int) -> None:
+    def _judge_live(self, over: str, camera: StudioCamera, cases: Sequence[Case], every: int) -> None:
         def work(job: Job) -> None:
             with self._judging_anew():
                 question = JudgeCamera(camera.key, None, 0)
                 self._judge(job, self._live, question, camera.now, [], cases, len(cases), every)
 
-        self._live_lane.start(what, work)
+        self._live_lane.start(f"judging {camera.key[1]} {over}", work)
 
     def _judge_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
         question = JudgeCamera(camera.key, camera.now if camera.moved else None, 0)
@@ -183,19 +183,20 @@ class CameraJudging:
                     judging=False,
                 )
 
-    def suggest(self, key: CameraKey, objects: Sequence[str], low: Triple, high: Triple, seeds: int) -> None:
-        """Search placements that see these objects over so many fresh episodes, or as many as there are envs.
+    def suggest(self, objects: Sequence[str], low: Triple, high: Triple, seeds: int) -> None:
+        """Search placements of the selected camera that see these objects over so many fresh episodes, or as many as
+        there are envs.
 
         Args:
             objects: names of objects, or of single links of them (``TaskDescription.objects``).
             low, high: corners of the box for the eye; metres, in the frame of the camera's mount, or the env's.
         """
-        camera = self._asked_for(key)
-        load = self._load()
+        camera, load = self._asked_for(), self._load()
         if camera is not None and camera.now is None:
-            self._say(f"{key[1]} cannot be placed: {camera.refused}.")
+            self._say(f"{camera.key[1]} cannot be placed: {camera.refused}.")
         if camera is None or camera.now is None or load is None:
             return
+        key = camera.key
         space = SearchSpace(tuple(objects), low, high, camera.now, key[0], mount=camera.info.mount)
         what = f"searching places for {key[1]}"
 
@@ -218,24 +219,30 @@ class CameraJudging:
 
         self._background_lane.start(what, work)
 
-    def compare(self, key: CameraKey, other: CameraSettings) -> None:
-        """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
-        with self._cameras.lock:
-            why_not = self._cameras.refusal(key) or why_no_camera(other)
-        moment = self._past.shown_moment()
+    def compare(self, other: CameraSettings) -> None:
+        """Two pictures of the shown env: the selected camera as it is placed, and as it would be with other settings."""
+        camera = self._asked_for()
+        if camera is None:
+            return
+        key, moment, why_not = camera.key, self._past.shown_moment(), camera.refused or why_no_camera(other)
 
         def work(job: Job) -> None:
-            pair = [self._draw(job, key, settings, moment.env, moment) for settings in (None, other)]
-            self._know(compared=(pair[0], pair[1]))
+            now, then = (
+                self._draw(job, moment, DrawCamera(key, settings, moment.env)) for settings in (None, other)
+            )
+            self._know(compared=(now, then))
 
-        if not why_not:
+        if why_not:
+            self._say(f"{key[1]} is not compared: {why_not}.")
+        else:
             self._live_lane.start(f"comparing two placements of {key[1]}", work)
-        self._say(f"{key[1]} is not compared: {why_not}." if why_not else "")
 
-    def make_sheet(self, key: CameraKey) -> None:
-        """The pictures of all envs by one camera, as they come; worst first if it was judged over them."""
-        if self._asked_for(key) is None:
+    def make_sheet(self) -> None:
+        """The selected camera's pictures of all envs, as they come; worst first if it was judged over them."""
+        camera = self._asked_for()
+        if camera is None:
             return
+        key = camera.key
         moment, report = self._past.shown_moment(), self.looked.report_over_envs(key)
         order = list(range(moment.num_envs))
         if report is not None:
@@ -246,22 +253,21 @@ class CameraJudging:
             self._know(sheet=())
             for done, env in enumerate(order):
                 job.tell(done, len(order))
-                picture = self._draw(job, key, None, env, moment)
+                picture = self._draw(job, moment, DrawCamera(key, None, env))
                 self._know(sheet=(*self.looked.sheet, picture))
 
         self._live_lane.start(f"taking pictures by {key[1]} of all envs", work)
 
-    def pick(self, key: CameraKey, u: float, v: float) -> None:
-        """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
-        with self._cameras.lock:
-            info, task = self._cameras.info(key), self._cameras.task
-        if info is None or task is None:
+    def pick(self, u: float, v: float) -> None:
+        """What is seen at a place of its picture: 0, 0 is the upper left corner, 1, 1 the lower right one."""
+        camera, task, moment = self._asked_for(), self._cameras.task, self._past.shown_moment()
+        if camera is None or task is None:
             return
-        moment = self._past.shown_moment()
 
         def work(job: Job) -> None:
-            picture = self._draw(job, key, None, moment.env, moment, ("depth", "segmentation"))
-            self._know(picked=picked(info, picture, u, v, task.segmentation))
+            question = DrawCamera(camera.key, None, moment.env, ("depth", "segmentation"))
+            picture = self._draw(job, moment, question)
+            self._know(picked=picked(camera.info, picture, u, v, task.segmentation))
 
         self._live_lane.start("looking closely", work)
 
@@ -285,9 +291,9 @@ class CameraJudging:
 
     # --- small things ------------------------------------------------------------------------------------
 
-    def _asked_for(self, key: CameraKey) -> StudioCamera | None:
+    def _asked_for(self) -> StudioCamera | None:
         with self._cameras.lock:
-            camera = self._cameras.asked_for(key)
+            camera = self._cameras.asked_for()
         self._on_change()
         return camera
 
@@ -296,16 +302,8 @@ class CameraJudging:
             self._cameras.problem = problem
         self._on_change()
 
-    def _draw(
-        self,
-        job: Job,
-        key: CameraKey,
-        settings: CameraSettings | None,
-        env: int,
-        moment: ShownMoment,
-        modalities: tuple[str, ...] = ("rgb",),
-    ) -> Picture:
-        return self._live.ask(job.check, DrawCamera(key, settings, env, modalities, moment.of(env)))
+    def _draw(self, job: Job, moment: ShownMoment, question: DrawCamera) -> Picture:
+        return self._live.ask(job.check, replace(question, poses=moment.of(question.env)))
 
     @contextmanager
     def _judging_anew(self) -> Iterator[None]:

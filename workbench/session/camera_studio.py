@@ -16,13 +16,11 @@ Here is how a camera comes to stand somewhere; what is asked about it there is `
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from workbench.authoring import camera_files
 from workbench.core.camera_frames import Convention, Direction, relative_to, with_pose
@@ -41,107 +39,13 @@ from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.questions import DrawCamera
 from workbench.session.studio_cameras import Step, StudioCameras
 from workbench.session.studio_file import StudioFile
-from workbench.session.studio_view import StudioView, Wish
+from workbench.session.studio_view import StudioView
 from workbench.session.timeline import TimeTravel
 from workbench.session.versions import Versions
 
-_LARGEST = 256
-"""Pixels of the shorter side of a new camera's picture, before it is written."""
-
-
 IN_A_QUICK_LOOK = ("rgb", "depth", "segmentation")
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What would be looked at."""
-
-    key: CameraKey
-    settings: CameraSettings
-    env: int
-    step: StepResult | None = field(compare=False)
-    scale: float
-    """Of the picture's sides against the camera's own."""
-
-    def same(self, other: Sight | None) -> bool:
-        return other is not None and self.step is other.step and self == other
-
-
-class Preview:
-    """One look at a time; a new one takes the place of the one before. Thread-safe; every method returns at once."""
-
-    def __init__(
-        self,
-        asker: Asker,
-        on_change: Callable[[], None],
-        failing: str,
-        modalities: tuple[str, ...] = ("rgb",),
-    ) -> None:
-        """
-        Args:
-            failing: how the sentence begins that says why there is no picture.
-            modalities: that the picture has, whatever the camera's own shader gives.
-        """
-        self._asker, self._failing, self._modalities = asker, failing, modalities
-        self._lock = threading.Lock()
-        self._lane = Lane("studio-preview", on_change, self._failed)
-        self._asked: Sight | None = None
-        self._picture: Picture | None = None
-        self._problem = ""
-
-    @property
-    def problem(self) -> str:
-        """Why the last look failed, as a sentence."""
-        with self._lock:
-            return self._problem
-
-    def picture(self, key: CameraKey | None, env: int | None = None) -> Picture | None:
-        """The last look, if it was by this camera, and in this env if one is named."""
-        with self._lock:
-            found = self._picture
-        if found is None or (found.kind, found.camera) != key or env not in (None, found.env):
-            return None
-        return found
-
-    def wants(self, sight: Sight) -> bool:
-        """Whether this is to be looked at and was not yet, and nothing else is being looked at."""
-        with self._lock:
-            return self._lane.progress is None and not sight.same(self._asked)
-
-    def look(self, sight: Sight, poses: NDArray[np.float32] | None) -> None:
-        """
-        Args:
-            poses: (B, 7) of the env's bodies at a moment of the past; None for now.
-        """
-        question = DrawCamera(sight.key, sight.settings, sight.env, self._modalities, poses, sight.scale)
-
-        def work(job: Job) -> None:
-            picture = self._asker.ask(job.check, question)
-            with self._lock:
-                self._picture = picture
-
-        with self._lock:
-            self._asked, self._problem = sight, ""
-        self._lane.start("a preview", work)
-
-    def forget(self) -> None:
-        """What was seen is not to be shown any more."""
-        with self._lock:
-            self._asked, self._picture = None, None
-
-    def stop(self) -> None:
-        """The worker is gone, or another version runs: what is under way is not answered any more."""
-        self._lane.stop()
-        with self._lock:
-            self._asked = None
-
-    def close(self) -> None:
-        self._lane.close()
-
-    def _failed(self, job: Job, failure: JobFailed) -> None:
-        """The last picture stays; the next change looks again."""
-        with self._lock:
-            self._problem = f"{self._failing}: {failure}."
+Sight = tuple[StepResult | None, DrawCamera]
+"""A moment, and what of it is looked at."""
 
 
 class CameraStudio:
@@ -168,14 +72,18 @@ class CameraStudio:
         self._shown = past.shown_moment
         self._cameras, load = StudioCameras(), versions.same_again
         self._lock = self._cameras.lock
-        self.file = StudioFile(self._cameras, self._note, versions.open_file, asker, load)
+        self._asker = asker
+        self.file = StudioFile(self._cameras, self._note, versions.open_file, asker, load, self._shown)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
         self.judging = CameraJudging(self._cameras, asker, background, self._note, past, load)
-        self._quick = Preview(asker, self._note, "The quick look failed", IN_A_QUICK_LOOK)
+        self._looking = Lane("studio-quick-look", self._note, self._look_failed)
         self._quick_scale = 1.0
-        self._first = Preview(asker, self._note, "There is no picture of the new camera")
+        self._quick: Picture | None = None
+        self._quick_problem = ""
+        self._looked: Sight | None = None
+        """What was looked at last."""
 
     # --- placing -------------------------------------------------------------------------------------
 
@@ -187,16 +95,19 @@ class CameraStudio:
             )
         self._note()
 
-    def place(self, key: CameraKey, settings: CameraSettings, gesture: int | None = None) -> None:
+    def place(
+        self, key: CameraKey, settings: CameraSettings, hand: object = None, pause: float = math.inf
+    ) -> None:
         """Place a camera, live. Of placements faster than the worker only the newest is made.
 
         Args:
-            gesture: calls with the same number, one behind the other, are one step of undo (a drag).
+            hand: what places it; calls by the same one, one behind the other, are one step of undo (a drag).
+            pause: seconds after the last of them from which on it is another step.
         """
         with self._lock:
             why_not = self._cameras.refusal(key) or why_no_camera(settings)
             self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-            moved = not why_not and self._cameras.placements.place(key, settings, gesture)
+            moved = not why_not and self._cameras.placements.place(key, settings, hand, pause)
         self.ask_for([key] if moved else [])
 
     def undo(self) -> None:
@@ -222,15 +133,6 @@ class CameraStudio:
             )
         self.ask_for([key] if moved else [])
 
-    def plan(self, wish: Wish) -> None:
-        """Find the edit that fulfils a wish; what a new camera would see is `StudioView.first_sight`."""
-        self.file.plan(wish)
-        if wish.what == "add" and wish.settings is not None:
-            moment, smaller = self._shown(), _LARGEST / min(wish.settings.width, wish.settings.height)
-            sight = Sight(wish.key, wish.settings, moment.env, None, min(1.0, smaller))
-            self._first.forget()
-            self._first.look(sight, moment.of(moment.env))
-
     def take_suggestion(self, index: int) -> None:
         """Place the camera as suggested."""
         looked = self.judging.looked
@@ -246,24 +148,35 @@ class CameraStudio:
     def set_quick_scale(self, scale: float) -> None:
         """Look through the chosen camera in a picture of so much of its own size; 1 for that itself. Never written."""
         with self._lock:
-            self._quick_scale = scale
-        self._quick.forget()
+            self._quick_scale, self._quick, self._looked = scale, None, None
         self._note()
 
     def look(self) -> None:
-        """Take the quick look that `StudioView.wants_quick` tells of."""
+        """Take another quick look, if there is something new to be looked at and none is being taken."""
         with self._lock:
-            sight = self._sight()
-        if sight is not None and self._quick.wants(sight):
-            self._quick.look(sight, self._shown().of(sight.env))
+            key, (step, env) = self._cameras.selected, self._cameras.drawn
+            now = None if key is None else self._cameras.placements.now(key)
+            if self._quick_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
+                return
+            question = DrawCamera(key, now, env, IN_A_QUICK_LOOK, scale=self._quick_scale)
+            seen = self._looked is not None and self._looked[0] is step and self._looked[1] == question
+            if seen or self._looking.progress is not None:
+                return
+            self._looked, self._quick_problem = (step, question), ""
 
-    def _sight(self) -> Sight | None:
-        key = self._cameras.selected
-        now = None if key is None else self._cameras.placements.now(key)
-        if self._quick_scale == 1.0 or key is None or now is None or self._cameras.refusal(key) is not None:
-            return None
-        step, env = self._cameras.drawn
-        return Sight(key, now, env, step, self._quick_scale)
+        question = replace(question, poses=self._shown().of(env))
+
+        def work(job: Job) -> None:
+            picture = self._asker.ask(job.check, question)
+            with self._lock:
+                self._quick = picture
+
+        self._looking.start("a quick look", work)
+
+    def _look_failed(self, job: Job, failure: JobFailed) -> None:
+        """The last picture stays; the next change looks again."""
+        with self._lock:
+            self._quick_problem = f"The quick look failed: {failure}."
 
     # --- in other words --------------------------------------------------------------------------------
 
@@ -325,7 +238,7 @@ class CameraStudio:
         looked, progress = self.judging.looked, self.judging.progress
         with self._lock:
             self._cameras.drawn = step, env
-            sight = self._sight()
+            quick = self._quick
             judged = None if looked.report_of is None else self._cameras.placements.now(looked.report_of)
             was = looked.report_settings
             # Not what is rounded away when it is written.
@@ -335,15 +248,13 @@ class CameraStudio:
                 looked=looked,
                 report_stale=looked.report is not None and (moved or looked.outdated),
                 quick_scale=self._quick_scale,
-                quick=self._quick.picture(self._cameras.selected, env),
-                wants_quick=sight is not None and self._quick.wants(sight),
+                quick=quick if quick and (quick.key, quick.env) == (self._cameras.selected, env) else None,
                 progress=progress,
                 selected=self._cameras.selected,
                 undo=self._cameras.placements.undo_words,
                 redo=self._cameras.placements.redo_words,
-                writing=(writing := self.file.view),
-                first_sight=self._first.picture(writing.key if writing.stage == "planned" else None),
-                problem=self._cameras.problem or looked.problem or self._quick.problem or self._first.problem,
+                writing=self.file.view,
+                problem=self._cameras.problem or looked.problem or self._quick_problem,
                 serial=self._serial,
             )
 
@@ -385,8 +296,8 @@ class CameraStudio:
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
         self.judging.stop()
-        self._quick.stop()
-        self._first.stop()
+        self._looking.stop()
+        self._looked = None
         self.file.stop()
 
     def failed_to_load(self) -> None:
@@ -421,8 +332,7 @@ class CameraStudio:
     def close(self) -> None:
         """Wait for what is being written."""
         self.judging.close()
-        self._quick.close()
-        self._first.close()
+        self._looking.close()
         self.file.close()
 
     # --- small things ----------------------------------------------------------------------------------

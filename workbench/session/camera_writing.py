@@ -154,7 +154,7 @@ def _made(
     if wish.what == "add":
         assert wish.settings is not None
         file = task.file or task.source_files[0]
-        return members.plan_add(texts, file, task.class_name, wish.key, wish.settings, run, wish.target)
+        return members.plan_add(texts, file, task.class_name, wish.key, wish.settings, run)
     if info is None or info.settings is None:
         raise Refused(f"there is no {kind} camera {uid!r} whose settings are known")
     if wish.what == "remove":

@@ -179,7 +179,7 @@ class LiveState:
             if event.pictures and event.pictures[0].env == now.settings.selected_env:
                 # They come a kind at a time; what nobody looks through any more is not to stay.
                 watched = {(camera.kind, camera.name) for camera in now.settings.cameras}
-                made = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                made = {picture.key: picture for picture in event.pictures}
                 shown = {key: p for key, p in {**now.pictures, **made}.items() if key in watched}
                 self.new_pictures(pictures=shown, picture_milliseconds=event.milliseconds)
         elif isinstance(event, Placed):

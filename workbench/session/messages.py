@@ -157,6 +157,10 @@ class CameraRequest(NamedTuple):
     kind: CameraKind
     modalities: tuple[str, ...] = ("rgb",)
 
+    @property
+    def key(self) -> CameraKey:
+        return self.kind, self.name
+
 
 @dataclass(frozen=True)
 class Settings:

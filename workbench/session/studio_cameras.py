@@ -11,14 +11,17 @@ new of that very camera: the author wrote that, so it counts, and the placement 
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from workbench.authoring import camera_files
+from workbench.core.camera_frames import axes_of, pose_in_env
 from workbench.core.camera_settings import NOT_ON_THE_GPU, CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
@@ -26,6 +29,8 @@ from workbench.session.messages import TaskDescription
 from workbench.session.studio_view import StudioCamera
 
 _MOST_STEPS = 500
+NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
+"""Metres in front of the eye at which the target of a camera is put that has none yet."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,10 @@ class Step:
     before: CameraSettings
     after: CameraSettings
     words: str
-    gesture: int | None = None
+    hand: object = None
+    """What made it."""
+    at: float = 0.0
+    """Seconds, of `time.monotonic`."""
 
 
 class Placements:
@@ -63,21 +71,41 @@ class Placements:
         return self._undone[-1].words if self._undone else None
 
     def place(
-        self, key: CameraKey, settings: CameraSettings, gesture: int | None = None, words: str = ""
+        self,
+        key: CameraKey,
+        settings: CameraSettings,
+        hand: object = None,
+        pause: float = math.inf,
+        words: str = "",
     ) -> bool:
-        """False if there is no such camera, or it stands so already."""
-        before = self.now(key)
-        if before is None or not differences(before, settings):
+        """False if there is no such camera, or it stands so already; `hand` and `pause` as in `CameraStudio.place`."""
+        before, now = self.now(key), time.monotonic()
+        if before is None:
             return False
-        last = self._done[-1] if self._done else None
-        if gesture is not None and last is not None and (last.key, last.gesture) == (key, gesture):
+        last = self._done[-1] if self._done and self._done[-1].key == key else None
+        if not differences(before, settings):
+            # How far it looks is no step of its own.
+            aimed = self.aim(key, settings.distance)
+            if last is not None:
+                self._done[-1] = replace(last, after=aimed)
+            return False
+        if last is not None and hand is not None and last.hand == hand and now - last.at <= pause:
             before = last.before
             self._done.pop()
         words = words or _in_words(key, before, settings)
-        self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, before, settings, words, gesture)]
-        self._undone.clear()
+        self._note(Step(key, before, settings, words, hand, now))
         self._put(key, settings)
         return True
+
+    def aim(self, key: CameraKey, distance: float | None) -> CameraSettings:
+        """A camera as it is now, looking so far."""
+        held = self.placed if key in self.placed else self.said
+        held[key] = replace(held[key], distance=distance)
+        return held[key]
+
+    def _note(self, step: Step) -> None:
+        self._done = [*self._done[-_MOST_STEPS + 1 :], step]
+        self._undone.clear()
 
     def undo(self) -> Step | None:
         """The step that was taken back."""
@@ -92,7 +120,7 @@ class Placements:
         if not self._undone:
             return None
         step = self._undone.pop()
-        self._done.append(replace(step, gesture=None))
+        self._done.append(replace(step, hand=None))
         self._put(step.key, step.after)
         return step
 
@@ -118,9 +146,7 @@ class Placements:
             return False
         self.placed.pop(key, None)
         if differences(written, said):
-            words = f"took back the change of {key[1]}"
-            self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, written, said, words)]
-            self._undone.clear()
+            self._note(Step(key, written, said, f"took back the change of {key[1]}"))
         return True
 
     def rename(self, key: CameraKey, new: CameraKey) -> None:
@@ -143,6 +169,9 @@ class Placements:
         Returns:
             cameras whose placement was dropped, since the file says something new of them.
         """
+        # Where the file names no target, a camera looks as far as it did.
+        far = {key: now.distance for key in said if (now := self.now(key)) is not None}
+        said = {key: s if s.distance else replace(s, distance=far.get(key)) for key, s in said.items()}
         before, self.said = self.said, dict(said)
         dropped: list[CameraKey] = []
         for key, placed in list(self.placed.items()):
@@ -184,6 +213,14 @@ def _in_words(key: CameraKey, before: CameraSettings, after: CameraSettings) -> 
     return next((words for most, words in _IN_WORDS if changed <= most), "changed {}").format(key[1])
 
 
+def usual_distance(pose: ArrayLike) -> float:
+    """How far before a camera (7,) its target is put: where it looks at the height 0 of its env, if that is near."""
+    p = np.asarray(pose, np.float64)
+    forward = axes_of(p[3:])[0]
+    distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else USUAL
+    return distance if NEAREST_TARGET <= distance <= FARTHEST_TARGET else USUAL
+
+
 class StudioCameras:
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -198,10 +235,10 @@ class StudioCameras:
     def info(self, key: CameraKey) -> CameraInfo | None:
         return None if self.task is None else self.task.camera(key)
 
-    def asked_for(self, key: CameraKey) -> StudioCamera | None:
-        """The camera, if there is one; it is said if not. What went wrong before it was asked for is over."""
-        info = self.info(key)
-        self.problem = "" if info is not None else f"There is no {key[0]} camera {key[1]}."
+    def asked_for(self) -> StudioCamera | None:
+        """The selected camera, if there is one. What went wrong before something was asked of it is over."""
+        info = None if self.selected is None else self.info(self.selected)
+        self.problem = ""
         return None if info is None else self._as_shown(info)
 
     def refusal(self, key: CameraKey) -> str | None:
@@ -230,13 +267,16 @@ class StudioCameras:
         return () if self.task is None else tuple(self._as_shown(info) for info in self.task.cameras)
 
     def _as_shown(self, info: CameraInfo) -> StudioCamera:
-        key = info.key
+        key, mount = info.key, self.mount_pose(info)
+        now = self.placements.now(key)
+        if now is not None and now.distance is None and (mount is None) == (info.mount is None):
+            now = self.placements.aim(key, usual_distance(pose_in_env(now, mount)))
         return StudioCamera(
             key=key,
             info=info,
-            now=self.placements.now(key),
+            now=now,
             moved=key in self.placements.placed,
-            mount_pose=self.mount_pose(info),
+            mount_pose=mount,
             refused=self.refusal(key) or "",
         )
 

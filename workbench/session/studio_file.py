@@ -21,14 +21,17 @@ from workbench.authoring.source.text import Refused, plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.askers import Asker
 from workbench.session.camera_writing import DONE, LEFT, copy, mismatch, plan, said, was_before
+from workbench.session.history import ShownMoment
 from workbench.session.lane import JobFailed, Stopped
 from workbench.session.messages import Load, TaskDescription
-from workbench.session.questions import RunCameras
+from workbench.session.questions import DrawCamera, RunCameras
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import Wish, Writing, WritingStage
 
 MADE: tuple[WritingStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
+_LARGEST = 256
+"""Pixels of the shorter side of a new camera's picture, before it is written."""
 
 
 class StudioFile:
@@ -39,6 +42,7 @@ class StudioFile:
         open_copy: open this class of this file, in a folder of the user's, in place of the task.
         asker: asks the worker that plays.
         load: how the version that runs was loaded; None before there is one.
+        shown: which moment the page shows.
         patience: seconds in which the worker must have run the hooks: one of them may not end.
     """
 
@@ -49,12 +53,13 @@ class StudioFile:
         open_copy: Callable[[Path, str], None],
         asker: Asker,
         load: Callable[[], Load | None],
+        shown: Callable[[], ShownMoment],
         patience: float = 60.0,
     ) -> None:
         self._cameras, self._note, self._open_copy = cameras, on_change, open_copy
         self.folder = Path.cwd()
         """Where a copy of a task goes: where the program was started."""
-        self._asker, self._load, self._patience = asker, load, patience
+        self._asker, self._load, self._shown, self._patience = asker, load, shown, patience
         self._stopped = threading.Event()
         """Nobody waits any more for what is being asked."""
         self.view = Writing()
@@ -79,15 +84,42 @@ class StudioFile:
     def _find_plan(self, wish: Wish) -> None:
         with self._cameras.lock:
             task, info = self._cameras.task, self._cameras.info(wish.key)
-        if task is None:
-            return
+            if task is None:
+                return
+            before = self.view.wish if self.view.stage == "planned" else None
+            # Nobody takes what was said of another wish for the answer to this one; but a version may be awaited.
+            self.view = self.view if self.view.loading else Writing(wish=wish)
+        self._note()
         writing = plan(task, info, wish, self._run)
         with self._cameras.lock:
-            before = self.view.wish if self.view.stage == "planned" else None
             first, self._just_copied = self._just_copied, ""
             if before is not None and (before.what, before.key) != (wish.what, wish.key):
                 first = said(before, LEFT)
             self.view = replace(writing, message=f"{first} {writing.message}".strip())
+        self._note()
+        if writing.stage == "planned" and wish.what == "add" and wish.settings is not None:
+            self._look(wish, wish.settings)
+
+    def _look(self, wish: Wish, settings: CameraSettings) -> None:
+        """What a camera would see that is to be added; not looked for any more when something else is asked for."""
+        moment, smaller = self._shown(), _LARGEST / min(settings.width, settings.height)
+        poses = moment.of(moment.env)
+        question = DrawCamera(wish.key, settings, moment.env, poses=poses, scale=min(1.0, smaller))
+
+        def check() -> None:
+            if self._stopped.is_set() or not self._last.running():
+                raise Stopped
+
+        try:
+            picture = self._asker.ask(check, question)
+        except Stopped:
+            return
+        except JobFailed as failure:
+            self._cameras.problem = f"There is no picture of the new camera: {failure}."
+        else:
+            with self._cameras.lock:
+                if self.view.wish is wish:
+                    self.view = replace(self.view, picture=picture)
         self._note()
 
     def _run(self, texts: Mapping[str, str]) -> Ran:
@@ -284,7 +316,8 @@ class StudioFile:
                 self._submit(work, *args)
 
     def _submit(self, work: Callable[..., None], *args: object) -> None:
-        self._thread.submit(work, *args).add_done_callback(self._worked)
+        self._last = self._thread.submit(work, *args)
+        self._last.add_done_callback(self._worked)
 
     def _worked(self, future: Future[None]) -> None:
         error = None if future.cancelled() else future.exception()

@@ -38,8 +38,8 @@ class Wish:
     """What it is to have, or has where it is removed; None for as it is placed when it is asked for."""
     name: str = ""
     """The new name."""
-    target: tuple[float, float, float] | None = None
-    """The point that one looks at which is added, in the env's frame."""
+    about: str = ""
+    """What is said beside its plan, for the reader."""
 
     @property
     def result(self) -> CameraKey:
@@ -78,13 +78,10 @@ class Writing:
     """One sentence or two: what happened, and what to do next."""
     can_copy: bool = False
     """Refused since the file is not the user's to edit, and a copy of it would be: see `StudioFile.copy_task`."""
+    picture: Picture | None = None
+    """What the camera would see whose addition is planned, once it was looked."""
     loading: bool = False
     """It is in the file, or out of it again, and the version with that has not come in yet."""
-
-    @property
-    def key(self) -> CameraKey | None:
-        """Whose: of a camera that is added, the new one's."""
-        return None if self.wish is None else self.wish.result
 
     @property
     def what(self) -> Change:
@@ -173,8 +170,6 @@ class StudioView:
     """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
     redo: str | None = None
     writing: Writing = Writing()
-    first_sight: Picture | None = None
-    """What the camera would see whose addition is planned."""
     looked: Looked = Looked()
     """What came of looking at the cameras."""
     report_stale: bool = False
@@ -183,8 +178,6 @@ class StudioView:
     """Other than 1: the chosen camera is looked through in a picture of so much of its own size."""
     quick: Picture | None = None
     """That picture, while there is one."""
-    wants_quick: bool = False
-    """There is something new to be looked at: see `CameraStudio.look`."""
     progress: Progress | None = None
     """None while nothing runs in the background."""
     problem: str = ""

@@ -9,26 +9,25 @@ on, and it is fetched when it should be ready, by what the last ones took (see `
 human cameras, since the two see different objects and cannot be drawn at once, and are handed over as soon as they are
 there. No more than 15 rounds a second are made, and after each there is a pause in proportion, so that the browser on the
 same machine gets its share. But a camera that is being dragged somebody follows with the hand: its picture is made next
-and alone (`hurry`), without a pause, and the others when it rests.
+and alone, without a pause, and the others when it rests.
 """
 
 from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from workbench.authoring.problem import problem_from_exception
 from workbench.core.camera_settings import CameraKey
 from workbench.core.exchange import keep_observation_space
-from workbench.core.pictures import CameraKind, Picture
+from workbench.core.pictures import Picture
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.state_columns import read_state_columns
 from workbench.core.take_pictures import (
     KINDS,
     BegunPictures,
-    Request,
     begin_pictures,
     list_cameras,
     recorded_pictures,
@@ -55,113 +54,17 @@ _PAUSE_SHARE = 0.3
 """Of the time a round took."""
 
 
-class PictureMaker:
-    """Rounds of pictures of what `watch` named; `poll` moves the present one on."""
+@dataclass(frozen=True)
+class _Begun:
+    """Pictures of one kind that the renderer is at work on."""
 
-    def __init__(self) -> None:
-        self._env_index = 0
-        self._requests: tuple[Request, ...] = ()
-        self._wanted = False
-        self._hurried: set[CameraKey] = set()
-        self._next_round = 0.0
-        self._round: tuple[Request, ...] = ()
-        self._begun: BegunPictures | None = None
-        self._begun_at = 0.0
-        self._ready_at = 0.0
-        self._kinds_left: list[CameraKind] = []
-        self._round_began = 0.0
-        self._expected: dict[tuple[CameraKey, ...], float] = {}
-        self._drawn: tuple[CameraKey, ...] = ()
-        self.nothing_else_to_do = False
-        """No step is due: a picture is waited for where it is not ready, since guessing when it will be takes longer."""
-        self._moment = 0
-        self._begun_of = 0
-        self.shown = 0
-        """Which moment (as `scene_changed` was told) the pictures that were fetched last show."""
-
-    def watch(self, env_index: int, requests: Sequence[Request]) -> None:
-        """From now on these cameras of this env."""
-        self._env_index, self._requests = env_index, tuple(requests)
-        self._wanted = bool(requests)
-        self._hurried.clear()
-        self._expected.clear()
-        self._next_round = 0.0  # somebody waits for these
-
-    def scene_changed(self, moment: int) -> None:
-        """What was drawn is old; the scene is now that of `moment`, a number of the caller's."""
-        self._wanted, self._moment = bool(self._requests), moment
-
-    def hurry(self, key: CameraKey) -> None:
-        """Somebody moves this camera: if it is watched, its picture comes first."""
-        if any((kind, name) == key for name, kind, _ in self._requests):
-            self._hurried.add(key)
-
-    @property
-    def idle(self) -> bool:
-        """Whether the renderer is at work on nothing of ours."""
-        return self._begun is None
-
-    def wait(self, now: float) -> float | None:
-        """Seconds until `poll` has something to do; None while nobody looks."""
-        if self._begun is not None:
-            return 0.0 if self.nothing_else_to_do else max(0.0, self._ready_at - now)
-        if self._hurried:
-            return 0.0
-        return max(0.0, self._next_round - now) if self._wanted else None
-
-    def poll(self, env: TaskEnv, now: float) -> tuple[tuple[Picture, ...], float] | None:
-        """Begin or fetch what is due; the pictures of a kind and their seconds when they are complete."""
-        if self._begun is None:
-            if not self._hurried and (not self._wanted or now < self._next_round):
-                return None
-            if self._hurried:
-                self._round = tuple(r for r in self._requests if (r[1], r[0]) in self._hurried)
-                self._hurried.clear()
-            else:
-                self._round, self._wanted = self._requests, False
-            self._round_began = now
-            self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._round)]
-            self._begin_next(env)
-            return None
-        if now < self._ready_at and not self.nothing_else_to_do:
-            return None
-        made, seconds = self._fetch()
-        if self._kinds_left:
-            self._begin_next(env)
-        else:
-            done = time.monotonic()
-            pause = _PAUSE_SHARE * (done - self._round_began)
-            self._next_round = max(self._round_began + _PERIOD, done + pause)
-        return made, seconds
-
-    def settle(self) -> None:
-        """Wait for the renderer and give up the round: the scene is about to be closed or drawn anew."""
-        if self._begun is not None:
-            self._begun.finish()
-            self._begun = None
-            self._wanted = bool(self._requests)
-
-    def _begin_next(self, env: TaskEnv) -> None:
-        kind = self._kinds_left.pop(0)
-        chosen = [request for request in self._round if request[1] == kind]
-        self._begun = begin_pictures(env.env, self._env_index, chosen)
-        self._drawn = tuple((kind, name) for name, kind, _ in chosen)
-        self._begun_of = self._moment
-        self._begun_at = time.monotonic()
-        self._ready_at = self._begun_at + self._expected.get(self._drawn, 0.0)
-
-    def _fetch(self) -> tuple[tuple[Picture, ...], float]:
-        begun, self._begun = self._begun, None
-        assert begun is not None
-        asked = time.monotonic()
-        made = tuple(begun.finish())
-        self.shown = self._begun_of
-        done = time.monotonic()
-        waited = done - asked > 0.004
-        # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
-        took = done - self._begun_at
-        self._expected[self._drawn] = min(took, 1.0) if waited else 0.9 * self._expected.get(self._drawn, 0.0)
-        return made, took
+    pictures: BegunPictures
+    asked: tuple[CameraRequest, ...]
+    number: int
+    """Of the moment that they show."""
+    at: float
+    ready_at: float
+    """What they should be ready at, in seconds of `time.monotonic` as `at`."""
 
 
 class WorkerCameras:
@@ -175,7 +78,19 @@ class WorkerCameras:
         self._held, self._on_first = held, on_first
         self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
         """The env, and its cameras, whose pictures are kept being made."""
-        self._pictures = PictureMaker()
+        self._there: tuple[CameraRequest, ...] = ()
+        """Those of them that the version has."""
+        self._wanted = False
+        """Their pictures are not of the moment that is."""
+        self._hurried: set[CameraKey] = set()
+        self._left: list[tuple[CameraRequest, ...]] = []
+        """What of a round is not begun, kind by kind."""
+        self._begun: _Begun | None = None
+        self._expected: dict[tuple[CameraRequest, ...], float] = {}
+        """Seconds that pictures take."""
+        self._round_began = self._next_round = 0.0
+        self._nothing_else_to_do = False
+        """No step is due: a picture is waited for where it is not ready, since guessing when it will be takes longer."""
         self._placed = PlacedCameras()
         self._to_place: dict[CameraKey, PlaceCamera] = {}
         self._renderer_ready = False
@@ -249,14 +164,18 @@ class WorkerCameras:
         opened = self._held.opened
         if opened is None:
             return
-        known = {(camera.name, camera.kind) for camera in opened.description.cameras}
-        env, cameras = self._watched
-        wanted = [camera for camera in cameras if (camera.name, camera.kind) in known]
-        self._pictures.watch(min(env, opened.env.num_envs - 1), wanted)
+        known = {camera.key for camera in opened.description.cameras}
+        self._watch(tuple(camera for camera in self._watched[1] if camera.key in known))
+
+    def _watch(self, cameras: tuple[CameraRequest, ...]) -> None:
+        self._there, self._wanted = cameras, bool(cameras)
+        self._hurried.clear()
+        self._expected.clear()
+        self._next_round = 0.0  # somebody waits for these
 
     def scene_changed(self) -> None:
         """What was drawn is old."""
-        self._pictures.scene_changed(self._held.steps.number)
+        self._wanted = bool(self._there)
 
     def settle(self) -> None:
         """The scene is about to be drawn or built otherwise: what is under way ends, and cameras stand as asked."""
@@ -265,7 +184,10 @@ class WorkerCameras:
 
     def finish_picture(self) -> None:
         """The envs are about to be moved: what is under way ends."""
-        self._pictures.settle()
+        if self._begun is not None:
+            self._begun.pictures.finish()
+            self._begun, self._left = None, []
+            self._wanted = bool(self._there)
 
     def put_back(self) -> None:
         """The scene's cameras may be new ones: those that were placed stand there again."""
@@ -280,11 +202,17 @@ class WorkerCameras:
 
     def wait(self, now: float) -> float | None:
         """Seconds until `make` has something to do; None while nobody looks."""
-        return None if self._held.opened is None else self._pictures.wait(now)
+        if self._held.opened is None:
+            return None
+        if self._begun is not None:
+            return 0.0 if self._nothing_else_to_do else max(0.0, self._begun.ready_at - now)
+        if self._hurried:
+            return 0.0
+        return max(0.0, self._next_round - now) if self._wanted else None
 
     @property
     def placing_due(self) -> bool:
-        return bool(self._to_place) and self._pictures.idle
+        return bool(self._to_place) and self._begun is None
 
     def place_waiting(self) -> None:
         """Those that wait. No picture may be under way."""
@@ -295,29 +223,59 @@ class WorkerCameras:
 
     def make(self, nothing_else_to_do: bool) -> None:
         """Move the pictures on that somebody looks at."""
-        opened = self._held.opened
-        if opened is None or self._pictures.wait(time.monotonic()) is None:
+        self._nothing_else_to_do = nothing_else_to_do
+        opened, wait = self._held.opened, self.wait(time.monotonic())
+        if opened is None or wait is None or wait > 0:
             return
-        if not self._renderer_ready and self._pictures.idle:
+        if not self._renderer_ready and self._begun is None:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._on_first(False)
         self._held.pulse.begin("drawing")
-        self._pictures.nothing_else_to_do = nothing_else_to_do
         try:
-            made = self._pictures.poll(opened.env, time.monotonic())
+            made = None if self._begun is None else self._fetch(self._begun)
+            if made is None:
+                self._begin_round()
+            self._begin(opened.env)
         except RuntimeError as error:
-            self._pictures.watch(0, ())  # until others are asked for, or another version is loaded
+            self._watch(())  # until others are asked for, or another version is loaded
             self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
         if made is None:
             return
-        pictures, seconds = made
-        self._held.line.send(Pictures(pictures, 1000 * seconds, self._pictures.shown))
+        self._held.line.send(made)
         if not self._renderer_ready:
             self._renderer_ready = True
             self._on_first(True)
 
     # --- the inside ----------------------------------------------------------------------------------
+
+    def _begin_round(self) -> None:
+        chosen = tuple(camera for camera in self._there if camera.key in self._hurried) or self._there
+        self._wanted = self._wanted and bool(self._hurried)
+        self._hurried.clear()
+        groups = (tuple(camera for camera in chosen if camera.kind == kind) for kind in KINDS)
+        self._left, self._round_began = [group for group in groups if group], time.monotonic()
+
+    def _fetch(self, begun: _Begun) -> Pictures:
+        self._begun, asked_at = None, time.monotonic()
+        made = begun.pictures.finish()
+        done = time.monotonic()
+        # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
+        took, waited = done - begun.at, done - asked_at > 0.004
+        self._expected[begun.asked] = min(took, 1.0) if waited else 0.9 * self._expected.get(begun.asked, 0.0)
+        if not self._left:
+            pause = _PAUSE_SHARE * (done - self._round_began)
+            self._next_round = max(self._round_began + _PERIOD, done + pause)
+        return Pictures(made, 1000 * took, begun.number)
+
+    def _begin(self, env: TaskEnv) -> None:
+        """What is next of the round, if anything is left of it."""
+        if self._left:
+            asked = self._left.pop(0)
+            pictures = begin_pictures(env.env, min(self._watched[0], env.num_envs - 1), asked)
+            at = time.monotonic()
+            ready_at = at + self._expected.get(asked, 0.0)
+            self._begun = _Begun(pictures, asked, self._held.steps.number, at, ready_at)
 
     def _place(self, opened: OpenedTask, request: PlaceCamera) -> Placed:
         key, env = request.key, opened.env.env
@@ -334,7 +292,8 @@ class WorkerCameras:
         )
         self._held.opened = replace(opened, description=replace(opened.description, cameras=infos))
         self.scene_changed()
-        self._pictures.hurry(key)
+        # Somebody moves this camera: if it is watched, its picture comes first.
+        self._hurried |= {key} & {camera.key for camera in self._there}
         if reshaped and key[0] == "sensor" and opened.env.observes_pictures:
             self._held.guarded(_observe_again)
         info = next((info for info in infos if info.key == key), None)

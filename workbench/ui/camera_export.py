@@ -149,9 +149,7 @@ def matrices_html(camera: StudioCamera | None, convention: Convention, direction
     """Intrinsic and extrinsic of the camera as it is placed, in the env's frame."""
     if camera is None or camera.now is None:
         return render("note", text="Choose a camera first.")
-    pose = frames.pose_of(camera.now)
-    if camera.mount_pose is not None:
-        pose = frames.compose(camera.mount_pose, pose)
+    pose = frames.pose_in_env(camera.now, camera.mount_pose)
     return render(
         "camera_matrices",
         camera=camera,

@@ -20,11 +20,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import viser
 
-from workbench.core.camera_frames import axes_of, intrinsic_of, vertical_fov
+from workbench.core.camera_frames import axes_of, intrinsic_of, target_of, vertical_fov
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import (
@@ -52,9 +53,9 @@ SIGHT_COLOUR = (34, 139, 230)
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Taken:
-    """A camera as it was when a handle was taken."""
+    """A camera as it was when a handle was taken: until that is let go, all is one step of undo."""
 
     key: CameraKey
     settings: CameraSettings
@@ -63,7 +64,6 @@ class _Taken:
     """(7,) in the view."""
     target: Floats
     """(3,) in the view."""
-    gesture: int
 
 
 class CameraGizmo:
@@ -85,22 +85,11 @@ class CameraGizmo:
     ) -> None:
         self._placing = placing
         self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
-        scene = server.scene
         # A fixed size on the screen: in a grid of sixteen envs one of 10 cm would be a dot.
-        self._camera = scene.add_transform_controls(
-            "/studio/camera", PIXELS, fixed=True, depth_test=False, visible=False
-        )
-        self._eye = scene.add_transform_controls(
-            "/studio/eye", PIXELS, fixed=True, depth_test=False, disable_rotations=True, visible=False
-        )
-        self._target = scene.add_transform_controls(
-            "/studio/target",
-            TARGET_PIXELS,
-            fixed=True,
-            depth_test=False,
-            disable_rotations=True,
-            visible=False,
-        )
+        add = partial(server.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
+        self._camera = add("/studio/camera", PIXELS)
+        self._eye = add("/studio/eye", PIXELS, disable_rotations=True)
+        self._target = add("/studio/target", TARGET_PIXELS, disable_rotations=True)
         self._line = line_set(server, "/studio/line of sight", SIGHT_COLOUR, 2.0)
         self._held_at = -1e9
         self._start: _Taken | None = None
@@ -130,19 +119,19 @@ class CameraGizmo:
         self._draw_line(camera)
         if camera is None or camera.now is None:
             return
-        pose = self._placing.frame(camera).to_view(camera.now)
+        frame = self._placing.frame(camera)
+        pose = frame.to_view(camera.now)
         _move(self._camera, pose[:3], pose[3:] if self._own_axes() else UNTURNED)
-        target = self._placing.target_in_view(camera, camera.now)
         _move(self._eye, pose[:3], UNTURNED)
-        _move(self._target, target, UNTURNED)
+        _move(self._target, frame.point_to_view(target_of(camera.now)), UNTURNED)
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
         """From the eye to the target, which otherwise would be any three arrows in the air."""
         if camera is None or camera.now is None or not self._look_at():
             self._line.draw()
             return
-        eye = self._placing.frame(camera).to_view(camera.now)[:3]
-        self._line.draw(np.stack([eye, self._placing.target_in_view(camera, camera.now)])[None])
+        ends = camera.now.position, target_of(camera.now)
+        self._line.draw(np.stack([self._placing.frame(camera).point_to_view(end) for end in ends])[None])
 
     # --- what the hand does ----------------------------------------------------------------------------
 
@@ -152,8 +141,8 @@ class CameraGizmo:
             return False
         frame = self._placing.frame(camera)
         pose = frame.to_view(camera.now)
-        target = self._placing.target_in_view(camera, camera.now)
-        self._start = _Taken(camera.key, camera.now, frame, pose, target, self._placing.begin())
+        target = frame.point_to_view(target_of(camera.now))
+        self._start = _Taken(camera.key, camera.now, frame, pose, target)
         return True
 
     def _went_on(self, phase: str) -> _Taken | None:
@@ -164,7 +153,6 @@ class CameraGizmo:
         start = self._start
         if phase == "end":
             self._start = None
-            self._placing.begin()
         return start if phase == "update" else None
 
     async def _on_camera(self, event: viser.TransformControlsEvent) -> None:
@@ -179,7 +167,7 @@ class CameraGizmo:
             else:
                 moved = turned_in_world(pose, position, wxyz)
             moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
-            self._place(start, moved, float(np.linalg.norm(start.target - pose[:3])))
+            self._place(start, moved, start.target - pose[:3])
 
     async def _on_point(self, event: viser.TransformControlsEvent) -> None:
         """The eye or the target is moved."""
@@ -192,12 +180,11 @@ class CameraGizmo:
         there = snapped(*at, Snap(metres=self._snap().metres), False, start.frame.offset)[:3]
         eye, target = (there, target) if moves_eye else (pose[:3], there)
         with refusals_told(event.client, then=self._let_go):
-            self._place(start, looking_at(pose, eye, target), float(np.linalg.norm(target - eye)))
+            self._place(start, looking_at(pose, eye, target), target - eye)
 
-    def _place(self, start: _Taken, pose: Floats, distance: float) -> None:
-        moved = start.frame.from_view(start.settings, pose)
-        self._placing.set_distance(start.key, moved, distance)
-        self._placing.place(start.key, moved, "gizmo", start.gesture)
+    def _place(self, start: _Taken, pose: Floats, sight: Floats) -> None:
+        moved = start.frame.from_view(start.settings, pose, float(np.linalg.norm(sight)))
+        self._placing.place(start.key, moved, start, math.inf)
 
     def _let_go(self) -> None:
         """So that it is put back to where the camera is."""
@@ -298,23 +285,24 @@ class LookThrough:
         if shown == looking.shown:
             return
         looking.shown = shown
-        forward, left, up = axes_of(pose[3:])
+        _, left, up = axes_of(pose[3:])
         # The page's orbit turns about its up: about the camera's own, a drag would tilt a level horizon.
         level = abs(left[2]) < 1e-3 and up[2] > 0.05
         eye = client.camera
         aspect = eye.image_width / eye.image_height if eye.image_height and eye.image_width else USUAL_ASPECT
         fov = vertical_fov(intrinsic_of(now), now.height)
-        with client.atomic():
-            eye.up_direction = UPRIGHT if level else up
-            eye.position = pose[:3]
-            eye.look_at = pose[:3] + forward * self._placing.distance(camera)
-            eye.fov = min(fov_that_shows_all(fov, now.width / now.height, aspect), WIDEST)
+        target = self._placing.frame(camera).point_to_view(target_of(now))
+        fov = min(fov_that_shows_all(fov, now.width / now.height, aspect), WIDEST)
+        _stand(client, pose[:3], target, UPRIGHT if level else up, fov)
 
     def _back(self, client: viser.ClientHandle) -> None:
-        looking = self._looking.pop(client.client_id)
+        was = self._looking.pop(client.client_id)
+        up = was.up if np.linalg.norm(was.up) > 0.5 else UPRIGHT
+        _stand(client, was.position, was.look_at, up, was.fov)
+
+
+def _stand(client: viser.ClientHandle, position: Floats, look_at: Floats, up: Floats, fov: float) -> None:
+    """Let a page look from there."""
+    with client.atomic():
         eye = client.camera
-        with client.atomic():
-            eye.up_direction = looking.up if np.linalg.norm(looking.up) > 0.5 else UPRIGHT
-            eye.position = looking.position
-            eye.look_at = looking.look_at
-            eye.fov = looking.fov
+        eye.up_direction, eye.position, eye.look_at, eye.fov = up, position, look_at, fov

@@ -13,10 +13,7 @@ are said, and which calls are one movement, so that one undo takes back one move
 
 from __future__ import annotations
 
-import itertools
 import math
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +30,7 @@ from workbench.core.camera_frames import (
     make_pose,
     pose_from_look_at,
     pose_from_matrix,
-    pose_of,
+    pose_in_env,
     quaternion_of,
     relative_to,
     rotation_matrix,
@@ -46,8 +43,6 @@ from workbench.session.studio_view import StudioCamera
 
 Floats = NDArray[np.float64]
 
-NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
-"""Metres in front of the eye at which the target of a camera is put that has none yet."""
 SAME = 1e-7
 """Metres, and parts of a unit quaternion: what viser's numbers of 32 bit may differ by."""
 
@@ -71,17 +66,14 @@ class Frame:
 
     def to_view(self, settings: CameraSettings) -> Floats:
         """(7,) where the camera is in the view."""
-        pose = self.to_env(settings)
+        pose = pose_in_env(settings, self.mount)
         pose[:3] += self.offset
         return pose
 
-    def to_env(self, settings: CameraSettings) -> Floats:
-        """(7,) where the camera is in its env."""
-        pose = pose_of(settings)
-        return pose if self.mount is None else compose(self.mount, pose)
-
-    def from_view(self, settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
-        """The same camera, at this pose (7,) of the view."""
+    def from_view(
+        self, settings: CameraSettings, pose: ArrayLike, distance: float | None = None
+    ) -> CameraSettings:
+        """The same camera, at this pose (7,) of the view; looking as far as it did, or `distance` metres."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
         moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
@@ -90,7 +82,16 @@ class Frame:
             moved = replace(moved, position=settings.position)
         if np.allclose(moved.quaternion, settings.quaternion, rtol=0, atol=SAME):
             moved = replace(moved, quaternion=settings.quaternion)
-        return moved
+        return moved if distance is None else replace(moved, distance=max(distance, 1e-3))
+
+    def turned_to(self, settings: CameraSettings, target: ArrayLike) -> CameraSettings:
+        """The same camera, turned to a target (3,) that is said as its position is.
+
+        Raises:
+            ValueError: that is where it stands.
+        """
+        pose, there = self.to_view(settings), self.point_to_view(target)
+        return self.from_view(settings, looking_at(pose, pose[:3], there), math.dist(there, pose[:3]))
 
     def point_to_view(self, point: ArrayLike) -> Floats:
         """(3,) of a point (3,) that is said as the camera's position is."""
@@ -98,27 +99,6 @@ class Frame:
         if self.mount is not None:
             there = compose(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]
         return there + self.offset
-
-    def point_from_view(self, point: ArrayLike) -> Floats:
-        there = np.asarray(point, np.float64) - self.offset
-        if self.mount is None:
-            return there
-        return relative_to(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]
-
-
-def usual_distance(pose: ArrayLike) -> float:
-    """How far before a camera its target is put: where it looks at the height 0 of its env, if that is near."""
-    p = np.asarray(pose, np.float64)
-    forward = axes_of(p[3:])[0]
-    if abs(forward[2]) < 1e-6:
-        return USUAL
-    distance = -float(p[2] / forward[2])
-    return distance if NEAREST_TARGET <= distance <= FARTHEST_TARGET else USUAL
-
-
-def target_of(pose: ArrayLike, distance: float) -> Floats:
-    p = np.asarray(pose, np.float64)
-    return p[:3] + distance * axes_of(p[3:])[0]
 
 
 def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
@@ -225,8 +205,6 @@ def _in_steps(rotation: Floats, step: float) -> Floats:
 
 PAUSE = 1.2
 """Seconds. What one hand does after a shorter pause belongs to the same step of undo."""
-REMEMBERED = 2000
-"""Places of cameras, for which it is known how far they looked from there."""
 FARTHEST = 1000.0
 """Metres from the origin that a page may ask for."""
 
@@ -234,11 +212,6 @@ FARTHEST = 1000.0
 class Placing:
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._lock = threading.Lock()
-        self._gestures = itertools.count(1)
-        self._gesture, self._hand, self._moved_at = 0, "", -1e9
-        self._distances: dict[tuple[object, ...], float] = {}
-        self._distance: dict[CameraKey, float] = {}
         self.offset: NDArray[np.float32] = np.zeros(3, np.float32)
         """Where the selected env stands in the view."""
 
@@ -261,99 +234,21 @@ class Placing:
     def frame(self, camera: StudioCamera) -> Frame:
         return Frame(camera.mount_pose, self.offset)
 
-    def begin(self) -> int:
-        """A movement that is one step of undo however long it takes; and what comes after it is another."""
-        with self._lock:
-            self._hand = ""
-            return next(self._gestures)
-
-    def place(self, key: CameraKey, settings: CameraSettings, hand: str, gesture: int | None = None) -> None:
-        """Place it live.
-
-        Args:
-            hand: what moves it. The same hand goes on with its movement unless it paused.
-            gesture: of `begin`, for a hand that says when it begins and ends.
+    def place(self, key: CameraKey, settings: CameraSettings, hand: object, pause: float = PAUSE) -> None:
+        """Place it live; `hand` and `pause` as in `CameraStudio.place`.
 
         Raises:
             ValueError: it is too far away for any task.
         """
         if not all(abs(x) <= FARTHEST for x in settings.position):
             raise ValueError(f"A camera stands within {FARTHEST:g} m of the origin.")
-        with self._lock:
-            now = time.monotonic()
-            if hand != self._hand or now - self._moved_at > PAUSE:
-                self._gesture = next(self._gestures)
-            self._hand, self._moved_at = hand, now
-            gesture = self._gesture if gesture is None else gesture
-        self._session.studio.place(key, settings, gesture)
+        self._session.studio.place(key, settings, hand, pause)
 
-    def change(self, hand: str, change: Callable[[CameraSettings], CameraSettings]) -> None:
+    def change(self, hand: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
         """Place the chosen camera as `change` makes of it; `hand` as in `place`.
 
         Raises:
             ValueError: no camera can be placed, or not so.
         """
-        camera, now, _ = self.require()
-        changed = change(now)
-        if changed != now:
-            self.place(camera.key, changed, hand)
-
-    # --- the target: a camera has a direction; how far it looks is said by its look_at, or known to the page ----
-
-    def distance(self, camera: StudioCamera) -> float:
-        """Metres from the eye to the target: as it was set when the camera stood so, as the file gives it where the
-        camera stands as that has it, or as it was last."""
-        now = camera.now
-        if now is None:
-            return USUAL
-        set_here, said = self._distances.get(_stand(camera.key, now)), _said_distance(camera)
-        if set_here is None and said is not None:
-            # Not kept for this place: the file may give another target that is seen the same way.
-            with self._lock:
-                self._distance[camera.key] = said
-            return said
-        distance = self._distance.get(camera.key) if set_here is None else set_here
-        if distance is None:
-            distance = usual_distance(self.frame(camera).to_env(now))
-        self.set_distance(camera.key, now, distance)
-        return distance
-
-    def set_distance(self, key: CameraKey, settings: CameraSettings, distance: float) -> None:
-        """Remember how far it looks from there, so that an undo brings back the target too."""
-        distance = max(float(distance), 1e-3)
-        with self._lock:
-            self._distance[key] = distance
-            self._distances[_stand(key, settings)] = distance
-            if len(self._distances) > REMEMBERED:
-                del self._distances[next(iter(self._distances))]
-
-    def target_in_view(self, camera: StudioCamera, settings: CameraSettings) -> Floats:
-        """(3,)"""
-        return target_of(self.frame(camera).to_view(settings), self.distance(camera))
-
-    def target(self, camera: StudioCamera, settings: CameraSettings) -> Floats:
-        """(3,) in the frame that the camera's numbers are said in."""
-        return self.frame(camera).point_from_view(self.target_in_view(camera, settings))
-
-    def look(self, camera: StudioCamera, settings: CameraSettings, target: Floats, hand: str) -> None:
-        """Place it where these settings say, turned to a target (3,) in the view; `hand` as in `place`.
-
-        Raises:
-            ValueError: that is where it stands, or it is too far away for any task.
-        """
-        frame = self.frame(camera)
-        pose = frame.to_view(settings)
-        turned = frame.from_view(settings, looking_at(pose, pose[:3], target))
-        self.set_distance(camera.key, turned, float(np.linalg.norm(target - pose[:3])))
-        self.place(camera.key, turned, hand)
-
-
-def _said_distance(camera: StudioCamera) -> float | None:
-    """Metres to the target that the file gives; None where it gives none, or the camera was moved."""
-    if camera.moved or camera.now is None or camera.info.target is None:
-        return None
-    return float(np.linalg.norm(np.subtract(camera.info.target, camera.now.position)))
-
-
-def _stand(key: CameraKey, settings: CameraSettings) -> tuple[object, ...]:
-    return key, settings.position, settings.quaternion
+        camera, now, frame = self.require()
+        self.place(camera.key, change(now, frame), hand)

@@ -37,19 +37,13 @@ class CameraPick:
         Args:
             presses: of the tab or of a folder with a name around it (what has no name hides what comes after it).
         """
-        self._session = session
         self._drawn: object = None
         # After a picture that is put into the container later.
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
-        self._press = presses.place_id("picture", self._pick)
+        self._press = presses.place_id("picture", session.studio.judging.pick)
         self._cross = line_set(server, "/picked/cross", MARK_COLOUR, 3.0)
         self._label = view_label(server, "/picked/label", "bottom-left")
-
-    def _pick(self, u: float, v: float) -> None:
-        key = self._session.view().studio.selected
-        if key is not None:
-            self._session.studio.judging.pick(key, u, v)
 
     def draw(self, view: SessionView, shown: bool) -> None:
         """Draw what is new.

@@ -122,16 +122,13 @@ class CameraSuggest:
         return triple(np.minimum(*corners)), triple(np.maximum(*corners))
 
     def _ask(self, event: viser.GuiEvent) -> None:
-        key = self._session.view().studio.selected
-        if key is None:
-            return
         chosen = self._now_chosen()
         wanted = tuple(choice.name for choice in self._choices if choice.name in chosen)
         with refusals_told(event.client):
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             self._offers.asked(self._session.view().studio.looked.suggestions)
-            self._session.studio.judging.suggest(key, wanted, *self._bounds(), self._resets.value)
+            self._session.studio.judging.suggest(wanted, *self._bounds(), self._resets.value)
 
     # --- drawn ---------------------------------------------------------------------------------------
 

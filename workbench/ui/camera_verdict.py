@@ -77,21 +77,16 @@ class CameraVerdict:
     # --- asked ---------------------------------------------------------------------------------------
 
     def _ask(self) -> None:
-        key = self._session.view().studio.selected
-        if key is None:
-            return
         self._report.asked(self._session.view().studio.looked.report)
         over = self._over.value
         if over == STEPS:
-            self._session.studio.judging.judge_steps(key, self._steps.value)
+            self._session.studio.judging.judge_steps(self._steps.value)
         else:
-            self._session.studio.judging.judge(key, self._resets.value if over == FRESH else 0)
+            self._session.studio.judging.judge(self._resets.value if over == FRESH else 0)
 
     def _ask_for_sheet(self) -> None:
-        key = self._session.view().studio.selected
-        if key is not None:
-            self._pictures.asked(self._session.view().studio.looked.sheet)
-            self._session.studio.judging.make_sheet(key)
+        self._pictures.asked(self._session.view().studio.looked.sheet)
+        self._session.studio.judging.make_sheet()
 
     def _show_moment(self, position: int) -> None:
         moments = self._session.view().studio.looked.report_moments
@@ -188,7 +183,7 @@ class CameraVerdict:
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         looked, env = view.studio.looked, view.selected_env
         sheet = looked.sheet
-        mine = camera is not None and bool(sheet) and (sheet[0].kind, sheet[0].camera) == camera.key
+        mine = camera is not None and bool(sheet) and sheet[0].key == camera.key
         report = None if camera is None else looked.report_over_envs(camera.key)
         told = id(report), env
         self._pictures.draw(

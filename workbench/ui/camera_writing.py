@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_frames import axes_of, intrinsic_of, pose_of, vertical_fov
 from workbench.core.camera_settings import CameraKind, CameraSettings
-from workbench.core.pictures import Picture
 from workbench.session.session import Session
+from workbench.session.studio_file import MADE
 from workbench.session.studio_view import StudioView, Wish, Writing
 from workbench.session.view import SessionView
 from workbench.ui.camera_moves import Placing, rounded
@@ -33,7 +33,7 @@ from workbench.ui.viser_seam import element_id
 
 LEAVE, CLOSE = "Leave the file as it is", "Close"
 MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
-DONE = ("written", "checked", "mismatch")
+NOTHING = Writing()
 
 
 class CameraChange:
@@ -58,53 +58,46 @@ class CameraChange:
         self._undo.on_click(lambda _: session.studio.file.undo_write())
         self._copy.on_click(lambda _: session.studio.file.copy_task())
         self._drop.on_click(lambda _: session.studio.file.drop_plan())
+        self._drawn: tuple[Writing, bool, bool] | None = None
 
-    def draw(self, writing: Writing, stale: bool, about: str = "", picture: str = "") -> None:
+    def draw(self, writing: Writing, stale: bool) -> None:
         """Show how far it is; a `Writing` of no stage and no message empties the box.
 
         Args:
             stale: the camera was moved since the plan was made.
-            about: what else is to be said of the plan.
-            picture: address of what the camera would see that is to be added.
         """
         stage = writing.stage
         self._text.visible = stage != "none" or bool(writing.message)
         self._copy.visible = writing.can_copy
         self._write.visible = stage == "planned" and not stale
         self._drop.visible = stage not in ("none", "written")
-        self._undo.visible = stage in DONE
+        self._undo.visible = stage in MADE
         name = "" if writing.edit is None else writing.edit.names
         self._drop.label = LEAVE if stage == "planned" else CLOSE
         self._write.label = f"Write it to {name}" if name else "Write it"
         new = self.arrival.just_came(writing if stage != "none" else None)
-        self._text.content = writing_html(
-            writing,
-            stale,
-            about if stage == "planned" else "",
-            element_id(self._drop) if new else "",
-            picture if stage == "planned" else "",
-        )
+        if self._drawn is None or self._drawn[0] is not writing or self._drawn[1:] != (stale, new):
+            self._drawn = writing, stale, new
+            self._text.content = writing_html(writing, stale, element_id(self._drop) if new else "")
 
 
-def writing_html(
-    writing: Writing, stale: bool, about: str = "", scroll_to: str = "", picture: str = ""
-) -> str:
+def writing_html(writing: Writing, stale: bool, scroll_to: str = "") -> str:
     """How far the change is; every value escaped.
 
     Args:
         scroll_to: id of the element that is to come into sight.
-        picture: address of one.
     """
-    edit = writing.edit
+    edit, planned = writing.edit, writing.stage == "planned"
+    seen = writing.picture.rgb if planned and writing.picture is not None else None
     files = [] if edit is None or writing.stage == "undone" else edit.changes
     return render(
         "camera_writing",
         message="The camera was moved since: show the change again." if stale else writing.message,
         mood="warn" if stale else MOODS.get(writing.stage, "plain"),
-        about=about,
-        picture=picture,
+        about=writing.wish.about if planned and writing.wish is not None else "",
+        picture="" if seen is None else data_address(seen, PREVIEW),
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
-        folded=writing.stage in DONE,
+        folded=writing.stage in MADE,
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
         snippet=writing.snippet,
         scroll_to=scroll_to,
@@ -167,14 +160,8 @@ class CameraWriting:
     ) -> None:
         self._session, self._placing, self._from_viewer = session, placing, from_viewer
         gui = server.gui
-        self._about = ""
-        """What is said of the plan beside."""
-        self._before: Writing | None = None
-        """What there was when something was asked for, which is not to be shown as its answer."""
         self._named: Writing | None = None
         """The last change after which the field for a name was emptied."""
-        self._sight: tuple[Picture, str] | None = None
-        """The last picture of a camera to be added, and its address."""
         with above:
             # Always there: one that came with the first movement would push what is under it out of the hand.
             self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
@@ -202,14 +189,12 @@ class CameraWriting:
         if camera is not None:
             self._ask(Wish("edit", camera.key))
 
-    def _ask(self, wish: Wish, about: str = "") -> None:
+    def _ask(self, wish: Wish) -> None:
         """Note what is asked for and where, and then ask: the answer may come at once."""
-        self._about = about
-        self._before = self._session.view().studio.writing
         self._say("")
         change = self._change if wish.what == "edit" else self._member_change
-        change.arrival.asked(self._before)
-        self._session.studio.plan(wish)
+        change.arrival.asked(self._session.view().studio.writing)
+        self._session.studio.file.plan(wish)
 
     def _on_member(self, event: viser.GuiEvent) -> None:
         try:
@@ -232,7 +217,8 @@ class CameraWriting:
             names, places = objects_in(view)
             if kind == "sensor":
                 settings, words = first_place(settings, names, places)
-            self._ask(Wish("add", key, settings, target=aimed_at(settings, places)), words)
+            settings = replace(settings, distance=distance_to(settings, places))
+            self._ask(Wish("add", key, settings, about=words))
         elif chosen is None:
             raise ValueError("Choose the camera first.")
         elif what == REMOVE:
@@ -263,8 +249,6 @@ class CameraWriting:
         chosen, writing = studio.chosen, studio.writing
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
-        if writing is not self._before:
-            self._before = None
         of_members = writing.what != "edit"
         # Not at the place of the button that writes: a second press must not write what was not read.
         can_plan = can_place and (writing.stage != "planned" or stale or of_members)
@@ -272,21 +256,11 @@ class CameraWriting:
         self._plan.visible = can_plan
         self._plan.disabled = not wants_plan
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
-            shown = here and self._before is None
-            change.draw(writing if shown else Writing(), stale and shown, self._about, self._address(studio))
+            change.draw(writing if here else NOTHING, stale and here)
         if writing.stage == "checked" and of_members and writing is not self._named:
             self._named = writing
             self._name.value = ""  # it is taken now
         self._with_chosen.visible = chosen is not None
-
-    def _address(self, studio: StudioView) -> str:
-        """Of the picture of the camera that is to be added; empty while there is none."""
-        picture = studio.first_sight
-        if picture is None or picture.rgb is None:
-            return ""
-        if self._sight is None or self._sight[0] is not picture:
-            self._sight = picture, data_address(picture.rgb, PREVIEW)
-        return self._sight[1]
 
 
 def is_stale(studio: StudioView) -> bool:
@@ -361,17 +335,13 @@ def first_place(
     return replace(seen_from, position=(x, y, z)), words
 
 
-def aimed_at(settings: CameraSettings, places: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """The point ahead of a camera that is nearest to the middle of some places (K, 3); None if that is behind it."""
+def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
+    """Metres along the line of sight to where the middle of some places (K, 3) is nearest; None if that is behind."""
     if not len(places):
         return None
     pose = pose_of(settings)
-    forward = axes_of(pose[3:])[0]
-    distance = float((np.median(places, axis=0) - pose[:3]) @ forward)
-    if distance < NEAREST_TARGET:
-        return None
-    x, y, z = (pose[:3] + distance * forward).tolist()
-    return x, y, z
+    distance = float((np.median(places, axis=0) - pose[:3]) @ axes_of(pose[3:])[0])
+    return None if distance < NEAREST_TARGET else distance
 
 
 def objects_in(view: SessionView) -> tuple[tuple[str, ...], NDArray[np.float64]]:

@@ -285,8 +285,7 @@ class StudioPicture:
         picture = None if key is None else view.pictures.get(key)
         if quick:
             picture = studio.quick
-            if studio.wants_quick:
-                self._session.studio.look()
+            self._session.studio.look()
         # The last one stays while the next is drawn; that of another camera does not.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)

@@ -23,6 +23,7 @@ import viser
 from numpy.typing import NDArray
 from viser._messages import HotkeyKey  # the type of add_command's argument (viser 1.1.1)
 
+from workbench.core.camera_frames import target_of
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
@@ -32,7 +33,7 @@ from workbench.ui.camera_export import CameraExport
 from workbench.ui.camera_frustums import Placed
 from workbench.ui.camera_gizmo import CameraGizmo, LookThrough
 from workbench.ui.camera_moves import Floats, Frame, Placing, Snap, nudged, panned
-from workbench.ui.camera_numbers import CameraLens, CameraNumbers
+from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_suggest import CameraSuggest
 from workbench.ui.camera_verdict import CameraVerdict
@@ -100,7 +101,6 @@ class StudioPanel(PagePart[SessionView]):
         above = gui.add_folder(None)
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
-        self._lens = CameraLens(server, self._placing)
         self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer, above)
         verdict, compare = CameraVerdict(server, session), CameraCompare(server, session)
         self._suggest = CameraSuggest(server, session)
@@ -174,7 +174,6 @@ class StudioPanel(PagePart[SessionView]):
         self._tools.visible = camera is not None
         self._handles.visible = camera is not None
         self._numbers.draw(camera)
-        self._lens.draw(camera)
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
         for part in self._folders:
@@ -329,9 +328,7 @@ class StudioPanel(PagePart[SessionView]):
         if client is None:
             return
         with refusals_told(client):
-            camera, now, frame = self._placing.require()
-            self._placing.begin()
-            self._placing.place(camera.key, self._look.settings_from(client, now, frame), "viewer")
+            self._placing.change(None, partial(self._look.settings_from, client))
 
     def _new_from_viewer(self, client: viser.ClientHandle, settings: CameraSettings) -> CameraSettings:
         return self._look.settings_from(client, settings, Frame(None, self._placing.offset))
@@ -362,14 +359,13 @@ class StudioPanel(PagePart[SessionView]):
         return Command(f"Turn the chosen camera {name}", turn, key, "alt+shift")
 
     def _by_key(self, move: Callable[[Floats], Floats], hand: str) -> None:
-        camera = self._placing.camera
-        if camera is not None and camera.now is not None:
-            frame = self._placing.frame(camera)
-            moved = frame.from_view(camera.now, move(frame.to_view(camera.now)))
-            if self._look_at and moved.position != camera.now.position:
-                self._placing.look(camera, moved, self._placing.target_in_view(camera, camera.now), hand)
-            else:
-                self._placing.place(camera.key, moved, hand)
+        def change(now: CameraSettings, frame: Frame) -> CameraSettings:
+            moved = frame.from_view(now, move(frame.to_view(now)))
+            keeps_target = self._look_at and moved.position != now.position
+            return frame.turned_to(moved, target_of(now)) if keeps_target else moved
+
+        if self._placing.camera is not None:
+            self._placing.change(hand, change)
 
 
 def _placed(camera: StudioCamera) -> CameraSettings:

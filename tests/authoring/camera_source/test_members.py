@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from dataclasses import replace
 
 import pytest
 
@@ -194,17 +196,10 @@ BESIDE_LOOK_AT = """\
 
 
 def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_does() -> None:
-    wanted = with_pose(NEW, pose_from_look_at(LookAt((0.51234, 0.3, 0.6), (0.08, 0.0, 0.02))))
-    plan = planned(
-        plan_add,
-        {FILE: hook(BESIDE_LOOK_AT)},
-        FILE,
-        "Task",
-        ("sensor", "side"),
-        wanted,
-        run_as("Task"),
-        (0.08, 0.0, 0.02),
-    )
+    seen = LookAt((0.51234, 0.3, 0.6), (0.08, 0.0, 0.02))
+    wanted = replace(with_pose(NEW, pose_from_look_at(seen)), distance=math.dist(seen.eye, seen.target))
+    key = ("sensor", "side")
+    plan = planned(plan_add, {FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", key, wanted, run_as("Task"))
     assert isinstance(plan, SourceEdit)
     assert (
         """\

@@ -40,12 +40,10 @@ def plan_add(
     key: CameraKey,
     settings: CameraSettings,
     run: Run,
-    target: tuple[float, float, float] | None = None,
 ) -> SourceEdit:
     """A new camera that stands still, in the hook of `class_name`, which is made if the class has none.
 
-    Its pose is written as its siblings' is, where that can say it; `target` is the point that it looks at then. It and
-    the others raise Refused.
+    Its pose is written as its siblings' is, where that can say it. It and the others raise Refused.
     """
     check_camera(settings)
     kind, uid = key
@@ -55,7 +53,7 @@ def plan_add(
         _check_new(edit.ran, key)
         cls, hook = class_named(source, class_name), HOOK_OF[kind]
         name = _siblings_look_at(edit, source, kind)
-        pose = name and look_at_text(name, settings, target) or ""
+        pose = name and look_at_text(name, settings) or ""
         edit.importing(source, imports_of(settings, pose))
 
         def text(indent: str) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from numpy.typing import ArrayLike
 from transforms3d.euler import euler2quat
@@ -19,7 +20,7 @@ from workbench.authoring.source.changes import Changes, settled
 from workbench.authoring.source.numbers import list_text, look_at, quaternion_texts, same_side, to_euler
 from workbench.authoring.source.text import Replacement, SourceFile
 from workbench.authoring.source.trace import Part
-from workbench.core.camera_frames import angle_between, rotation_matrix
+from workbench.core.camera_frames import angle_between, rotation_matrix, target_of
 from workbench.core.camera_settings import CameraSettings
 
 POSITION_STEP = 1e-4
@@ -33,8 +34,6 @@ _STILL_AT_TARGET = 3e-5
 _LEAST_DISTANCE = 0.1
 _METRES = (4, 5, 6)
 """Decimals: 0.1 mm, and more where what is looked at is so close that 0.1 mm would turn the camera."""
-
-Triple = tuple[float, float, float]
 
 
 def why_not_a_pose(changes: Changes, pose: Part) -> str | None:
@@ -153,17 +152,13 @@ def _look_at(changes: Changes, pose: Part, after: CameraSettings) -> bool:
     return False
 
 
-def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str | None:
-    """A new camera's pose as a call of `name`, which is a look_at; None if that cannot say it.
-
-    Args:
-        aim: the point that it looks at; else it is one a metre ahead.
-    """
+def look_at_text(name: str, settings: CameraSettings) -> str | None:
+    """A new camera's pose as a call of `name`, which is a look_at; None if that cannot say it."""
     forward = rotation_matrix(settings.quaternion)[:, 0]
-    ahead = [float(x) for x in settings.position + forward]
     if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
         return None
-    for target in (ahead,) if aim is None else (aim, ahead):
+    for aimed in (settings, replace(settings, distance=None)):
+        target = target_of(aimed).tolist()
         for decimals in _METRES:
             eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
             if _turned(look_at(eye, point), settings) <= ANGLE_STEP:
