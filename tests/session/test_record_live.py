@@ -124,6 +124,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
 def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(session: Session) -> None:
     """A keep to a camera that is judged over seeds; that, and a search, to a keep."""
     judging = session.studio.judging
+    session.studio.select(BASE)
 
     def keep(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
         session.keep_past((0,))
@@ -138,7 +139,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
         return progress is not None and progress.what == "drawing it again" and progress.done > 0
 
     def judge() -> None:
-        judging.judge(BASE, 60)
+        judging.judge(60)
 
     def judged() -> tuple[tuple[int, ...], ObjectSummary]:
         view = wait_until(session, lambda view: view.studio.progress is None, "the judgement")
@@ -147,7 +148,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
         return report.envs, report.wanted_objects(("cube",))[0].summary()
 
     def search() -> None:
-        judging.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+        judging.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
 
     def found() -> list[tuple[float, CameraSettings]]:
         view = wait_until(session, lambda view: view.studio.progress is None, "the search")
