@@ -53,7 +53,7 @@ PROTECTED = {
     "authoring/modules": "authoring/test_load.py authoring/test_task_content.py authoring/test_library_names.py"
     " authoring/test_named_modules.py",
     "authoring/source/text": "authoring/camera_source/test_which_camera.py authoring/camera_source/test_members.py"
-    " authoring/camera_source/test_shapes.py",
+    " authoring/camera_source/test_shapes.py authoring/source/test_text.py",
     "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
     " authoring/camera_source/test_which_camera.py",
     "authoring/source/changes": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"

@@ -193,6 +193,26 @@ def test_a_write_that_a_reset_of_other_envs_would_apply_is_told() -> None:
     env.close()
 
 
+def test_what_only_warns_of_such_a_write_lets_the_reset_apply_it() -> None:
+    env = build(PICK_CUBE, rules="warn")
+    height = env.cube.pose.p[:, 2].clone()
+    set_pose(env)
+    with pytest.warns(RuleWarning, match="'cube' in envs 0, 2 was set outside _initialize_episode"):
+        env.reset(options={"env_idx": torch.tensor([1])})
+    torch.testing.assert_close(env.cube.pose.p[:, 2] - height, torch.tensor([0.1, 0.0, 0.1]))
+    env.close()
+
+
+def test_an_env_whose_reset_was_refused_for_such_a_write_is_as_before_the_write() -> None:
+    env = build(PICK_CUBE)
+    height = env.cube.pose.p[:, 2].clone()
+    set_pose(env)
+    with pytest.raises(BrokenRule, match="was set outside _initialize_episode"):
+        env.reset(options={"env_idx": torch.tensor([1])})
+    assert torch.equal(env.cube.pose.p[:, 2], height)
+    env.close()
+
+
 def test_the_same_writes_applied_are_no_fault() -> None:
     def apply(self: Any) -> None:
         for write in (set_pose, set_velocity, set_qpos, set_targets, set_target_of_a_joint, write_the_tensor):
@@ -437,6 +457,25 @@ def test_a_neighbour_written_through_the_tensor_is_told() -> None:
     )
     assert "# the fault" in told_at(caught)
     run(pick_cube(_initialize_episode=lift)).close()
+
+
+def test_a_neighbours_velocity_is_told_too_and_that_of_its_links_may_be_read() -> None:
+    def push_all(self: Any, env_idx: torch.Tensor, options: dict) -> None:
+        body = self.cube._body_data_index
+        self.scene.px.cuda_rigid_body_data.torch()[body, 7] += 0.1  # the fault
+
+    def read(self: Any, env_idx: torch.Tensor, options: dict) -> None:
+        if len(env_idx) < N:
+            self.scene._gpu_apply_all()
+            self.scene.px.gpu_update_articulation_kinematics()
+            self.scene._gpu_fetch_all()
+            assert self.agent.tcp.linear_velocity[[0, 2]].any()
+
+    caught = breaks(
+        pick_cube(_initialize_episode=push_all), "changed the state of 'cube' in envs 0, 2, which are not"
+    )
+    assert "# the fault" in told_at(caught)
+    keeps(pick_cube(_initialize_episode=read))
 
 
 def test_a_neighbour_written_with_another_mask_is_told() -> None:
