@@ -173,6 +173,11 @@ def put_right_and_spoiled_again(self: Any, env_idx: torch.Tensor) -> None:
     self.target = torch.rand(self.num_envs)  # the fault
 
 
+def of_another_shape(self: Any, env_idx: torch.Tensor) -> None:
+    self.calls = getattr(self, "calls", 0) + 1
+    self.target = torch.zeros((self.num_envs, self.calls))  # the fault
+
+
 WAYS = [
     (whole_tensor, "self.target is"),
     (in_place, "self.target is"),
@@ -192,6 +197,7 @@ WAYS = [
     (of_a_pose, "self.target_pose is"),
     (in_a_plain_list, "self.stages is"),
     (put_right_and_spoiled_again, "self.target is"),
+    (of_another_shape, "self.target is"),
 ]
 
 
@@ -261,6 +267,8 @@ def makes_the_same_anew(self: Any, env_idx: torch.Tensor) -> None:
     self.distance = (self.cube.pose.p - self.goal_site.pose.p).norm(dim=1) * 0 + 1
     self.unknown = torch.full((self.num_envs,), torch.nan)
     self.names = np.array(["a"] * self.num_envs)
+    self.finished = np.full(self.num_envs, np.datetime64("NaT"))
+    self.stages = [float("0.5"), float("nan"), "a"]
 
 
 def puts_it_right(self: Any, env_idx: torch.Tensor) -> None:
@@ -274,6 +282,8 @@ def puts_it_right(self: Any, env_idx: torch.Tensor) -> None:
 def counts_for_the_batch(self: Any, env_idx: torch.Tensor) -> None:
     self.resets = getattr(self, "resets", 0) + 1
     self.last_drawn = torch.rand(7)
+    # With a row for each env at first, and for none of them from then on.
+    self.queue = torch.rand(self.num_envs if self.resets < 3 else 7)
 
 
 @pytest.mark.parametrize("reset", [writes_its_rows, makes_the_same_anew, puts_it_right, counts_for_the_batch])

@@ -135,6 +135,25 @@ def test_of_a_step_only_what_moved_is_sent(task: TaskEnv) -> None:
     assert len(packed.body) < 0.2 * len(pickle.dumps(snapshot))
 
 
+def test_what_a_task_keeps_and_does_not_write_is_sent_once(task: TaskEnv) -> None:
+    task.reset(seed=0)
+    task.env.table = torch.arange(N * 1000, dtype=torch.float32).reshape(N, 1000)
+    packer = SnapshotPacker()
+    first = packer.pack(task.snapshot())
+    again = packer.pack(task.snapshot())
+    third = packer.pack(task.snapshot())
+    del task.env.table
+    assert len(first.body) + sum(map(len, first.new_parts.values())) > 16_000
+    assert third.keys is None and third.new_parts == {} and again.keys is not None
+    assert len(third.body) < len(first.body) - 15_000
+
+
+def test_two_packers_give_no_number_twice(task: TaskEnv) -> None:
+    snapshot = task.snapshot()
+    one, other = (SnapshotPacker().pack(snapshot) for _ in range(2))
+    assert not one.new_parts.keys() & other.new_parts.keys()
+
+
 def test_a_reset_of_one_env_sends_that_envs_generators(task: TaskEnv) -> None:
     packer = SnapshotPacker()
     task.reset(seed=0)
@@ -149,6 +168,13 @@ def test_some_envs_can_be_packed_alone(task: TaskEnv) -> None:
     snapshot = task.snapshot([3, 1])
     packed = SnapshotPacker().pack(snapshot)
     assert same(unpack_snapshot(packed.body, Receiver().take(packed)), snapshot)
+
+
+def test_fewer_envs_and_more_again_come_back_as_they_were(task: TaskEnv) -> None:
+    packer, receiver = SnapshotPacker(), Receiver()
+    for chosen in ([0], [0, 1], [0, 1, 2, 3], [0, 1]):
+        snapshot = task.snapshot(chosen)
+        assert same(unpack_snapshot((packed := packer.pack(snapshot)).body, receiver.take(packed)), snapshot)
 
 
 def test_whole_bytes_unpickle_as_a_snapshot(task: TaskEnv) -> None:

@@ -420,6 +420,28 @@ def test_a_batch_of_another_size_than_is_reset_is_told_with_both(rules: Any, wri
     env.close()
 
 
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda env: env.agent.robot.set_qpos(torch.rand((2, 5))),
+        lambda env: env.agent.robot.set_qpos(torch.rand(5)),
+        lambda env: env.cube.set_linear_velocity(torch.rand((1, 4))),
+    ],
+)
+def test_what_is_wrong_with_a_value_but_its_batch_is_said_by_torch(write: Hook) -> None:
+    """And not blamed on the batch, which is right, or one for all."""
+
+    def initialize(self: Any, env_idx: torch.Tensor, options: dict) -> None:
+        if len(env_idx) < N:
+            write(self)
+
+    env = build(pick_cube(_initialize_episode=initialize), "off")
+    with pytest.raises(RuntimeError, match="shape|size|expand") as caught:
+        env.reset(options={"env_idx": torch.tensor([0, 2])})
+    assert not isinstance(caught.value, ValueError) and "batch of" not in str(caught.value)
+    env.close()
+
+
 @pytest.mark.parametrize("rules", ["stop", "off"])
 def test_a_static_actor_cannot_be_moved(rules: Any) -> None:
     def load(self: Any, options: dict) -> None:

@@ -248,6 +248,37 @@ def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: A
     edited.close()
 
 
+def test_the_shape_that_a_buffer_had_is_told(env: Any) -> None:
+    env.write(1.0)
+    snapshot, phases, best = take_snapshot(env), env.phases["steps"], env.best_distance
+    phases["count"], env.best_distance = torch.zeros(N, 3), torch.zeros(N, 1)
+    report = restore_snapshot(env, snapshot, [0])
+    phases["count"], env.best_distance = torch.zeros(N, 2), best
+    assert report.not_carried["phases['steps']['count']"] == "it had shape (N, 2) and is another thing now"
+    assert report.not_carried["best_distance"] == "it had shape (N) and is another thing now"
+
+
+class Lazy(PUSH_CUBE):
+    """What is not written yet is the class's."""
+
+    best: Any = None
+    count: Any = 0
+
+
+def test_what_is_not_set_yet_but_by_its_class_is_set_when_all_envs_go_back() -> None:
+    env: Any = batched(Lazy, N)
+    env.reset(seed=[0, 1, 2, 3])
+    env.best, env.count = torch.arange(float(N)), 3
+    snapshot = take_snapshot(env)
+    del env.best, env.count
+    report = restore_snapshot(env, snapshot, [1, 2])
+    assert env.best is None and env.count == 0
+    assert report.not_carried["best"] == report.not_carried["count"] == "the task has none of this name now"
+    report = restore_snapshot(env, snapshot)
+    assert env.best.tolist() == [0, 1, 2, 3] and env.count == 3 and {"best", "count"} <= set(report.carried)
+    env.close()
+
+
 def test_base_envs_own_members_are_known() -> None:
     assert {"_elapsed_steps", "_last_obs", "scene", "_batched_episode_rng", "num_envs"} <= base_env_members()
     assert "agent" not in base_env_members()

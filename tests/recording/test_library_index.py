@@ -79,3 +79,28 @@ def test_an_index_that_was_closed_holds_nothing_and_takes_nothing(folder: Path) 
     index = LibraryIndex(folder)
     assert index.load().keys() == {"a"}
     index.close()
+
+
+def test_what_a_file_that_was_taken_away_left_beside_it_goes_with_it(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a")
+    path = index_path(folder)
+    path.unlink()
+    journal = path.with_name(f"{path.name}-journal")
+    journal.write_bytes(b"")
+    keep(index, "b")
+    assert path.exists() and not journal.exists()
+    keep(index, "c")
+    assert index.load().keys() == {"c"}
+    index.close()
+
+
+def test_where_no_index_can_lie_it_is_in_memory(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("no folder")
+    index = LibraryIndex(folder)
+    keep(index, "a")
+    assert index.load().keys() == {"a"} and index.thumbnails([("a", 0)]) == {("a", 0): b"a"}
+    index.close()
+    index = LibraryIndex(folder)
+    assert index.load() == {}
+    index.close()

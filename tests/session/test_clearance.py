@@ -301,6 +301,14 @@ def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str
         assert len(asked(as_recorded(recording))) == 1
 
 
+def test_one_of_an_episode_without_a_seed_keeps_it(tmp_path: Path) -> None:
+    recording = write(tmp_path, made(2, seed=-1), pictures=False)
+    assert json.loads(recording.read_bytes())["workbench"]["seed"] is None
+    assert made_here(info_of(recording)) is not MadeHere.NO
+    edit(recording, seed=0)
+    assert made_here(info_of(recording)) is MadeHere.NO
+
+
 @pytest.mark.parametrize("value", [{"content": "0" * 64, "place": 3}, {}, [1]])
 def test_what_is_no_seal_is_a_broken_recording(recording: Path, value: object) -> None:
     edit(recording, made_here=value)
@@ -441,7 +449,10 @@ def test_without_a_folder_to_keep_it_in_it_is_asked_every_run_and_recording_goes
     told = [record.message for record in caplog.records]
     assert len([message for message in told if "cannot be kept" in message]) == 1
     again = write(foreign.parents[1] / "recordings", made(2), pictures=False)
+    write(foreign.parents[1] / "recordings", made(3), pictures=False)
     assert made_here(info_of(again)) is MadeHere.NO
+    told = [record.message for record in caplog.records]
+    assert len([message for message in told if "not known as recorded here" in message]) == 1
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without a home")
