@@ -104,7 +104,15 @@ PROTECTED = {
     "session/verdict": "session/test_verdict.py",
     "session/judgement": "session/test_judgement.py session/test_judge.py",
     "session/kept_worker": "session/test_kept_worker.py",
+    "session/versions": "session/test_recovery.py session/test_versions.py",
+    "session/given_actions": "session/test_given_actions.py",
+    "session/record_live": "session/test_recorder_thread.py",
+    "session/studio_cameras": "session/test_placements.py",
     "ui/gate": "ui/test_gate.py",
+    "ui/camera_moves": "ui/test_camera_moves.py ui/test_camera_numbers.py",
+    "ui/camera_numbers": "ui/test_camera_numbers.py",
+    "ui/review_timeline": "ui/test_review_page.py -k 'strip or timeline or opened'",
+    "ui/library_list": "ui/test_library_panel.py",
     "ui/door": "ui/test_door.py ui/test_socket_and_renewal.py ui/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"
     " ui/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
     " ui/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"

@@ -115,6 +115,14 @@ class SmallWorker:
         threading.Thread(target=time.sleep, args=(float(seconds),), daemon=False).start()
         ctypes.CDLL(None).pthread_exit(None)
 
+    def ends_soon_without_a_main_thread(self, seconds: str) -> None:
+        def end() -> None:
+            time.sleep(float(seconds))
+            os._exit(7)
+
+        threading.Thread(target=end).start()
+        ctypes.CDLL(None).pthread_exit(None)
+
     def _pass_time(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:

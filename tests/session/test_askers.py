@@ -188,14 +188,17 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
 
 @pytest.mark.parametrize("aside", [True, False])
 def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_afterwards(
-    background: Background, tmp_path: Path, aside: bool
+    background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("workbench.session.askers._PATIENCE", 30.0)  # also of a machine that is busy
     load = Load(str(write_task(tmp_path)), TaskOptions(1, env_kwargs={"render_backend": "none"}))
     done, under_way, seen = list[str](), threading.Event(), threading.Event()
+    pids = set[int | None]()
 
     def side_work(job: Job) -> None:
         done.append("begins")
         background.ensure(job, load)
+        pids.add(background.pid)
         while not seen.is_set():
             background.ask(job.check, Reset((0,), 1))
             under_way.set()
@@ -205,6 +208,7 @@ def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_a
         with background.turn(job):
             background.ensure(job, load)
             background.ask(job.check, Reset((0,), 2))
+            pids.add(background.pid)
             done.append("answered")
             seen.set()
 
@@ -220,6 +224,7 @@ def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_a
         threads.submit(somebody_waits, waiting).result(timeout=90)
         side.result(timeout=90)
     assert done == ["begins", "answered", "begins", "ends"]
+    assert len(pids) == 1, "what was left gave its answer in time, and its process goes on"
     assert told[-1] == "waiting for other work in the background"
 
 

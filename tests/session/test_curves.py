@@ -84,6 +84,12 @@ def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
     assert recent.curves().no_curve == ()
 
 
+def test_a_success_of_several_numbers_counts_by_its_first() -> None:
+    recent = RecentSteps(N)
+    recent.add(replace(step(1), evaluate={"success": np.array([[0, 1], [1, 0], [1, 1]], np.float32)}))
+    assert recent.curves().success.tolist() == [[0, 1, 1]]
+
+
 def test_a_term_that_a_new_version_drops_goes_when_its_last_value_goes() -> None:
     recent = RecentSteps(N)
     recent.add(step(1, reach=[1, 1, 1]))

@@ -6,9 +6,11 @@ import io
 import os
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
+from tests.drive.episodes import made, write
 from workbench.session.given_actions import read_given
 
 
@@ -28,6 +30,47 @@ def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: str) -> None:
         one.tolist(),
         (2 * one).tolist(),
     ]
+
+
+def test_an_episode_of_each_array_begins_where_the_env_likes(tmp_path: Path) -> None:
+    three = np.arange(24.0).reshape(2, 4, 3)
+    np.save(tmp_path / "a.npy", three)
+    runs, asked = read_given(tmp_path / "a.npy")
+    assert [run.name for run in runs] == ["file a.npy, its array 0", "file a.npy, its array 1"]
+    assert [run.action.tolist() for run in runs] == three.tolist() and asked == {}
+    assert [(run.seed, dict(run.env_states)) for run in runs] == 2 * [(-1, {})]
+
+
+@pytest.mark.parametrize("array", [np.zeros(3), np.zeros((0, 3)), np.zeros((2, 3), complex)])
+def test_what_are_no_actions_is_refused_by_its_shape_and_kind(tmp_path: Path, array: np.ndarray) -> None:
+    np.savez(tmp_path / "a.npz", np.zeros((2, 3)), array)
+    with pytest.raises(ValueError, match=r"actions are numbers of shape \(steps, dimensions\)"):
+        read_given(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_no_robot_can_do_is_refused(tmp_path: Path, value: float) -> None:
+    np.save(tmp_path / "a.npy", np.array([[0.0, value]]))
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        read_given(tmp_path / "a.npy")
+
+
+def test_an_archive_without_an_array_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="holds no array"):
+        read_given(tmp_path / "a.npz")
+
+
+def test_a_recording_is_done_again_from_its_seed_and_one_without_actions_is_refused(
+    child_process: None, tmp_path: Path
+) -> None:
+    h5py.File(tmp_path / "empty.h5", "w").close()
+    with pytest.raises(ValueError, match="holds no trajectory with actions"):
+        read_given(tmp_path / "empty.h5")
+    recording = write(tmp_path, made(4, seed=8), pictures=False)
+    ((run,), asked) = read_given(recording.with_suffix(".h5"))
+    assert run.seed == 8 and run.action.tolist() == [[0.5, 0.5]] * 4
+    assert asked == {"control_mode": "pd_joint_delta_pos"}
 
 
 @pytest.mark.parametrize(

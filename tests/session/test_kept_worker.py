@@ -15,9 +15,10 @@ from typing import Any
 
 import pytest
 
+from tests.drive.waiting import until
 from workbench.jobs.wire import Call
 from workbench.session import kept_worker, process
-from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
+from workbench.session.kept_worker import Death, KeptWorker, SpareWorker, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.messages import (
     Event,
@@ -386,6 +387,15 @@ def test_a_worker_without_its_main_thread_is_ended() -> None:
         assert death.why.startswith("was ended because its main thread had ended")
 
 
+def test_one_that_is_about_to_end_without_its_main_thread_is_left_to_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kept_worker, "_HEADLESS", 60.0)
+    with minded() as one:
+        one.worker.send(do("ends_soon_without_a_main_thread 0.5"))
+        assert one.until_dead().why == "ended with exit code 7"
+
+
 def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> None:
     limit = 600 << 20
     with minded(WorkerOptions(memory_limit=limit)) as one:
@@ -432,3 +442,25 @@ def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatc
         os.kill(one.worker.pid or 0, signal.SIGKILL)
         one.until_greeted(2)
         assert not one.worker.vitals.spare_ready
+
+
+def test_a_spare_that_dies_of_its_warming_up_is_tried_once_more_and_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kept_worker, "_SPARE_DELAY", 0.0)
+    spare = SpareWorker(WarmUp(OPTIONS))
+
+    def attended() -> process.WorkerProcess | None:
+        spare.attend()
+        return spare._process
+
+    try:
+        spare.begin_soon()
+        for _ in range(2):
+            first = until(attended, "a spare")
+            spare.kill()
+            until(lambda first=first: attended() is not first, "its end")
+        spare.begin_soon()
+        assert attended() is None and spare.memory == 0 and not spare.ready
+    finally:
+        spare.stop()

@@ -155,3 +155,35 @@ def test_what_is_made_again_is_whole() -> None:
     placements.place(KEY, further, DRAG)
     placements.undo()
     assert placements.now(KEY) == moved
+
+
+def test_what_was_taken_back_can_be_made_again_until_something_else_is_done() -> None:
+    placements = opened(FILE).placements
+    moved, other = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
+    assert placements.undo() is None and placements.redo() is None
+    assert (placements.undo_words, placements.redo_words) == (None, None)
+    placements.place(KEY, moved)
+    assert (placements.undo_words, placements.redo_words) == ("moved base_camera", None)
+    placements.undo()
+    assert (placements.undo_words, placements.redo_words) == (None, "moved base_camera")
+    placements.place(KEY, other)
+    assert placements.redo() is None and placements.now(KEY) == other
+
+
+def test_a_placement_that_is_out_of_the_file_again_is_a_step_of_undo_and_one_made_since_stays() -> None:
+    written, since = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
+    placements = opened(FILE, written, FILE).placements
+    assert placements.taken_back(KEY, written, FILE) and placements.now(KEY) == FILE
+    assert placements.undo_words == "took back the change of base_camera"
+    placements.undo()
+    assert placements.now(KEY) == written
+    placements.place(KEY, since)
+    assert not placements.taken_back(KEY, written, FILE)
+    assert placements.now(KEY) == since and placements.undo_words == "moved base_camera"
+
+
+def test_a_camera_that_there_is_not_cannot_be_exported() -> None:
+    cameras = opened(FILE)
+    assert cameras.to_export(KEY).settings == FILE
+    with pytest.raises(ValueError, match="no sensor camera nothing whose settings are known"):
+        cameras.to_export(("sensor", "nothing"))

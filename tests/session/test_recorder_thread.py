@@ -13,10 +13,12 @@ import pytest
 from tests.drive.episodes import begin, made
 from tests.drive.waiting import until
 from tests.session.moments import stepped
+from tests.ui.scenes import description, table_scene
 from workbench.machine.watched_thread import listen, stop_listening
+from workbench.recording.read_episode import read_episode
 from workbench.session import record_live
 from workbench.session.messages import Stepped
-from workbench.session.record_live import LiveRecorder
+from workbench.session.record_live import LiveRecorder, recovered_in_words
 from workbench.session.studio_view import Progress
 from workbench.session.view import KeepStatus, RecordingStatus
 from workbench.ui.record_panel import recording_html
@@ -36,6 +38,30 @@ def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
         assert rrd.name in recording_html(recorder.status())
     finally:
         recorder.close()
+
+
+def test_what_is_stopped_in_the_middle_of_an_episode_is_written(child_process: None, tmp_path: Path) -> None:
+    recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
+    try:
+        assert (recorder.recording, recorder.one_each) == ((), False)
+        recorder.start(description(table_scene(3)[0]), (0, 2))
+        assert recorder.recording == (0, 2)
+        recorder.take(stepped(0, jumped=(2,)))
+        recorder.take(stepped(1))
+        recorder.stop()
+        status = until(lambda: s if (s := recorder.status()).episodes_written else None, "the files")
+        assert (status.episodes_written, status.active, status.problem) == (1, False, None)
+        (rrd,) = tmp_path.glob("*.rrd")
+        episode = read_episode(rrd)
+        assert (episode.info.env_index, episode.length) == (2, 1)
+    finally:
+        recorder.close()
+
+
+def test_of_many_that_were_mended_three_are_named() -> None:
+    assert recovered_in_words([]) == ""
+    said = "4 episodes that an earlier session left half written were mended: a, b, c and 1 more"
+    assert recovered_in_words(list("abcd")) == said
 
 
 def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_not_the_thread(

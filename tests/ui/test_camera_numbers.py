@@ -208,3 +208,12 @@ def test_what_no_camera_has_is_refused_in_words(desk: Desk, label: str, value: A
     now = desk.types(label, value)
     assert why in desk.panels.client.notices[0]
     assert not differences(FILE, now)
+
+
+@with_a_fov
+def test_where_no_camera_is_chosen_none_is_placed(desk: Desk) -> None:
+    placing = Placing(desk.session)
+    assert placing.require()[1] == FILE
+    desk.session.studio.select(None)
+    with pytest.raises(ValueError, match="Choose a camera that can be placed first"):
+        placing.require()

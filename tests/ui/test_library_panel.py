@@ -13,7 +13,7 @@ from tests.drive.panels import Clock, Panels, told_so_far
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
 from workbench.ui.commands import register
-from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, Action
+from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, Action, LibraryList, walking
 from workbench.ui.library_panel import OPEN, LibraryPanel
 from workbench.ui.presses import NUMBERS
 
@@ -161,6 +161,24 @@ def test_keys_walk_over_the_pages(table: Table) -> None:
     table.command("Select the one before it too")
     table.command("Select the one before it too")
     assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
+
+
+def test_the_cursor_is_followed_for_keys_only_and_goes_with_its_row(library: Library) -> None:
+    listed = LibraryList(library)
+    commands = {command.label: command for command in walking(listed)}
+    assert not listed.follow
+    listed.press("id07")
+    commands["Select the next recording too"].run()
+    assert listed.selected_ids() == ("id07", "id06") and listed.follow
+    listed.press("id03")
+    assert listed.selected_ids() == ("id03",) and not listed.follow, "it was seen where it was pressed"
+    assert listed.rows() is listed.rows(), "put in order once"
+    listed.choose("success")
+    listed.page(library.view())
+    listed.choose("all")
+    assert listed.cursor is None and listed.selected_ids() == (), "it was let go of"
+    commands["Select all recordings that are listed"].run()
+    assert len(listed.selected_ids()) == COUNT
 
 
 def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:

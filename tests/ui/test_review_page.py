@@ -24,6 +24,7 @@ from workbench.ui.put_together import Workplace
 from workbench.ui.review_page import ReviewPage
 from workbench.ui.review_panel import GHOSTS, GO_LIVE
 from workbench.ui.review_scene import MOST_NAMED
+from workbench.ui.review_timeline import walk
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +188,26 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Shown) -> None:
     assert "background:#f08c00" in rows[1] and ">B</span>" in rows[1] and "no success" in rows[1]
     status = shown.panels.html("wb-status")
     assert "background:#f08c00" in status and ">B</span>" in status and "no success" in status
+
+
+def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved(shown: Shown) -> None:
+    shown.open(1)
+    buttons = shown.panels.control("step to take")
+    assert buttons.options == walk(playing=False) and "play" in buttons.options
+    (strip,) = (html for html in shown.panels.htmls() if "wb-timeline" in html.content)
+    points = re.findall(r'<polyline points="([^"]*)"', strip.content)
+    places = [float(point.partition(",")[0]) for line in points for point in line.split()]
+    assert (min(places), max(places)) == (10.0, 100.0), "a reward of each step, the first with the first"
+    before = strip.content
+    shown.draw()
+    assert strip.content is before
+    shown.review.seek(3)
+    shown.draw()
+    assert "step 3 / 10" in strip.content
+    shown.review.toggle_play()
+    shown.draw()
+    assert buttons.options == walk(playing=True) and "pause" in buttons.options
+    shown.review.toggle_play()
 
 
 def test_what_is_known_of_a_recording_is_told_and_what_is_not_is_left_out(shown: Shown, folder: Path) -> None:
