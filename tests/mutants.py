@@ -108,6 +108,8 @@ PROTECTED = {
     "session/given_actions": "session/test_given_actions.py",
     "session/record_live": "session/test_recorder_thread.py",
     "session/studio_cameras": "session/test_placements.py",
+    "session/studio_file": "session/test_studio_alone.py session/test_camera_writing.py",
+    "session/camera_studio": "session/test_studio_alone.py",
     "ui/gate": "ui/test_gate.py",
     "ui/camera_moves": "ui/test_camera_moves.py ui/test_camera_numbers.py",
     "ui/camera_numbers": "ui/test_camera_numbers.py",
