@@ -136,6 +136,8 @@ def test_what_is_huge_is_bounded() -> None:
     assert max(map(len, others)) <= 200
     for entry in others.values():
         assert len(entry.texts[0]) <= MOST_LETTERS and not entry.whole
+    _, named = split_entries({"n" * 200: None, "m" * 201: None}, N)
+    assert list(named) == ["n" * 200, "m" * 199 + "…"]
     many, rest = split_entries({str(i): EACH for i in range(MOST_ENTRIES + 7)}, N)
     assert len(many) == MOST_ENTRIES and rest["…"].texts == ("7 more",)
 

@@ -140,6 +140,7 @@ def test_cameras_are_described_and_stand_where_maniskill_says() -> None:
     info = {c.name: c for c in list_cameras(env)}
     assert set(info) == {"base_camera", "hand_camera", "render_camera"}
     assert info["hand_camera"].mount == "panda_wristcam/camera_link" and info["base_camera"].mount is None
+    assert not any(camera.varies for camera in info.values())
     assert info["render_camera"].kind == "human" and set(ALL) <= set(info["base_camera"].modalities)
     cameras = {**env._sensors, **env._human_render_cameras}
     for name, camera in cameras.items():

@@ -10,9 +10,10 @@ import pytest
 import torch
 from mani_skill.utils import common
 
-from tests.drive.envs import batched
+from tests.core.drawn_envs import batched as drawn
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.recorded_run import states_of
-from workbench.core.state_columns import read_state_columns
+from workbench.core.state_columns import StateReading, read_state_columns
 from workbench.core.task_env import TaskEnv
 
 
@@ -52,6 +53,68 @@ def test_what_the_task_itself_moves_has_no_velocity_whatever_was_written() -> No
         assert (column[:, 7:10] == speed).all()
         np.testing.assert_array_equal(column, actor.get_state().numpy())
     task.close()
+
+
+def test_pictures_are_left_out_of_an_observation(renderer: None) -> None:
+    task = TaskEnv(drawn("PickCube-v1", obs_mode="rgb"))
+    task.reset(seed=0)
+    seen = {name for name in read_state_columns(task) if name.startswith("obs/")}
+    assert {name.split("/")[1] for name in seen} == {"agent", "extra"}
+    task.close()
+
+
+class Observes(PICK_CUBE):
+    evaluated = 0
+
+    def evaluate(self) -> dict[str, Any]:
+        self.evaluated += 1
+        return super().evaluate()
+
+    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {**super()._get_obs_extra(info), "nothing": torch.zeros((self.num_envs, 0))}
+
+
+def test_the_names_of_a_flat_observation_are_asked_for_once_and_what_is_empty_has_none() -> None:
+    task = TaskEnv(batched(Observes, 3, obs_mode="state"))
+    task.reset(seed=0)
+    env: Any = task.env
+    columns = read_state_columns(task)
+    evaluated = env.evaluated
+    assert "obs/extra/tcp_pose" in columns and "obs/extra/nothing" not in columns
+    assert [*read_state_columns(task)] == [*columns] and env.evaluated == evaluated
+    task.close()
+
+
+class Remembers(PICK_CUBE):
+    """With a state of its own."""
+
+    def get_state_dict(self) -> dict[str, Any]:
+        return {**super().get_state_dict(), "goals": {"best": torch.arange(3.0)}}
+
+
+def test_a_task_with_a_state_of_its_own_is_asked_for_it() -> None:
+    task = TaskEnv(batched(Remembers, 3))
+    task.reset(seed=0)
+    columns = read_state_columns(task)
+    assert columns["state/goals/best"].tolist() == [0, 1, 2] and "state/actors/cube" in columns
+    task.close()
+
+
+def test_what_lies_on_a_device_comes_as_it_is_in_its_order() -> None:
+    """Put together by type on the way; here nothing but the name of the device is a GPU's."""
+    asked = {
+        "b": torch.arange(12.0).reshape(2, 3, 2),
+        "truths": torch.tensor([True, False]),
+        "a": torch.tensor([7.0, 8.0]),
+        "known": np.array([1, 2]),
+        "none": torch.zeros((2, 0)),
+    }
+    columns = StateReading(None, asked, {}, 2, torch.device("cuda")).columns()
+    assert list(columns) == list(asked)
+    for name, value in asked.items():
+        column = columns[name]
+        assert column.shape == tuple(value.shape) and column.dtype == np.asarray(value).dtype
+        np.testing.assert_array_equal(column, np.asarray(value))
 
 
 def test_columns_are_copies() -> None:

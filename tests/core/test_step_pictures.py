@@ -9,7 +9,7 @@ import pytest
 
 from tests.core.drawn_envs import batched
 from workbench.core import take_pictures as module
-from workbench.core.take_pictures import step_pictures, take_pictures
+from workbench.core.take_pictures import list_cameras, recorded_pictures, step_pictures, take_pictures
 from workbench.core.task_env import TaskEnv
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -33,6 +33,7 @@ def test_what_was_observed_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -
         ("render_camera", "human", ("rgb",)),
         ("base_camera", "sensor", ALL),
     ]
+    assert sorted(recorded_pictures(list_cameras(task.env))) == sorted(wanted)
     every = step_pictures(task, [1, 0], wanted)  # type: ignore[arg-type]
     assert step_pictures(task, [1, 0], ()) == []
     for env, pictures in ((1, every[:3]), (0, every[3:])):

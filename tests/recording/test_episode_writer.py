@@ -274,6 +274,17 @@ def test_a_full_disk_is_said_and_what_was_recorded_is_found_when_there_is_room(
     assert not (small_disk / FOLDER).exists()
 
 
+def test_who_acts_cannot_be_written_to_a_folder_that_is_gone(make_episode: Maker, tmp_path: Path) -> None:
+    writer = make_episode().writer(tmp_path / "gone")
+    append(writer, next(iter(make_episode().rows())))
+    journal_of(writer).write()
+    shutil.rmtree(tmp_path / "gone")
+    journal_of(writer).sync()
+    with pytest.raises(RecordingError, match="Cannot record Made-v1 .*gone was removed"):
+        writer.acted_by("somebody else")
+    writer.close()
+
+
 def test_finishing_again_helps_once_there_is_room(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:

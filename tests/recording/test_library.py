@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import pytest
 import rerun as rr
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
 from PIL import Image
@@ -251,7 +251,7 @@ def is_wrong(name: str, value: Any) -> bool:
     return type(value) is int and name != "return" and not -(2**63) <= value < 2**63
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(_TYPES, _anything)))
 def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
     with tempfile.TemporaryDirectory() as name:
@@ -324,6 +324,16 @@ def test_only_what_changed_is_read_again(
     read_keys.clear()
     assert [row.note for row in read(tmp_path)] == ["a", "changed"]
     assert read_keys == []  # from the index
+
+
+def test_a_folder_that_comes_later_is_looked_into_and_has_its_thumbnails(tmp_path: Path) -> None:
+    library = Library(tmp_path / "later")
+    library.refresh()
+    assert library.rows() == ()
+    describe(tmp_path / "later", "a", id="ab12")
+    library.refresh()
+    assert library.thumbnails(["ab12"]) == {"ab12": jpeg()}
+    library.close()
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils import common
 from numpy.typing import NDArray
 
 from workbench.core import seams
@@ -177,9 +176,7 @@ def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], s
     parts = []
     for name, value in flat_entries(obs):
         if isinstance(value, torch.Tensor) and value.nelement():
-            made: Any = common.flatten_state_dict({"value": value}, use_torch=True, device=env.device)
-            shape = tuple(value.shape[1:]) if np.prod(value.shape[1:], dtype=int) == made.shape[-1] else None
-            parts.append((name, shape or (made.shape[-1],), _dtype(value)))
+            parts.append((name, tuple(value.shape[1:]) or (1,), _dtype(value)))
     # A task may flatten in its own way: then no names are better than wrong ones.
     return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
 

@@ -71,7 +71,6 @@ class EpisodeWriter:
         self._layouts: dict[Layout, int] = {}
         self._texts = TextWriter()
         self._states = 0
-        self._written = False
         self._finished: EpisodeFiles | None = None
         path = self._folder / FOLDER / f"{info.id}.arrow"
         self._scene = path.with_suffix(SCENE_SUFFIX)
@@ -162,12 +161,10 @@ class EpisodeWriter:
         """
         if self._finished is not None:
             return self._finished
-        if not self._written:
-            try:
-                self._journal.finish()
-            except OSError as error:
-                raise self._failed(error) from error
-            self._written = True
+        try:
+            self._journal.finish()  # of one that is closed, since making the files failed, nothing is left to be written
+        except OSError as error:
+            raise self._failed(error) from error
         try:
             self._finished = make_files(self._journal.path, self._header, self._folder, self._states)
         except Exception:

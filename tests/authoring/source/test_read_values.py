@@ -125,6 +125,8 @@ def said(project: Project, part: Part) -> str:
         # Elements.
         ('D = {"x": 1, "eye": [1, 2]}\nnote(D["eye"])', '[1, 2] {1 < D["eye"], 2 < D["eye"]} < D["eye"]'),
         ('D = dict(x=1, eye=2)\nnote(D["eye"])', '2 < D["eye"]'),
+        ('D = dict(x=1, eye=2)\nnote(D["eye"])\nD["x"]', '2 < D["eye"]'),
+        ('D = dict(x=1, eye=2)\nnote(D["eye"])\nD["eye"]', '2 < D["eye"] (line 11)'),
         ("L = [[1, 2], [3, 4]]\nnote(L[1][0])", "3 < L[1][0]"),
         ("L = (1, 2)\nM = L\nnote(M[-1])", "2 < M[-1]"),
         ("L = (1, 2)\nnote(L[-2])", "1 < L[-2]"),
