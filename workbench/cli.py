@@ -165,10 +165,10 @@ def review(
 
     # While the page is imported, so that its first rows need not wait for it.
     start_reading()
+    from workbench.jobs.task import TaskOptions
     from workbench.page_command import review_in_terminal
     from workbench.session.kept_worker import WorkerOptions
     from workbench.session.memory_limit import parse_memory
-    from workbench.session.messages import TaskOptions
     from workbench.ui.door import DoorOptions
 
     try:

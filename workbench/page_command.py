@@ -17,10 +17,11 @@ from rich.markup import escape
 
 import workbench
 from workbench.authoring.reference import TaskName, named_file
+from workbench.jobs.task import TaskOptions
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import Event, Failed, Loaded, Loading, TaskOptions
+from workbench.session.messages import Event, Failed, Loaded, Loading
 from workbench.session.session import HISTORY_BYTES, Session
 from workbench.terminal import out, print_event, print_line, refuse, say, say_addresses, warn
 from workbench.ui.commands import Command

@@ -41,13 +41,13 @@ from workbench.core.state_columns import StateReading, read_states
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request, recorded_pictures, step_pictures
 from workbench.core.task_env import TaskEnv
+from workbench.jobs.task import Stepped, TaskDescription
 from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.journal import before_writing
 from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
-from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.open_task import describe
 from workbench.session.record_live import recovered_in_words
 

@@ -21,13 +21,13 @@ from workbench.authoring.reference import TaskName
 from workbench.core.backends import gpu_left_alone
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
+from workbench.jobs.task import TaskOptions
 from workbench.machine.atomic_files import replace_file
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
 from workbench.recording.sources import Source, UnreadableRecording, sources_among
 from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
-from workbench.session.messages import TaskOptions
 from workbench.session.reload import open_task
 from workbench.session.rescore import Group, group_episodes, hidden_in_words, judge_each, with_renderer
 from workbench.session.rescore_run import rescore

@@ -16,7 +16,7 @@ import tyro
 from workbench.core.rules import DEGREES, Degree
 
 if TYPE_CHECKING:
-    from workbench.session.messages import TaskOptions
+    from workbench.jobs.task import TaskOptions
 
 Backend = Literal["auto", "cpu", "gpu"]
 Rules = Annotated[
@@ -73,7 +73,7 @@ class BatchArguments:
     imports: Imports = ()
 
     def options(self) -> TaskOptions:
-        from workbench.session.messages import TaskOptions
+        from workbench.jobs.task import TaskOptions
 
         if not 1 <= self.num_envs <= 4096:
             raise ValueError(f"--num-envs must be from 1 to 4096, not {self.num_envs}")

@@ -27,7 +27,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.reload import cold_restart
 from tests.drive.page import TASK
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.session.messages import CameraRequest, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 
 BASE: CameraKey = ("sensor", "base_camera")

@@ -27,9 +27,9 @@ from workbench.core import actions
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.snapshot_parts import SnapshotPacker
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.jobs.task import Stepped
 from workbench.session.env_table import EnvTable
 from workbench.session.history import History
-from workbench.session.messages import Stepped
 
 
 @dataclass

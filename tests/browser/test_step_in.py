@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
 from tests.drive.waiting import until
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.record import RecordOptions, record
 
 pytestmark = pytest.mark.browser

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.ui.trust_dialog import DO_NOT, ONCE
 

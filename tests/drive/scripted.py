@@ -17,6 +17,7 @@ import numpy as np
 from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.core.step import StepResult
+from workbench.jobs.task import Restored, Stepped, TaskDescription
 from workbench.session.kept_worker import Death, KeptWorker, Vitals, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.messages import (
@@ -28,12 +29,9 @@ from workbench.session.messages import (
     Request,
     Reset,
     Restore,
-    Restored,
     Settings,
     SingleStep,
     Status,
-    Stepped,
-    TaskDescription,
     WarmUp,
 )
 from workbench.session.process import Output

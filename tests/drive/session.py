@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.drive.waiting import until
+from workbench.jobs.task import TaskOptions
 from workbench.session.judging import JudgedView
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import TaskOptions
 from workbench.session.rescore import Rescorer
 from workbench.session.session import Session
 from workbench.session.view import SessionView

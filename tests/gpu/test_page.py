@@ -12,7 +12,8 @@ import pytest
 
 from tests.drive.session import wait_until
 from tests.gpu.conftest import Simulation, Told
-from workbench.session.messages import CameraRequest, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"

@@ -11,8 +11,8 @@ import numpy as np
 
 from tests.drive.session import TASKS
 from workbench.core.step import StepResult
+from workbench.jobs.task import Stepped
 from workbench.jobs.wire import pack, pack_message
-from workbench.session.messages import Stepped
 
 _MISCHIEF = """
 import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading as _threading, time as _time

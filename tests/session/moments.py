@@ -6,8 +6,8 @@ import numpy as np
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.step import StepResult
+from workbench.jobs.task import Restored, Stepped
 from workbench.session.env_table import EnvTable
-from workbench.session.messages import Restored, Stepped
 
 N, BODIES = 3, 4
 

@@ -20,14 +20,7 @@ from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
 from workbench.jobs.wire import Answer, Call, Unpacker, pack_message
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
-from workbench.session.messages import (
-    ListenForDebugger,
-    Load,
-    Loaded,
-    Loading,
-    Quit,
-    Request,
-)
+from workbench.session.messages import ListenForDebugger, Load, Loaded, Loading, Quit, Request
 from workbench.session.pulse import PulseWriter
 from workbench.session.questions import QUESTIONS, RunCameras
 from workbench.session.worker_start import main

@@ -8,7 +8,8 @@ import pytest
 
 from tests.drive.session import TASKS
 from workbench.authoring.problem import TaskError
-from workbench.session.messages import Load, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import Load
 from workbench.session.reload import Running, load_version, open_task
 
 KWARGS = {"render_backend": "none"}

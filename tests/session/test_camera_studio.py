@@ -16,7 +16,8 @@ from tests.drive.waiting import until
 from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_frames import target_of
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
-from workbench.session.messages import CameraRequest, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioView, Wish

@@ -15,8 +15,8 @@ from tests.session.studio import BASE, camera, moved, said
 from workbench.authoring.camera_source.cameras import Run
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
+from workbench.jobs.task import TaskOptions
 from workbench.session.camera_writing import copy, not_as_written, plan
-from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_file import StudioFile

@@ -8,7 +8,7 @@ import pytest
 
 import workbench
 from workbench.authoring.problem import TaskError
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.reload import open_task
 
 HEADER = """

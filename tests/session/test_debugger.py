@@ -17,11 +17,11 @@ import pytest
 from tests.drive.session import wait_until
 from tests.session.debug_client import DebugClient
 from workbench.cli import main
+from workbench.jobs.task import TaskOptions
 from workbench.machine.child_python import child_environment, python_command
 from workbench.session import kept_worker
 from workbench.session.debugger import port_for_debugger
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.banner import is_busy_for_long

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from tests.ui.scenes import step_of, table_scene
 from workbench.core.step import StepResult
+from workbench.jobs.task import Restored, Stepped
 from workbench.session.env_table import KEPT_REWARDS, EnvRows, EnvTable, Outcome
 from workbench.session.history import FAIL, SUCCESS, History
-from workbench.session.messages import Restored, Stepped
 
 N = 3
 

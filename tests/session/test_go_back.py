@@ -14,8 +14,9 @@ import pytest
 from workbench.authoring.load import load_task
 from workbench.core import actions
 from workbench.core.snapshot import Snapshot
+from workbench.jobs.task import TaskOptions
 from workbench.session import go_back
-from workbench.session.messages import Restore, TaskOptions, WayBack
+from workbench.session.messages import Restore, WayBack
 from workbench.session.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
 
 N = 3

@@ -11,9 +11,10 @@ import pytest
 
 from tests.session.moments import N, mask_of, stepped, table
 from workbench.core.pictures import CameraKind, Picture
+from workbench.jobs.task import NO_MOMENT, Restored
 from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
 from workbench.session.judgement import Judgement
-from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored
+from workbench.session.messages import PastPictures, Pictures
 
 
 def picture(env: int, size: int = 64, kind: CameraKind = "sensor", name: str = "eye") -> Picture:

@@ -14,8 +14,8 @@ from tests.drive.session import TASKS
 from workbench.authoring.load import load_task
 from workbench.core import actions
 from workbench.core.step import StepResult
+from workbench.jobs.task import TaskOptions
 from workbench.session.go_back import judge_moments
-from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
 from workbench.session.questions import Judged, JudgeMoments, MomentToJudge
 

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from tests.session.moments import table
 from workbench.core.recorded_run import pose_distances
 from workbench.core.step import StepResult
+from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.askers import Background
 from workbench.session.history import History
 from workbench.session.judgement import MOST_ENTRIES, Judge, Judgement
 from workbench.session.judging import StoppedBy
-from workbench.session.messages import Load, Stepped, TaskOptions
+from workbench.session.messages import Load
 
 BODIES = 2
 

@@ -16,18 +16,12 @@ from typing import Any
 import pytest
 
 from tests.drive.waiting import until
+from workbench.jobs.task import TaskOptions
 from workbench.jobs.wire import Call
 from workbench.session import kept_worker, process
 from workbench.session.kept_worker import Death, KeptWorker, SpareWorker, WorkerOptions
 from workbench.session.last_words import Busy
-from workbench.session.messages import (
-    Event,
-    Load,
-    Loading,
-    Request,
-    TaskOptions,
-    WarmUp,
-)
+from workbench.session.messages import Event, Load, Loading, Request, WarmUp
 from workbench.session.questions import RunCameras
 
 pytestmark = pytest.mark.usefixtures("child_process")

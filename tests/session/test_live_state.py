@@ -14,6 +14,7 @@ from tests.drive.waiting import until
 from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.authoring.reference import RecordedTask
 from workbench.core.pictures import Picture
+from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.kept_worker import Death, KeptWorker
 from workbench.session.live_state import LiveState
 from workbench.session.messages import (
@@ -26,8 +27,6 @@ from workbench.session.messages import (
     Request,
     Settings,
     Status,
-    Stepped,
-    TaskOptions,
 )
 from workbench.session.session import Session
 from workbench.session.view import SessionView

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, wait_until
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -23,12 +23,12 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from tests.drive.session import rescored
 from tests.drive.waiting import until
 from workbench.cli import main
+from workbench.jobs.task import TaskOptions
 from workbench.recording.library import Library
 from workbench.recording.sources import sources_among
 from workbench.rescore_command import RescoreOptions, rescore_all
 from workbench.session.clearance import Clearances, Consent, NotTrusted, TrustQuestion
 from workbench.session.make_scene import make
-from workbench.session.messages import TaskOptions
 from workbench.session.questions import MakeScene
 from workbench.session.record import RecordOptions, record
 from workbench.session.recorded_scene import SceneProcess

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.ui.scenes import step_of, table_scene
+from workbench.jobs.task import Stepped
 from workbench.session.env_table import FASTEST, EnvTable, Kind, OutlierWatch, lowest_still_point
 from workbench.session.history import History
-from workbench.session.messages import Stepped
 
 
 def test_a_body_that_a_reset_puts_elsewhere_has_not_moved() -> None:

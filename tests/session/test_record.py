@@ -25,10 +25,10 @@ from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import TaskError
 from workbench.cli import main
 from workbench.jobs.pool import Deal, Executor, Processes, Work
+from workbench.jobs.task import TaskOptions
 from workbench.record_command import record_in_terminal
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
-from workbench.session.messages import TaskOptions
 from workbench.session.record import Progress, Recorded, RecordOptions, Written, record
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -14,10 +14,10 @@ from tests.drive.episodes import begin, made
 from tests.drive.waiting import until
 from tests.session.moments import stepped
 from tests.ui.scenes import description, table_scene
+from workbench.jobs.task import Stepped
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.recording.read_episode import read_episode
 from workbench.session import record_live
-from workbench.session.messages import Stepped
 from workbench.session.record_live import LiveRecorder, recovered_in_words
 from workbench.session.studio_view import Progress
 from workbench.session.view import KeepStatus, RecordingStatus

@@ -24,7 +24,8 @@ from workbench.core.seams import task_class
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
-from workbench.session.messages import Load, LoadLevel, ReloadReport, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import Load, LoadLevel, ReloadReport
 from workbench.session.open_task import OpenedTask, step_checked
 from workbench.session.reload import Running, load_version, open_task
 

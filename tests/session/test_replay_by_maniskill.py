@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from workbench.jobs.task import TaskOptions
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode, read_maniskill
-from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 
 pytestmark = pytest.mark.usefixtures("child_process")

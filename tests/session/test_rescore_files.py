@@ -22,13 +22,13 @@ from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
 from workbench.cli import main
 from workbench.core.recorded_state import apart, read_states
+from workbench.jobs.task import TaskOptions
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
 from workbench.recording.sources import sources_among
 from workbench.rescore_command import RescoreOptions, rescore_all
 from workbench.session import rescore_words as words
 from workbench.session.given_actions import read_given
-from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.session.relive import arrive
 from workbench.session.rescore import Rescorer

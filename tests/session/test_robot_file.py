@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from workbench.core import actions
-from workbench.session.messages import Load, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import Load
 from workbench.session.open_task import step_checked
 from workbench.session.reload import Running, load_version
 

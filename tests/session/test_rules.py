@@ -17,8 +17,9 @@ from tests.drive.session import wait_until
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.actions import hold_action
 from workbench.core.rules import Finding
+from workbench.jobs.task import TaskOptions
 from workbench.recording.read_episode import read_episode
-from workbench.session.messages import Event, Load, RulesBroken, TaskOptions
+from workbench.session.messages import Event, Load, RulesBroken
 from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
 from workbench.session.record import RecordOptions, record
 from workbench.session.reload import Running, load_version, open_task

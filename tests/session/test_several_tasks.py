@@ -10,7 +10,8 @@ import pytest
 
 from tests.drive.session import TASKS, wait_until
 from workbench.authoring.problem import TaskError
-from workbench.session.messages import Load, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import Load
 from workbench.session.reload import load_version, open_task
 from workbench.session.session import Session
 

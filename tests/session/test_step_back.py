@@ -15,8 +15,8 @@ import pytest
 from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
 from workbench.core.recorded_run import RecordedRun
+from workbench.jobs.task import TaskOptions
 from workbench.recording.episode import EpisodeInfo
-from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.step_back import (
     CannotStepIn,

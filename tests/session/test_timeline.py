@@ -11,8 +11,9 @@ import pytest
 
 from tests.session.moments import N, stepped, table
 from workbench.core.pictures import CameraKind, Picture
+from workbench.jobs.task import Restored, Stepped
 from workbench.session.history import RESET, SUCCESS
-from workbench.session.messages import CameraRequest, PastPictures, Restored, Stepped
+from workbench.session.messages import CameraRequest, PastPictures
 from workbench.session.timeline import Timeline
 
 EYE, HAND = CameraRequest("eye", "sensor", ("rgb",)), CameraRequest("hand", "sensor", ("rgb",))

@@ -20,11 +20,11 @@ import pytest
 from tests.drive.session import live_session, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
+from workbench.jobs.task import TaskOptions
 from workbench.recording.rerun_table import read_properties
 from workbench.session import kept_worker
 from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import TaskOptions
 from workbench.session.process import signal_main_thread
 from workbench.session.session import Session
 from workbench.session.view import SessionView

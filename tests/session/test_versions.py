@@ -12,8 +12,9 @@ import pytest
 from tests.drive.waiting import until
 from tests.session.test_live_state import DEATH
 from tests.ui.scenes import description, problem, step_of, table_scene
+from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.live_state import LiveState, SharedState
-from workbench.session.messages import Failed, Load, Loaded, Play, Request, Stepped, TaskOptions
+from workbench.session.messages import Failed, Load, Loaded, Play, Request
 from workbench.session.versions import Versions
 
 GOOD, NEW = "x = 1\n", "x = 2\n"

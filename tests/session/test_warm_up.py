@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.reload import warm_up
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from tests.drive.session import live_session, wait_until
 from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -23,8 +23,8 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.session.hazards import calm, provoke, write_task
+from workbench.jobs.task import TaskOptions
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 

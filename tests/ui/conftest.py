@@ -10,7 +10,7 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.scripted import Evaluate, no_success, scripted
 from tests.drive.session import wait_until
 from workbench.core.pictures import CameraInfo
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 from workbench.ui.door import Door, DoorOptions, open_door
 

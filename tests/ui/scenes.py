@@ -11,7 +11,8 @@ from workbench.authoring.problem import Problem
 from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo, CameraKind
 from workbench.core.step import StepResult
-from workbench.session.messages import ActionDimension, Settings, TaskDescription
+from workbench.jobs.task import ActionDimension, TaskDescription
+from workbench.session.messages import Settings
 from workbench.session.view import RecordingStatus, SessionView
 
 

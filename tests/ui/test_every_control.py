@@ -20,7 +20,7 @@ from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.knocking import claim, client, say
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 from workbench.ui import page_guard
 from workbench.ui.door import Door, DoorOptions, open_door

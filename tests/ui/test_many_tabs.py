@@ -18,7 +18,7 @@ from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import Tabs, open_deaf_tab, tabs_of
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 from workbench.ui import strangers
 from workbench.ui.door import Door, DoorOptions, open_door

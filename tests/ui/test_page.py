@@ -14,7 +14,7 @@ import websockets.sync.client
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.page import Page

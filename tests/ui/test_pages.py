@@ -17,7 +17,7 @@ from tests.drive.panels import Panels, held_by
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import tabs_of
-from workbench.session.messages import TaskOptions
+from workbench.jobs.task import TaskOptions
 from workbench.session.session import Session
 from workbench.ui.door import Door
 from workbench.ui.put_together import Workplace

@@ -14,9 +14,9 @@ import viser
 from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
+from workbench.jobs.task import TaskOptions
 from workbench.recording.columns import TextEntry
 from workbench.recording.library import Library
-from workbench.session.messages import TaskOptions
 from workbench.session.review import Review
 from workbench.session.session import Session
 from workbench.ui.door import Door

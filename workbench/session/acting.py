@@ -20,8 +20,8 @@ from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core import actions
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.task_env import TaskEnv
+from workbench.jobs.task import ActionSource
 from workbench.machine.current_folder import CurrentFolder
-from workbench.session.messages import ActionSource
 from workbench.session.policy import Policy, load_policy, problem_of
 
 

@@ -32,10 +32,11 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
+from workbench.jobs.task import TaskDescription
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging
 from workbench.session.lane import Job, JobFailed, Lane
-from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
+from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.questions import DrawCamera
 from workbench.session.studio_cameras import Step, StudioCameras
 from workbench.session.studio_file import StudioFile

@@ -23,7 +23,7 @@ from workbench.authoring.modules import read_exactly
 from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences, in_words
 from workbench.core.pictures import CameraInfo
-from workbench.session.messages import TaskDescription
+from workbench.jobs.task import TaskDescription
 from workbench.session.studio_view import Change, Wish, Writing
 
 SENTENCES: dict[Change, tuple[str, str, str]] = {

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.step import StepResult
-from workbench.session.messages import Restored, Stepped
+from workbench.jobs.task import Restored, Stepped
 
 FASTEST = 20.0
 """m/s."""

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from workbench.core.pictures import Picture
 from workbench.core.recorded_run import STATE, states_of
 from workbench.core.step import OtherEntry, StepResult
+from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.watched_thread import say_failure
 from workbench.recording.columns import BatchPacker
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
 from workbench.recording.landing import RecordingError
 from workbench.recording.side_files import side_files
-from workbench.session.messages import Stepped, TaskDescription
 
 _PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk")
 

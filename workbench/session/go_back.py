@@ -27,7 +27,8 @@ from workbench.core.snapshot import (
     restore_snapshot,
 )
 from workbench.core.step import StepResult
-from workbench.session.messages import Restore, Restored
+from workbench.jobs.task import Restored
+from workbench.session.messages import Restore
 from workbench.session.open_task import OpenedTask, blamed, restore_checked, step_checked
 from workbench.session.questions import Judged, JudgeMoments
 

@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_parts import WholeSnapshot
 from workbench.core.step import StepResult
+from workbench.jobs.task import NO_MOMENT, Restored, Stepped
 from workbench.session.curves import Columns, RecentSteps
 from workbench.session.env_table import KEPT_REWARDS, LOST_REWARD, EnvRows, EnvTable
-from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped, WayBack
+from workbench.session.messages import PastPictures, Pictures, WayBack
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
 """What may happen to an env at a moment. Success, failure and a reward that is none: the first in an episode."""

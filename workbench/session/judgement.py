@@ -31,11 +31,12 @@ from numpy.typing import NDArray
 
 from workbench.core.recorded_run import pose_distances
 from workbench.core.step import StepResult
+from workbench.jobs.task import TaskDescription
 from workbench.session.askers import Background
 from workbench.session.history import History, Moment
 from workbench.session.judging import JudgedView, Judging, StoppedBy
 from workbench.session.lane import Job, JobFailed
-from workbench.session.messages import Load, Loaded, TaskDescription
+from workbench.session.messages import Load, Loaded
 from workbench.session.questions import Judged, JudgeMoments, MomentToJudge
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
 

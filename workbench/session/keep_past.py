@@ -25,13 +25,14 @@ from pathlib import Path
 
 import numpy as np
 
+from workbench.jobs.task import TaskDescription
 from workbench.recording.columns import BatchPacker
 from workbench.recording.landing import RecordingError
 from workbench.session.askers import WAITING, Background
 from workbench.session.episodes import EpisodeFinisher, GatheredEpisode
 from workbench.session.history import History, Lived, Moment
 from workbench.session.lane import Job, JobFailed, Lane
-from workbench.session.messages import Load, PlaceCamera, Reset, TaskDescription
+from workbench.session.messages import Load, PlaceCamera, Reset
 from workbench.session.questions import CaptureMoment
 from workbench.session.view import KeepStatus
 

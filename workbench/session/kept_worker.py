@@ -23,15 +23,7 @@ from workbench.machine.family import describe_exit
 from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error
 from workbench.session.memory_limit import in_words
-from workbench.session.messages import (
-    Event,
-    ListenForDebugger,
-    Load,
-    Loaded,
-    Loading,
-    Request,
-    WarmUp,
-)
+from workbench.session.messages import Event, ListenForDebugger, Load, Loaded, Loading, Request, WarmUp
 from workbench.session.process import Output, WorkerProcess
 from workbench.session.pulse import Beat, Doing
 

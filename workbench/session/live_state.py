@@ -18,6 +18,7 @@ from workbench.authoring.problem import Problem
 from workbench.authoring.reference import RecordedTask, TaskName, class_beside, followed_folder, named_file
 from workbench.core.inspection import Inspection
 from workbench.core.step import StepResult
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
 from workbench.session.env_table import EnvTable
 from workbench.session.keep_past import PastEpisode, WhatToKeep, episode_round
 from workbench.session.kept_worker import Death
@@ -38,9 +39,6 @@ from workbench.session.messages import (
     RulesBroken,
     Settings,
     Status,
-    Stepped,
-    TaskDescription,
-    TaskOptions,
 )
 from workbench.session.timeline import Timeline
 from workbench.session.view import SessionView

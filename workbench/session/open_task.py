@@ -40,7 +40,7 @@ from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.visibility import objects_to_see
-from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
+from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
 
 
 @dataclass(frozen=True)

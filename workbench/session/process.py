@@ -32,15 +32,7 @@ from workbench.machine.process_tree import main_thread_ended
 from workbench.machine.watched_thread import say_failure
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.memory_limit import FamilyMemory
-from workbench.session.messages import (
-    Event,
-    Load,
-    PlaceCamera,
-    Quit,
-    Request,
-    Settings,
-    is_a_step,
-)
+from workbench.session.messages import Event, Load, PlaceCamera, Quit, Request, Settings, is_a_step
 from workbench.session.pulse import Beat, PulseReader, make_pulse
 
 _WHOLE = (Load, Settings)

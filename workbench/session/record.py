@@ -25,13 +25,13 @@ from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import recorded_pictures, step_pictures
 from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
+from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.current_folder import CurrentFolder
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting, RecordActing
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.session.given_actions import SUFFIXES, read_given
-from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 from workbench.session.policy import find_policy
 from workbench.session.record_options import RecordArguments

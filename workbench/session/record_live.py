@@ -17,11 +17,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
 from workbench.recording.reading import mend
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer
-from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.view import RecordingStatus
 
 _MOST_WAITING = 256 * 1024**2

@@ -36,7 +36,8 @@ from workbench.core.recorded_state import (
 )
 from workbench.core.snapshot import Snapshot, only_these_move
 from workbench.core.step import StepResult
-from workbench.session.messages import NO_MOMENT, Restored, StepBack
+from workbench.jobs.task import NO_MOMENT, Restored
+from workbench.session.messages import StepBack
 from workbench.session.number_text import length
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 from workbench.session.step_back import changed_since

@@ -44,7 +44,8 @@ from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras, recorded_pictures, take_pictures
 from workbench.core.task_env import TaskEnv
-from workbench.session.messages import Load, ReloadReport, TaskOptions
+from workbench.jobs.task import TaskOptions
+from workbench.session.messages import Load, ReloadReport
 from workbench.session.open_task import (
     Clock,
     OpenedTask,

@@ -19,6 +19,7 @@ from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import TaskName, named_file
+from workbench.jobs.task import TaskOptions
 from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import made_here
@@ -28,7 +29,7 @@ from workbench.session.askers import Background
 from workbench.session.clearance import Clearances, NotCleared, Wanted, recorded_content
 from workbench.session.judging import JudgedView, Judging
 from workbench.session.lane import Job, JobFailed
-from workbench.session.messages import Load, TaskOptions
+from workbench.session.messages import Load
 from workbench.session.questions import Rescore, Rescored
 from workbench.session.step_back import (
     CannotStepIn,

@@ -22,6 +22,7 @@ from typing import Any
 from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
+from workbench.jobs.task import Stepped, TaskOptions
 from workbench.jobs.wire import Answer, Progress
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.askers import Asker, Background
@@ -45,8 +46,6 @@ from workbench.session.messages import (
     SetCapture,
     SingleStep,
     StepBack,
-    Stepped,
-    TaskOptions,
     WarmUp,
 )
 from workbench.session.policy import PolicyFile

@@ -32,9 +32,9 @@ from workbench.authoring.task_content import CannotRead, read_text, source_hash
 from workbench.authoring.two_versions import TwoVersions
 from workbench.core.env_kwargs import HOW_IT_IS_RUN
 from workbench.core.recorded_run import RecordedRun
+from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.side_files import folder_of, place_of
-from workbench.session.messages import TaskDescription, TaskOptions
 
 
 class NoText(ValueError):

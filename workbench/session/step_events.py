@@ -18,7 +18,7 @@ from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import recorded_pictures, step_pictures
-from workbench.session.messages import Restored, Stepped
+from workbench.jobs.task import Restored, Stepped
 from workbench.session.open_task import OpenedTask
 
 

@@ -25,7 +25,7 @@ from workbench.core.camera_frames import axes_of, pose_in_env
 from workbench.core.camera_settings import NOT_ON_THE_GPU, CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
-from workbench.session.messages import TaskDescription
+from workbench.jobs.task import TaskDescription
 from workbench.session.studio_view import StudioCamera
 
 _MOST_STEPS = 500

@@ -19,11 +19,12 @@ from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.camera_source.disk import SourceEdit, apply, revert
 from workbench.authoring.source.text import Refused, plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.jobs.task import TaskDescription
 from workbench.session.askers import Asker
 from workbench.session.camera_writing import DONE, LEFT, copy, mismatch, plan, said, was_before
 from workbench.session.history import ShownMoment
 from workbench.session.lane import JobFailed, Stopped
-from workbench.session.messages import Load, TaskDescription
+from workbench.session.messages import Load
 from workbench.session.questions import DrawCamera, RunCameras
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import Wish, Writing, WritingStage

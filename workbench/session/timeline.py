@@ -16,16 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraKind, Picture
+from workbench.jobs.task import Restored, Stepped
 from workbench.session.env_table import EnvTable
 from workbench.session.history import History, Lived, Moment, ShownMoment
-from workbench.session.messages import (
-    CameraRequest,
-    DrawPast,
-    Request,
-    Restore,
-    Restored,
-    Stepped,
-)
+from workbench.session.messages import CameraRequest, DrawPast, Request, Restore
 
 if TYPE_CHECKING:
     from workbench.session.live_state import SharedState

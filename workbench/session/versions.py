@@ -13,9 +13,10 @@ from typing import Literal, NamedTuple
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import Problem
 from workbench.authoring.watch import SourceWatcher
+from workbench.jobs.task import TaskDescription
 from workbench.session.kept_worker import Death
 from workbench.session.live_state import SharedState
-from workbench.session.messages import Failed, Load, LoadLevel, Play, Request, TaskDescription
+from workbench.session.messages import Failed, Load, LoadLevel, Play, Request
 
 Rung = Literal["file", "moment", "version", "nothing"]
 

@@ -14,11 +14,12 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.jobs.task import TaskDescription
 from workbench.session.curves import Curves
 from workbench.session.judging import JudgedView
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
-from workbench.session.messages import ReloadReport, RulesBroken, Settings, TaskDescription
+from workbench.session.messages import ReloadReport, RulesBroken, Settings
 from workbench.session.printed import NOTHING_PRINTED, Printed
 from workbench.session.studio_view import Progress, StudioView
 from workbench.session.timeline import TimelineView

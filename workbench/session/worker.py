@@ -31,6 +31,7 @@ from workbench.authoring.reference import named_file
 from workbench.core.inspect_env import inspect_env
 from workbench.core.seams import mark_camera_configs
 from workbench.core.step import StepResult
+from workbench.jobs.task import Restored
 from workbench.jobs.wire import Answer, Call, CannotAnswer, Progress, Question, pack
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
@@ -61,7 +62,6 @@ from workbench.session.messages import (
     ReloadReport,
     Reset,
     Restore,
-    Restored,
     RulesBroken,
     SetCapture,
     Settings,

@@ -38,14 +38,7 @@ from workbench.core.task_env import TaskEnv
 from workbench.jobs.wire import CannotAnswer
 from workbench.session.camera_answers import answer
 from workbench.session.held_task import HeldTask
-from workbench.session.messages import (
-    CameraRequest,
-    DrawPast,
-    PastPictures,
-    Pictures,
-    PlaceCamera,
-    Placed,
-)
+from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pictures, PlaceCamera, Placed
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.questions import CameraQuestion, Captured, CaptureMoment
 

@@ -16,7 +16,7 @@ from workbench.core.camera_frames import rotation_matrix, triple
 from workbench.core.camera_report import OfferedPlacement
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind
-from workbench.session.messages import TaskDescription
+from workbench.jobs.task import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView

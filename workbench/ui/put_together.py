@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from workbench.jobs.task import TaskOptions
 from workbench.recording.library import Library
 from workbench.recording.reading import mend
 from workbench.session.clearance import Clearances
-from workbench.session.messages import TaskOptions
 from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.rescore import Rescorer

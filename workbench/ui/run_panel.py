@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator
 
 import viser
 
-from workbench.session.messages import ActionDimension, ActionSource, EpisodeEnd
+from workbench.jobs.task import ActionDimension, ActionSource
+from workbench.session.messages import EpisodeEnd
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.control_values import limit_text

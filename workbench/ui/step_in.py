@@ -19,10 +19,10 @@ import viser
 
 from workbench.authoring.reference import TaskName
 from workbench.core.recorded_run import RecordedRun
+from workbench.jobs.task import TaskOptions
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.side_files import side_files_in_words
 from workbench.session.clearance import Clearances, NotCleared, Wanted
-from workbench.session.messages import TaskOptions
 from workbench.session.review_view import ReviewView
 from workbench.session.session import Session
 from workbench.session.step_back import (

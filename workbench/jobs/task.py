@@ -1,0 +1,150 @@
+"""A task as plain data: how it is made, what it is, and what each step of its batch gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_report import ObjectToSee
+from workbench.core.camera_settings import CameraKey
+from workbench.core.geometry import SceneGeometry
+from workbench.core.pictures import CameraInfo, Picture
+from workbench.core.rules import Degree
+from workbench.core.step import StepResult
+
+Backend = Literal["auto", "cpu", "gpu"]
+ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
+
+
+@dataclass(frozen=True)
+class TaskOptions:
+    """How a task is made; the same for the page, the recorder and the benchmarks."""
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    seed: int = 0
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+    rules: Degree | None = None
+    """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
+    imports: tuple[str, ...] = ()
+    """Modules that a person named on the command line, imported before the task is looked for: they register its id."""
+
+
+@dataclass(frozen=True)
+class ActionDimension:
+    """One number of the action of one env."""
+
+    name: str
+    """For example ``arm/panda_joint1`` or ``gripper``."""
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class TaskDescription:
+    """What the page must know of a task that was loaded."""
+
+    env_id: str
+    """Registered id, or the class name of an unregistered task."""
+    class_name: str
+    file: str | None
+    """Source file of the class."""
+    source_files: tuple[str, ...]
+    """The task's file and the modules beside it that it imported: what the watcher follows."""
+    source_hash: str
+    """sha256 over `source_files`, 12 hex digits."""
+    source: dict[str, str]
+    """Path to text of `source_files`."""
+    backend: str
+    """For example ``cpu (batched)`` or ``gpu``."""
+    device: str
+    """For example ``cpu`` or ``cuda:0``; with the render device's name."""
+    num_envs: int
+    max_episode_steps: int | None
+    obs_mode: str
+    reward_mode: str
+    control_mode: str | None
+    control_dt: float
+    """Seconds of simulated time in one control step."""
+    actions: tuple[ActionDimension, ...]
+    geometry: SceneGeometry
+    cameras: tuple[CameraInfo, ...]
+    segmentation: dict[int, str]
+    """Segmentation id to body name."""
+    can_render: bool
+    chosen: str = ""
+    """Its name in the file: the class, or a robot that is shown in a scene."""
+    others: tuple[str, ...] = ()
+    """What else can be chosen in the file."""
+    in_place_of: str | None = None
+    """The class of the file that was tried first, and failed."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
+    objects: tuple[ObjectToSee, ...] = ()
+    """What a camera may be asked to see."""
+    notices: tuple[str, ...] = ()
+    """What its author should know although it works, in sentences."""
+
+    def camera(self, key: CameraKey) -> CameraInfo | None:
+        return next((camera for camera in self.cameras if camera.key == key), None)
+
+
+NO_MOMENT = -1
+"""The `Restored.origin` of a state that is not of this history."""
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What a `Restore` or a `StepBack` did."""
+
+    env_idx: tuple[int, ...]
+    source: tuple[int, ...]
+    origin: int
+    undoes: int | None
+    not_carried: dict[str, str]
+    """What could not be put back, and why; empty within one version of a task."""
+    recording: str = ""
+    """Of a `StepBack`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
+    how: str = ""
+    """How the state was come to, in a sentence; empty where it was put there."""
+    number: int = 0
+    """Of the `StepBack` that it answers; 0 for a `Restore`."""
+    lived_through: tuple[int, ...] = ()
+    """The envs that came there by the steps that led to it. For them it is no exact point, as a state that is put there
+    is, from which the same actions give the same bits."""
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """One reset, control step or restore of the batch, always sent, in order."""
+
+    step: StepResult
+    reset_mask: NDArray[np.bool_]
+    """(N,) True where this result does not follow from the one before: the first of a new episode, or a moment
+    of the past that was returned to (`restored`)."""
+    captured: tuple[Picture, ...] = ()
+    """Pictures that belong to exactly this step (only while capturing)."""
+    seeds: NDArray[np.int64] | None = None
+    """(N,) episode seed of each env, where a reset was part of this."""
+    snapshot: bytes = b""
+    """The body of the snapshot of the whole batch at this moment (see `core.snapshot_parts`): opaque to the
+    server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
+    part_keys: tuple[int, ...] | None = None
+    """The parts of the snapshot; None where they are those of the event before."""
+    new_parts: dict[int, bytes] = field(default_factory=dict)
+    """Parts that were not sent before."""
+    number: int = 0
+    """Counts these events since the worker began; `Pictures.number` refers to it."""
+    restored: Restored | None = None
+    columns: dict[str, NDArray] = field(default_factory=dict)
+    """(N, ...) each, as `core.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    capturing."""
+    acted_by: str = ""
+    """What chose the action of this step, as a recording is to say it; empty where it is known beforehand."""
+    resumed: bool = False
+    """The envs stand where the worker before this one left them: the result does not follow from one of this worker's,
+    but nothing was reset."""
