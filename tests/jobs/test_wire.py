@@ -20,8 +20,9 @@ from msgspec import inspect
 from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.core.inspection import Inspection
 from workbench.core.rules import Finding
+from workbench.jobs.pool import Answer
 from workbench.jobs.task import Stepped, TaskOptions
-from workbench.jobs.wire import Answer, Call, Unpacker, Unreadable, pack, pack_message, value_type
+from workbench.jobs.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
 from workbench.recording.sources import Source
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status
 from workbench.session.questions import QUESTIONS, Rescore

@@ -18,7 +18,8 @@ from typing import Any, get_args
 
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
-from workbench.jobs.wire import Answer, Call, Unpacker, pack_message
+from workbench.jobs.pool import Answer
+from workbench.jobs.wire import Call, Unpacker, pack_message
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import ListenForDebugger, Load, Loaded, Loading, Quit, Request
 from workbench.session.pulse import PulseWriter

@@ -18,8 +18,9 @@ import pytest
 from tests.drive.waiting import until
 from tests.session.hazards import calm, provoke, provoked, write_task
 from workbench.authoring.problem import Problem
+from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import TaskOptions
-from workbench.jobs.wire import Answer, Call, Progress, pack
+from workbench.jobs.wire import Call, pack
 from workbench.session.askers import Asker, Background
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Load, Request, Reset

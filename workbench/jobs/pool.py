@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Protocol, TypeVar
 
-from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
-from workbench.jobs.wire import Answer, Line, Progress, Unpacker, Unreadable, pack, pack_message
+from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_c
+from workbench.jobs.wire import Line, Unpacker, Unreadable, pack, pack_message
 from workbench.machine.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.child_python import child_environment, python_command, quick_imports
 from workbench.machine.family import describe_exit, end_family
@@ -40,6 +40,34 @@ News = TypeVar("News")
 
 class PoolError(RuntimeError):
     """A process died or failed; what the others had under way was finished."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a `wire.Call` is."""
+
+    number: int
+    done: int
+    total: int
+    part: bytes = b""
+    """What is known of the answer since the last one, packed; see `wire.Question.part`."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of a `wire.Call`."""
+
+    number: int
+    value: bytes = b""
+    """Packed: only who asked knows of what kind it is to be."""
+    why: str = ""
+    """Why there is no value, for the reader; empty where there is one."""
+    problem: Problem | None = None
+    """What the author's code raised, if that is why."""
+
+
+class CannotAnswer(Exception):
+    """In a worker: a question has no answer here; a sentence."""
 
 
 class Share(Protocol):

@@ -28,8 +28,6 @@ from typing import Any, ClassVar, ForwardRef, Generic, TypeVar, get_args, get_or
 import msgspec
 import numpy as np
 
-from workbench.authoring.problem import Problem
-
 MOST_BYTES = 1 << 30
 """Of one message. The largest of a healthy task are its meshes and the pictures of all envs: some 100 MB."""
 _PIECE, _SMALL = 1 << 18, 1 << 14
@@ -56,43 +54,15 @@ class Question(Generic[Value]):
     """What a worker can be asked in a `Call`; its answer is a `Value`."""
 
     part: ClassVar[Any] = None
-    """The type of `Progress.part`."""
+    """The type of what is told before the answer."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """Request to a worker: an `Answer` with this number comes back, after any count of `Progress`."""
+    """Request to a worker: an answer with this number comes back, after any count of messages on how far it is."""
 
     number: int
     request: Question[Any]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a `Call` is."""
-
-    number: int
-    done: int
-    total: int
-    part: bytes = b""
-    """What is known of the answer since the last one, packed; see `Question.part`."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The end of a `Call`."""
-
-    number: int
-    value: bytes = b""
-    """Packed: only who asked knows of what kind it is to be."""
-    why: str = ""
-    """Why there is no value, for the reader; empty where there is one."""
-    problem: Problem | None = None
-    """What the author's code raised, if that is why."""
-
-
-class CannotAnswer(Exception):
-    """In a worker: a question has no answer here; a sentence."""
 
 
 def value_type(question: type[Question[Any]]) -> Any:

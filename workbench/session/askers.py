@@ -21,7 +21,8 @@ from itertools import count
 from typing import Any, TypeVar
 
 from workbench.core.camera_settings import CameraKey
-from workbench.jobs.wire import Answer, Call, Progress, Question, Unpacker, Unreadable, value_type
+from workbench.jobs.pool import Answer, Progress
+from workbench.jobs.wire import Call, Question, Unpacker, Unreadable, value_type
 from workbench.machine.family import describe_exit
 from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Cancel, Load, PlaceCamera, Request

@@ -18,7 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from workbench.authoring.problem import shorten
-from workbench.jobs.wire import Answer, Call, Unreadable
+from workbench.jobs.pool import Answer
+from workbench.jobs.wire import Call, Unreadable
 from workbench.machine.family import describe_exit
 from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error

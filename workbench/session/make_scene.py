@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workbench.jobs.wire import CannotAnswer
+from workbench.jobs.pool import CannotAnswer
 from workbench.session.pacing import now_and_then
 from workbench.session.questions import MakeScene, SceneMade
 

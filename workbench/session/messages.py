@@ -23,8 +23,9 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.rules import Finding
 from workbench.core.step import StepResult
+from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import ActionSource, Stepped, TaskDescription, TaskOptions
-from workbench.jobs.wire import Answer, Call, Progress, Question
+from workbench.jobs.wire import Call, Question
 
 LoadLevel = Literal["auto", "patched", "cameras", "rebuilt"]
 """How a new version is to come in; ``auto`` for the least that is safe. See `workbench.authoring.changes`."""

@@ -22,8 +22,8 @@ from typing import Any
 from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
+from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import Stepped, TaskOptions
-from workbench.jobs.wire import Answer, Progress
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_studio import CameraStudio

@@ -31,8 +31,9 @@ from workbench.authoring.reference import named_file
 from workbench.core.inspect_env import inspect_env
 from workbench.core.seams import mark_camera_configs
 from workbench.core.step import StepResult
+from workbench.jobs.pool import Answer, CannotAnswer, Progress
 from workbench.jobs.task import Restored
-from workbench.jobs.wire import Answer, Call, CannotAnswer, Progress, Question, pack
+from workbench.jobs.wire import Call, Question, pack
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
 from workbench.session.debugger import (

@@ -35,7 +35,7 @@ from workbench.core.take_pictures import (
     take_pictures,
 )
 from workbench.core.task_env import TaskEnv
-from workbench.jobs.wire import CannotAnswer
+from workbench.jobs.pool import CannotAnswer
 from workbench.session.camera_answers import answer
 from workbench.session.held_task import HeldTask
 from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pictures, PlaceCamera, Placed
