@@ -28,7 +28,7 @@ from workbench.machine.terminal_text import plain_text
 from workbench.recording.sources import Source, UnreadableRecording, sources_among
 from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
-from workbench.session.reload import open_task
+from workbench.session.open_task import open_task
 from workbench.session.rescore import Group, group_episodes, hidden_in_words, judge_each, with_renderer
 from workbench.session.rescore_run import rescore
 from workbench.session.verdict import Verdict

@@ -25,7 +25,8 @@ from workbench.jobs.task import Stepped, TaskOptions
 from workbench.jobs.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
 from workbench.recording.sources import Source
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status
-from workbench.session.questions import QUESTIONS, Rescore
+from workbench.session.questions import QUESTIONS
+from workbench.session.verdict import Rescore
 
 EVENTS: tuple[type, ...] = get_args(Event)
 WHATEVER = st.recursive(

@@ -12,8 +12,7 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import read_states
 from workbench.core.step import StepResult
 from workbench.jobs.task import TaskOptions
-from workbench.session.open_task import OpenedTask, reset_checked, step_checked
-from workbench.session.reload import open_task
+from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked
 
 States = dict[str, np.ndarray]
 

@@ -10,7 +10,8 @@ from tests.drive.session import TASKS
 from workbench.authoring.problem import TaskError
 from workbench.jobs.task import TaskOptions
 from workbench.session.messages import Load
-from workbench.session.reload import Running, load_version, open_task
+from workbench.session.open_task import open_task
+from workbench.session.reload import Running, load_version
 
 KWARGS = {"render_backend": "none"}
 FOR_ONE = "        lifted = float(self.cube.pose.p[:, 2]) > 0.1\n"

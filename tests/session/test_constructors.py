@@ -9,7 +9,7 @@ import pytest
 import workbench
 from workbench.authoring.problem import TaskError
 from workbench.jobs.task import TaskOptions
-from workbench.session.reload import open_task
+from workbench.session.open_task import open_task
 
 HEADER = """
 from mani_skill.agents.registration import register_agent

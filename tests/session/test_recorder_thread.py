@@ -18,8 +18,8 @@ from workbench.jobs.task import Stepped
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.recording.read_episode import read_episode
 from workbench.session import record_live
+from workbench.session.lane import Progress
 from workbench.session.record_live import LiveRecorder, recovered_in_words
-from workbench.session.studio_view import Progress
 from workbench.session.view import KeepStatus, RecordingStatus
 from workbench.ui.record_panel import recording_html
 

@@ -26,8 +26,8 @@ from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.jobs.task import TaskOptions
 from workbench.session.messages import Load, LoadLevel, ReloadReport
-from workbench.session.open_task import OpenedTask, step_checked
-from workbench.session.reload import Running, load_version, open_task
+from workbench.session.open_task import OpenedTask, open_task, step_checked
+from workbench.session.reload import Running, load_version
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

@@ -20,9 +20,9 @@ from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
 from workbench.recording.read_episode import read_episode
 from workbench.session.messages import Event, Load, RulesBroken
-from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, Opening, open_task, reset_checked, step_checked
 from workbench.session.record import RecordOptions, record
-from workbench.session.reload import Running, load_version, open_task
+from workbench.session.reload import Running, load_version
 from workbench.session.session import Session
 
 TASK = """

@@ -12,7 +12,8 @@ from tests.drive.session import TASKS, wait_until
 from workbench.authoring.problem import TaskError
 from workbench.jobs.task import TaskOptions
 from workbench.session.messages import Load
-from workbench.session.reload import load_version, open_task
+from workbench.session.open_task import open_task
+from workbench.session.reload import load_version
 from workbench.session.session import Session
 
 OPTIONS = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})

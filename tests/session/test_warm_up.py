@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from workbench.jobs.task import TaskOptions
-from workbench.session.reload import warm_up
+from workbench.session.open_task import warm_up
 
 
 @pytest.mark.usefixtures("renderer")

@@ -21,11 +21,11 @@ from workbench.core.camera_settings import CameraSettings, why_no_camera
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
 from workbench.session.history import ShownMoment
-from workbench.session.lane import Job, JobFailed, Lane
+from workbench.session.lane import Job, JobFailed, Lane, Progress
 from workbench.session.messages import Load, Reset
 from workbench.session.questions import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.studio_cameras import StudioCameras
-from workbench.session.studio_view import JudgedMoment, Looked, Picked, Progress, StudioCamera
+from workbench.session.studio_view import JudgedMoment, Looked, Picked, StudioCamera
 from workbench.session.timeline import TimeTravel
 
 FIRST_SEED = 10_000

@@ -27,10 +27,12 @@ from workbench.core.snapshot import (
     restore_snapshot,
 )
 from workbench.core.step import StepResult
-from workbench.jobs.task import Restored
-from workbench.session.messages import Restore
+from workbench.jobs.task import NO_MOMENT, Restored
+from workbench.session.messages import Restore, StepBack
 from workbench.session.open_task import OpenedTask, blamed, restore_checked, step_checked
 from workbench.session.questions import Judged, JudgeMoments
+from workbench.session.relive import arrive, how
+from workbench.session.step_back import changed_since
 
 MOST_SECONDS = 8.0
 """A way back that takes longer is given up, and the moment put there."""
@@ -160,3 +162,32 @@ def judge_moments(opened: OpenedTask, request: JudgeMoments) -> Judged:
             # With some of the envs what holds for the whole batch is never put back: neither was it in the record.
             missed |= report.not_carried
     return Judged(tuple(steps), missed)
+
+
+# --- into a recording ----------------------------------------------------------------------------------
+
+
+def step_back(
+    opened: OpenedTask, request: StepBack, on_step: Callable[[int], None]
+) -> tuple[StepResult, Restored]:
+    """Let the envs of `request` stand at the last state of its run.
+
+    Raises:
+        TaskError: the task's code raised on the way; the envs stand somewhere on it.
+    """
+    run = request.run
+    step, arrival = arrive(opened, run, run.length, request.env_idx, on_step)
+    source = request.env_idx
+    where = f"{run.name}, step {run.length}"
+    loaded = opened.loaded
+    file = None if loaded.file is None else str(loaded.file)
+    changed = changed_since(request.source_file, request.source, file, loaded.source)
+    said = f"{where} (changed since: {changed}): {how(arrival)}" if changed else f"{where}: {how(arrival)}"
+    return step, Restored(
+        request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said, number=request.number
+    )
+
+
+def going_there(request: StepBack, done: int) -> str:
+    """For the status line, while it takes long."""
+    return f"going to {request.run.name}: step {done} of {request.run.length}"

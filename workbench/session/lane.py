@@ -12,7 +12,15 @@ from itertools import count
 
 from workbench.authoring.problem import Problem, shorten
 from workbench.machine.watched_thread import say_failure, watched_thread
-from workbench.session.studio_view import Progress
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Of work in the background."""
+
+    what: str
+    done: int
+    total: int
 
 
 class Stopped(Exception):

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring.load import LoadedTask, take_back, with_late_imports
+from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
 from workbench.authoring.problem import (
     MESSAGE_LIMIT,
     Interrupted,
@@ -26,6 +26,7 @@ from workbench.authoring.problem import (
     problem_from_exception,
     shorten,
 )
+from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.assets import MissingAssets
@@ -37,7 +38,7 @@ from workbench.core.rules import Degree, Finding
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.snapshot import RestoreReport, Snapshot
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import list_cameras, segmentation_names
+from workbench.core.take_pictures import list_cameras, recorded_pictures, segmentation_names, take_pictures
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.visibility import objects_to_see
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
@@ -133,6 +134,41 @@ def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
     finally:
         take_back(loaded)
     return True
+
+
+def open_task(
+    reference: TaskName,
+    options: TaskOptions,
+    *,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = warn_of,
+) -> OpenedTask:
+    """Import, build, rehearse and reset a task, to be run without a page.
+
+    Raises:
+        TaskError: with the author's file and line; nothing of the task stays behind.
+    """
+    opening = Opening(on_activity, on_finding)
+    loaded = import_task(reference, options, None, opening)
+    try:
+        return build_task(loaded, options, opening)
+    except TaskError as error:
+        take_back(loaded)
+        raise with_advice(error, loaded, options, lambda: load_task(reference)) from error.__cause__
+    except BaseException:
+        take_back(loaded)
+        raise
+
+
+def import_task(
+    reference: TaskName, options: TaskOptions, source: dict[str, str] | None, opening: Opening
+) -> LoadedTask:
+    """The class of a task, with `source` in place of what is on disk if it is given. Raises TaskError."""
+    opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
+    import_modules(options.imports)
+    loaded = load_task(reference, source=source)
+    opening.clock.lap("import")
+    return loaded
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
@@ -349,3 +385,34 @@ def _env_on_traceback(error: BaseException, cls: type) -> Any:
             return owner
         trace = trace.tb_next
     return None
+
+
+# --- before any ----------------------------------------------------------------------------------------
+
+_SMALL_TASK = "PickCube-v1"
+"""Needs no download, has a sensor and a human camera, and the robot that most tasks have."""
+
+
+def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
+    """What a process does once and takes long over, done before somebody waits for it: make a small env, draw it, and
+    throw it away; ends early when `goes_on` says no.
+
+    To make the first env of a process and read its shapes takes 1.2 s with N = 4 on two cores, the second 0.12, and the
+    first picture of each kind of camera has its shaders compiled: the robot's files, the render system and the shaders
+    are the same, whatever the author's task is.
+
+    It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
+    """
+    # Of the author's own arguments the one that says whether there is anything to draw with.
+    renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
+    try:
+        opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))
+    except TaskError:
+        return
+    try:
+        for camera in recorded_pictures(opened.description.cameras):
+            if not goes_on():
+                return
+            take_pictures(opened.env.env, 0, [camera])
+    finally:
+        opened.env.close()

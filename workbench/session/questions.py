@@ -24,9 +24,8 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.jobs.wire import Question
-from workbench.recording.sources import Source
 from workbench.session.messages import Load, PlaceCamera, Reset, WarmUp
-from workbench.session.verdict import Verdict
+from workbench.session.verdict import Rescore
 
 # --- cameras ---------------------------------------------------------------------------------------
 
@@ -135,30 +134,6 @@ class CaptureMoment(Question[Captured]):
     env_idx: tuple[int, ...]
     """Those whose pictures are wanted, if any."""
     pictures: bool
-
-
-# --- recordings judged again -------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Rescored:
-    """How far a `Rescore` is, or its end."""
-
-    verdicts: tuple[Verdict[Source], ...]
-    """New ones."""
-    steps: int
-    """Control steps of all its episodes so far."""
-    problem: Problem | None = None
-    """What the task's code raised; then it goes no further."""
-
-
-@dataclass(frozen=True)
-class Rescore(Question[Rescored]):
-    """Have a worker with the task open read and judge these episodes; each `Progress.part` is a `Rescored`."""
-
-    part: ClassVar[Any] = Rescored
-    files: tuple[Source, ...]
-    use_env_states: bool
 
 
 # --- the scene of a recording ------------------------------------------------------------------------

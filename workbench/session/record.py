@@ -32,11 +32,10 @@ from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting, RecordActing
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.session.given_actions import SUFFIXES, read_given
-from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, blamed, open_task, reset_checked, step_checked
 from workbench.session.policy import find_policy
 from workbench.session.record_options import RecordArguments
 from workbench.session.relive import put_there
-from workbench.session.reload import open_task
 
 _STEPS_WITHOUT_LIMIT = 200
 _TRIES = 100

@@ -36,11 +36,8 @@ from workbench.core.recorded_state import (
 )
 from workbench.core.snapshot import Snapshot, only_these_move
 from workbench.core.step import StepResult
-from workbench.jobs.task import NO_MOMENT, Restored
-from workbench.session.messages import StepBack
 from workbench.session.number_text import length
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
-from workbench.session.step_back import changed_since
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
 """From here on a state is another one than the recorded, and is put back to it."""
@@ -225,32 +222,6 @@ def _distance(
     now = read_states(env)
     found = [apart(_of(now, i), wanted) for i in chosen]
     return max(metres for metres, _ in found), max(radians for _, radians in found)
-
-
-def step_back(
-    opened: OpenedTask, request: StepBack, on_step: Callable[[int], None]
-) -> tuple[StepResult, Restored]:
-    """Let the envs of `request` stand at the last state of its run.
-
-    Raises:
-        TaskError: the task's code raised on the way; the envs stand somewhere on it.
-    """
-    run = request.run
-    step, arrival = arrive(opened, run, run.length, request.env_idx, on_step)
-    source = request.env_idx
-    where = f"{run.name}, step {run.length}"
-    loaded = opened.loaded
-    file = None if loaded.file is None else str(loaded.file)
-    changed = changed_since(request.source_file, request.source, file, loaded.source)
-    said = f"{where} (changed since: {changed}): {how(arrival)}" if changed else f"{where}: {how(arrival)}"
-    return step, Restored(
-        request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said, number=request.number
-    )
-
-
-def going_there(request: StepBack, done: int) -> str:
-    """For the status line, while it takes long."""
-    return f"going to {request.run.name}: step {done} of {request.run.length}"
 
 
 def how(arrival: Arrival) -> str:

@@ -10,7 +10,6 @@ step (which are undone) where those changed too. What fails leaves everything as
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,17 +19,16 @@ from workbench.authoring.inherited import inherited_by
 from workbench.authoring.load import (
     LoadedTask,
     Refused,
-    import_modules,
     load_task,
     take_back,
     with_late_imports,
 )
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import Interrupted, TaskError
-from workbench.authoring.reference import TaskName, class_beside
+from workbench.authoring.reference import class_beside
 from workbench.authoring.same_function import line_in
 from workbench.core import actions
-from workbench.core.broken_rule import BrokenRules, warn_of
+from workbench.core.broken_rule import BrokenRules
 from workbench.core.exchange import (
     can_exchange_cameras,
     exchange_cameras,
@@ -42,9 +40,8 @@ from workbench.core.rules import Finding
 from workbench.core.seams import task_class
 from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import list_cameras, recorded_pictures, take_pictures
+from workbench.core.take_pictures import list_cameras
 from workbench.core.task_env import TaskEnv
-from workbench.jobs.task import TaskOptions
 from workbench.session.messages import Load, ReloadReport
 from workbench.session.open_task import (
     Clock,
@@ -52,6 +49,7 @@ from workbench.session.open_task import (
     Opening,
     blamed,
     build_task,
+    import_task,
     notices_of,
     reset_checked,
     returns_check,
@@ -89,10 +87,7 @@ def load_version(
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
-    opening.on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
-    import_modules(request.options.imports)
-    loaded = load_task(request.task, source=request.source)
-    opening.clock.lap("import")
+    loaded = import_task(request.task, request.options, request.source, opening)
     try:
         return _bring_in(request, running, before, loaded, opening)
     except TaskError as error:
@@ -114,21 +109,6 @@ def load_version(
             lambda: load_task(request.task, source=request.source),
             knows_others,
         ) from error.__cause__
-
-
-def open_task(
-    reference: TaskName,
-    options: TaskOptions,
-    *,
-    on_activity: Callable[[str], None] = lambda activity: None,
-    on_finding: Callable[[Finding], None] = warn_of,
-) -> OpenedTask:
-    """Import, build, rehearse and reset a task, to be run without a page.
-
-    Raises:
-        TaskError: with the author's file and line; nothing of the task stays behind.
-    """
-    return load_version(Load(reference, options), None, Opening(on_activity, on_finding))[0]
 
 
 _MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
@@ -364,34 +344,3 @@ def _restore(
     with blamed("reset", opened.loaded, task):
         report = restore_snapshot(task.env, snapshot, there)
         return task.judge(action if fits else None), report
-
-
-# --- before any ----------------------------------------------------------------------------------------
-
-_SMALL_TASK = "PickCube-v1"
-"""Needs no download, has a sensor and a human camera, and the robot that most tasks have."""
-
-
-def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
-    """What a process does once and takes long over, done before somebody waits for it: make a small env, draw it, and
-    throw it away; ends early when `goes_on` says no.
-
-    To make the first env of a process and read its shapes takes 1.2 s with N = 4 on two cores, the second 0.12, and the
-    first picture of each kind of camera has its shaders compiled: the robot's files, the render system and the shaders
-    are the same, whatever the author's task is.
-
-    It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
-    """
-    # Of the author's own arguments the one that says whether there is anything to draw with.
-    renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
-    try:
-        opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))
-    except TaskError:
-        return
-    try:
-        for camera in recorded_pictures(opened.description.cameras):
-            if not goes_on():
-                return
-            take_pictures(opened.env.env, 0, [camera])
-    finally:
-        opened.env.close()

@@ -30,7 +30,6 @@ from workbench.session.clearance import Clearances, NotCleared, Wanted, recorded
 from workbench.session.judging import JudgedView, Judging
 from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Load
-from workbench.session.questions import Rescore, Rescored
 from workbench.session.step_back import (
     CannotStepIn,
     NoText,
@@ -39,7 +38,7 @@ from workbench.session.step_back import (
     recorded_source,
     reference_of,
 )
-from workbench.session.verdict import Verdict
+from workbench.session.verdict import Rescore, Rescored, Verdict
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,9 @@ from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.recording.sources import Source
 from workbench.session.open_task import OpenedTask, blamed, step_checked
-from workbench.session.questions import Rescore, Rescored
 from workbench.session.relive import begin_again, put_there, why_not_lived_through
 from workbench.session.step_back import run_of
-from workbench.session.verdict import Said, Verdict, compare, single_numbers
+from workbench.session.verdict import Rescore, Rescored, Said, Verdict, compare, single_numbers
 
 _TELL_EVERY = 0.2
 """Seconds."""

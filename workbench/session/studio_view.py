@@ -89,15 +89,6 @@ class Writing:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Of work in the background."""
-
-    what: str
-    done: int
-    total: int
-
-
-@dataclass(frozen=True)
 class Picked:
     """What a pixel of a picture shows."""
 

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from workbench.authoring.problem import Problem
+from workbench.jobs.wire import Question
+from workbench.recording.sources import Source
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
 """Numbers that differ by no more than this share of the largest recorded one, or by no more than this, are the same."""
@@ -225,3 +229,27 @@ def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
     if values is not None:
         found[: len(values)] = values[:states] > 0.5
     return found
+
+
+# --- recordings judged again -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rescored:
+    """How far a `Rescore` is, or its end."""
+
+    verdicts: tuple[Verdict[Source], ...]
+    """New ones."""
+    steps: int
+    """Control steps of all its episodes so far."""
+    problem: Problem | None = None
+    """What the task's code raised; then it goes no further."""
+
+
+@dataclass(frozen=True)
+class Rescore(Question[Rescored]):
+    """Have a worker with the task open read and judge these episodes; what is told meanwhile are `Rescored` too."""
+
+    part: ClassVar[Any] = Rescored
+    files: tuple[Source, ...]
+    use_env_states: bool

@@ -18,10 +18,11 @@ from workbench.jobs.task import TaskDescription
 from workbench.session.curves import Curves
 from workbench.session.judging import JudgedView
 from workbench.session.kept_worker import Vitals
+from workbench.session.lane import Progress
 from workbench.session.last_words import Busy
 from workbench.session.messages import ReloadReport, RulesBroken, Settings
 from workbench.session.printed import NOTHING_PRINTED, Printed
-from workbench.session.studio_view import Progress, StudioView
+from workbench.session.studio_view import StudioView
 from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]

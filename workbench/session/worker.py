@@ -42,7 +42,7 @@ from workbench.session.debugger import (
     listening_for_a_debugger,
     wait_for_debugger,
 )
-from workbench.session.go_back import go_back, going_back, judge_moments
+from workbench.session.go_back import go_back, going_back, going_there, judge_moments, step_back
 from workbench.session.held_task import HeldTask, ServerLine
 from workbench.session.interrupts import Interrupts
 from workbench.session.make_scene import SceneEnv
@@ -71,20 +71,13 @@ from workbench.session.messages import (
     StepBack,
     WarmUp,
 )
-from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked, warm_up
 from workbench.session.pacing import Pacer, Rate, now_and_then
 from workbench.session.pulse import Doing, PulseWriter
-from workbench.session.questions import (
-    CameraQuestion,
-    CaptureMoment,
-    JudgeMoments,
-    MakeScene,
-    Rescore,
-    RunCameras,
-)
-from workbench.session.relive import going_there, step_back
-from workbench.session.reload import Running, load_version, warm_up
+from workbench.session.questions import CameraQuestion, CaptureMoment, JudgeMoments, MakeScene, RunCameras
+from workbench.session.reload import Running, load_version
 from workbench.session.step_events import StepEvents
+from workbench.session.verdict import Rescore
 from workbench.session.worker_cameras import WorkerCameras
 
 _STATUS_PERIOD = 0.25

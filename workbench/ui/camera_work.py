@@ -13,8 +13,8 @@ from typing import ClassVar
 
 import viser
 
+from workbench.session.lane import Progress
 from workbench.session.session import Session
-from workbench.session.studio_view import Progress
 from workbench.ui.fragments import render
 
 JUST = 1.0
