@@ -20,7 +20,7 @@ from workbench.recording.read_episode import read_episode
 from workbench.session import record_live
 from workbench.session.lane import Progress
 from workbench.session.record_live import LiveRecorder, recovered_in_words
-from workbench.session.view import KeepStatus, RecordingStatus
+from workbench.session.record_status import KeepStatus, RecordingStatus
 from workbench.ui.record_panel import recording_html
 
 

@@ -13,7 +13,8 @@ from workbench.core.pictures import CameraInfo, CameraKind
 from workbench.core.step import StepResult
 from workbench.jobs.task import ActionDimension, TaskDescription
 from workbench.session.messages import Settings
-from workbench.session.view import RecordingStatus, SessionView
+from workbench.session.record_status import RecordingStatus
+from workbench.session.view import SessionView
 
 
 def box_mesh(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Mesh:

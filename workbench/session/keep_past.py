@@ -34,7 +34,7 @@ from workbench.session.history import History, Lived, Moment
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, PlaceCamera, Reset
 from workbench.session.questions import CaptureMoment
-from workbench.session.view import KeepStatus
+from workbench.session.record_status import KeepStatus
 
 
 @dataclass(frozen=True)

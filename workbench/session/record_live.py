@@ -22,7 +22,7 @@ from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
 from workbench.recording.reading import mend
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer
-from workbench.session.view import RecordingStatus
+from workbench.session.record_status import RecordingStatus
 
 _MOST_WAITING = 256 * 1024**2
 """Bytes of steps that the disk has not taken."""

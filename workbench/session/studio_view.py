@@ -17,6 +17,7 @@ from workbench.core.pictures import CameraInfo, Picture
 
 if TYPE_CHECKING:
     from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.session.lane import Progress
 
 WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
 """``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what

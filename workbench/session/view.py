@@ -18,50 +18,16 @@ from workbench.jobs.task import TaskDescription
 from workbench.session.curves import Curves
 from workbench.session.judging import JudgedView
 from workbench.session.kept_worker import Vitals
-from workbench.session.lane import Progress
 from workbench.session.last_words import Busy
 from workbench.session.messages import ReloadReport, RulesBroken, Settings
 from workbench.session.printed import NOTHING_PRINTED, Printed
+from workbench.session.record_status import RecordingStatus
 from workbench.session.studio_view import StudioView
 from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 """``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
 ``error``: a problem stands (see `SessionView.problem`); ``stopped``: the worker is gone."""
-
-
-@dataclass(frozen=True)
-class KeepStatus:
-    said: str = ""
-    """What came of the last one, once it has ended."""
-    failed: bool = False
-    """`said` is why it did not go well."""
-    progress: Progress | None = None
-    """In moments; None while nothing is kept."""
-
-
-@dataclass(frozen=True)
-class RecordingStatus:
-    """What is recorded now, and what came of it."""
-
-    active: bool = False
-    env_idx: tuple[int, ...] = ()
-    waiting: int = 0
-    """Envs of these whose episode has not begun: their next reset is waited for."""
-    steps: int = 0
-    """Steps captured of the episodes under way."""
-    bytes_written: int = 0
-    """Of this session's episodes, those under way too."""
-    episodes_written: int = 0
-    being_written: int = 0
-    """Episodes that are over, and whose files are being made."""
-    recovered: tuple[str, ...] = ()
-    """Episodes that an earlier server left half written, and that were mended at the start: their .rrd files."""
-    folder: str = ""
-    last_file: str | None = None
-    problem: str | None = None
-    """Why the recording ended, or the last file could not be written."""
-    keeping: KeepStatus = field(default_factory=KeepStatus)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ import shlex
 import viser
 
 from workbench.session.record_live import recovered_in_words
+from workbench.session.record_status import RecordingStatus
 from workbench.session.session import Session
-from workbench.session.view import RecordingStatus, SessionView
+from workbench.session.view import SessionView
 from workbench.ui.fragments import counted, render
 from workbench.ui.parts import PagePart
 
