@@ -20,13 +20,12 @@ from workbench.core.camera_report import CameraReport, OfferedPlacement, SearchS
 from workbench.core.camera_settings import CameraSettings, why_no_camera
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
-from workbench.session.history import ShownMoment
+from workbench.session.history import Shown, ShownMoment
 from workbench.session.lane import Job, JobFailed, Lane, Progress
 from workbench.session.messages import Load, Reset
 from workbench.session.questions import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import JudgedMoment, Looked, Picked, StudioCamera
-from workbench.session.timeline import TimeTravel
 
 FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
@@ -52,7 +51,7 @@ class CameraJudging:
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        past: TimeTravel,
+        past: Shown,
         load: Callable[[], Load | None],
     ) -> None:
         """

@@ -20,6 +20,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 from workbench.authoring import camera_files
@@ -36,13 +37,11 @@ from workbench.jobs.task import TaskDescription
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging
 from workbench.session.lane import Job, JobFailed, Lane
-from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request
+from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.questions import DrawCamera
 from workbench.session.studio_cameras import Step, StudioCameras
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioView
-from workbench.session.timeline import TimeTravel
-from workbench.session.versions import Versions
 
 IN_A_QUICK_LOOK = ("rgb", "depth", "segmentation")
 Sight = tuple[StepResult | None, DrawCamera]
@@ -58,8 +57,9 @@ class CameraStudio:
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        past: TimeTravel,
-        versions: Versions,
+        past: Shown,
+        load: Callable[[], Load | None],
+        open_file: Callable[[Path, str], None],
     ) -> None:
         """
         Args:
@@ -67,14 +67,15 @@ class CameraStudio:
             background: asks the other.
             on_change: called, on any thread, when `view` has something new.
             past: says which moment the page shows.
-            versions: say how another worker gets the version that runs, and open another file.
+            load: how another worker gets the version that runs; None while there is none.
+            open_file: opens a class of another file.
         """
         self._send, self._on_change = send, on_change
         self._shown = past.shown_moment
-        self._cameras, load = StudioCameras(), versions.same_again
+        self._cameras = StudioCameras()
         self._lock = self._cameras.lock
         self._asker = asker
-        self.file = StudioFile(self._cameras, self._note, versions.open_file, asker, load, self._shown)
+        self.file = StudioFile(self._cameras, self._note, open_file, asker, load, self._shown)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0

@@ -21,6 +21,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,6 +152,18 @@ class ShownMoment:
     def of(self, env: int) -> NDArray[np.float32] | None:
         """(B, 7) of one env."""
         return None if self.poses is None else self.poses[env]
+
+
+class Shown(Protocol):
+    """Says which moments the page shows."""
+
+    def shown_moment(self) -> ShownMoment:
+        """That of the selected env."""
+        ...
+
+    def episode_moments(self, most: int) -> tuple[Lived, ...]:
+        """Of the selected env's episode round the one that is shown, at the most so many."""
+        ...
 
 
 class History:

@@ -124,7 +124,13 @@ class Session:
         """What the batch lived through."""
         self._asker = Asker(self._send)
         self.studio = CameraStudio(
-            self._send, self._asker, self._background, self._note, self.past, self.versions
+            self._send,
+            self._asker,
+            self._background,
+            self._note,
+            self.past,
+            self.versions.same_again,
+            self.versions.open_file,
         )
         """Cameras placed by hand."""
         listen(self._say)
