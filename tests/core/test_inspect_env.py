@@ -16,6 +16,7 @@ import torch
 
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core import actions, seams
+from workbench.core.cpu_system import batched_system
 from workbench.core.inspect_env import MOST_VALUES, inspect_env
 from workbench.core.inspection import SECTIONS, Inspection
 from workbench.core.scene_index import scene_index
@@ -68,7 +69,7 @@ def test_a_joint_without_a_drive_has_no_target() -> None:
 def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
     for env in range(3):
         own: dict[frozenset[str], np.ndarray] = {}
-        for contact in seams.batched_system(pick.env.scene).systems[env].get_contacts():
+        for contact in batched_system(pick.env.scene).systems[env].get_contacts():
             first, second = (str(scene_index(pick.env).name_of(body)) for body in contact.bodies)
             impulse = sum((np.array(point.impulse) for point in contact.points), np.zeros(3))
             sign = 1 if first <= second else -1

@@ -22,6 +22,7 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.cpu_system import batched_system
 from workbench.core.env_numbers import require_env
 from workbench.core.scene_index import SceneIndex, scene_index
 
@@ -71,7 +72,7 @@ def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
     """
     env, env_idx = seams.open_env(env), operator.index(env_idx)
     require_env(env_idx, env.num_envs)
-    batched = seams.batched_system(env.scene)
+    batched = batched_system(env.scene)
     if batched is None and env.scene.gpu_sim_enabled:
         raise NotImplementedError(
             "PhysX on the GPU keeps no list of contacts that can be read: open the task with the CPU backend."

@@ -47,7 +47,7 @@ from workbench.core.broken_rule import (
     warn_of,
 )
 from workbench.core.contacts import CpuArray
-from workbench.core.cpu_system import BatchedCpuSystem
+from workbench.core.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.drawn_poses import NOWHERE_ELSE, drawn_at
 from workbench.core.partial_reset import (
     KeptControllers,
@@ -319,7 +319,7 @@ def batched_class(
         rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
         on_finding: called with each place where a rule is broken that does not stop the task, the first time.
     """
-    install_index_seams()
+    install_index_seams(batched_system)
     install_struct_access()
     namespace = {
         "__module__": task.__module__,

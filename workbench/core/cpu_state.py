@@ -48,9 +48,8 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core.cpu_layout import BODY
-from workbench.core.cpu_system import BatchedCpuSystem
+from workbench.core.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.scene_index import hidden_poses, once_a_scene, scene_index
-from workbench.core.seams import batched_system
 
 _ATTEMPTS = 4
 """How often a root pose is asked for; in all tasks that were tried, two were enough."""

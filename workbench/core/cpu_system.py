@@ -451,3 +451,11 @@ class BatchedCpuSystem:
 
 def _array(values: NDArray[np.float32]) -> CpuArray:
     return CpuArray(torch.from_numpy(values))
+
+
+def batched_system(scene: Any) -> BatchedCpuSystem | None:
+    """The batched CPU system of a ManiSkillScene, or None for any other scene.
+
+    Not isinstance: `BatchedCpuSystem` answers that question as a ``PhysxGpuSystem`` would.
+    """
+    return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None

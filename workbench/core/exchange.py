@@ -17,6 +17,7 @@ from mani_skill.utils import common
 
 from workbench.core import seams
 from workbench.core.cpu_scene import BatchedCpuMixin, batched_class
+from workbench.core.cpu_system import batched_system
 from workbench.core.snapshot import in_this_state, restore_memory, restore_snapshot, take_snapshot
 from workbench.core.strict import StrictMixin
 
@@ -41,7 +42,7 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 def can_exchange_cameras(env: BaseEnv) -> bool:
     """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone."""
     plain = all(seams.camera_components(camera) for camera in seams.cameras(env).values())
-    return plain and seams.batched_system(env.scene) is not None
+    return plain and batched_system(env.scene) is not None
 
 
 def exchange_cameras(env: BaseEnv) -> None:

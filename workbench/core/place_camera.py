@@ -27,6 +27,7 @@ from mani_skill.utils.structs.pose import Pose
 from workbench.core import seams
 from workbench.core.camera_frames import matrix3, triple
 from workbench.core.camera_settings import NOT_ON_THE_GPU, CameraKey, CameraSettings, why_no_camera
+from workbench.core.cpu_system import batched_system
 
 
 @dataclass
@@ -96,7 +97,7 @@ def _camera(env: Any, key: CameraKey) -> Any:
         raise ValueError(f"there is no {kind} camera {name!r}")
     if not seams.camera_components(camera):
         raise ValueError(f"{name!r} is no plain camera, and only those can be placed")
-    if env.scene.gpu_sim_enabled and seams.batched_system(env.scene) is None:
+    if env.scene.gpu_sim_enabled and batched_system(env.scene) is None:
         raise ValueError(NOT_ON_THE_GPU)
     return camera
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.cpu_layout import BODY
 from workbench.core.cpu_state import renew_physics
+from workbench.core.cpu_system import batched_system
 from workbench.core.entries import flat_entries
 from workbench.core.partial_reset import active_controllers
 from workbench.core.recorded_run import pose_distances
@@ -90,7 +91,7 @@ def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
 
 def new_physics(env: Any, env_idx: Sequence[int]) -> None:
     """Let PhysX forget what these envs did before; on a GPU there is no way to."""
-    if seams.batched_system(env.scene) is not None:
+    if batched_system(env.scene) is not None:
         renew_physics(env.scene, [int(i) for i in env_idx])
 
 

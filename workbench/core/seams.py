@@ -41,20 +41,12 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CallSite, CameraKey, CameraKind
-from workbench.core.cpu_system import BatchedCpuSystem
-
-
-def batched_system(scene: Any) -> BatchedCpuSystem | None:
-    """The batched CPU system of a ManiSkillScene, or None for any other scene.
-
-    Not isinstance: `BatchedCpuSystem` answers that question as a ``PhysxGpuSystem`` would.
-    """
-    return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None
 
 
 @cache
-def install_index_seams() -> None:
-    """Let ManiSkill's structs find their rows in a batched CPU system. Safe to call again."""
+def install_index_seams(batched_system: Callable[[Any], Any]) -> None:
+    """Let ManiSkill's structs find their rows in a batched CPU system: `batched_system(scene)`, None for any other scene.
+    Safe to call again."""
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_set_ee_action = PDEEPosController.set_action
 
@@ -72,13 +64,27 @@ def install_index_seams() -> None:
         else:
             _set_ee_action_of_each_env(self, action)
 
-    _find_rows(
-        PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", BatchedCpuSystem.row_of, torch.int64
-    )
-    _find_rows(Articulation, "_data_index", "_objs", BatchedCpuSystem.index_of, torch.int32)
-    _find_rows(
-        ArticulationJoint, "_data_index", "_physx_articulations", BatchedCpuSystem.index_of, torch.int32
-    )
+    def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
+        """Let the cached property `name` of a batched CPU scene's struct be where `find` has each of its `things`."""
+        stock = owner.__dict__[name].func
+
+        def rows(self: Any) -> torch.Tensor:
+            system = batched_system(self.scene)
+            if system is None:
+                return stock(self)
+            place = system.row_of if find == "row" else system.index_of
+            return torch.tensor(
+                [place(thing) for thing in getattr(self, things)], device=self.device, dtype=dtype
+            )
+
+        value = cached_property(rows)
+        # Assigned after the class body it has no name, and raises when it is first read.
+        value.__set_name__(owner, name)
+        setattr(owner, name, value)
+
+    find_rows(PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", "row", torch.int64)
+    find_rows(Articulation, "_data_index", "_objs", "index", torch.int32)
+    find_rows(ArticulationJoint, "_data_index", "_physx_articulations", "index", torch.int32)
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
 
@@ -107,25 +113,6 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
         controller._step_size = (controller._target_qpos - start) / controller._sim_steps
     else:
         controller.set_drive_targets(controller._target_qpos)
-
-
-def _find_rows(
-    owner: type, name: str, things: str, find: Callable[[BatchedCpuSystem, Any], int], dtype: torch.dtype
-) -> None:
-    """Let the cached property `name` of a batched CPU scene's struct be where `find` has each of its `things`."""
-    stock = owner.__dict__[name].func
-
-    def rows(self: Any) -> torch.Tensor:
-        system = batched_system(self.scene)
-        if system is None:
-            return stock(self)
-        found = [find(system, thing) for thing in getattr(self, things)]
-        return torch.tensor(found, device=self.device, dtype=dtype)
-
-    value = cached_property(rows)
-    # Assigned after the class body it has no name, and raises when it is first read.
-    value.__set_name__(owner, name)
-    setattr(owner, name, value)
 
 
 _BETWEEN_SUBSTEPS = ("_step_action", "_before_simulation_step", "_after_simulation_step")

@@ -48,6 +48,7 @@ from workbench.core.cpu_state import (
     read_cpu_state,
     write_cpu_state,
 )
+from workbench.core.cpu_system import batched_system
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.episode_rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
 from workbench.core.gpu_state import GpuState, read_gpu_state, write_gpu_state
@@ -104,7 +105,7 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
     """
     env = seams.open_env(env)
     chosen = envs_of_batch(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
-    px = seams.batched_system(env.scene)
+    px = batched_system(env.scene)
     if px is not None:
         simulation: Any = read_cpu_state(env, chosen)
     else:
@@ -150,7 +151,7 @@ def restore_snapshot(
     if not isinstance(snapshot, Snapshot):
         raise TypeError(f"a Snapshot is wanted, as take_snapshot gives it, not {type(snapshot).__name__}")
     targets, positions = _pairs(env, snapshot, env_idx, source)
-    px = seams.batched_system(env.scene)
+    px = batched_system(env.scene)
     state: Any = snapshot.simulation
     if isinstance(state, CpuState) != (px is not None):
         raise TypeError(
@@ -288,7 +289,7 @@ def only_these_move(env: Any, env_idx: Sequence[int], others: Snapshot | None) -
         others: all other envs as they are now, which they are at the end again; None for a batch in which nobody
             asks for what the others were.
     """
-    px = seams.batched_system(env.scene)
+    px = batched_system(env.scene)
     if px is None:
         try:
             yield

@@ -40,8 +40,8 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct, PhysxRi
 from mani_skill.utils.structs.link import Link
 from mani_skill.utils.structs.pose import vectorize_pose
 
+from workbench.core.cpu_system import batched_system
 from workbench.core.mirrors import Group
-from workbench.core.seams import batched_system
 from workbench.core.strict_system import StrictCpuSystem
 
 Index = Callable[[Any], torch.Tensor]

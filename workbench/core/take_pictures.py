@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.camera_settings import CameraKey
+from workbench.core.cpu_system import batched_system
 from workbench.core.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
 from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
@@ -187,7 +188,7 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
     if poses is not None:
         each = zip(scene_index(env).entities[env_index], poses, strict=True)
         return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
-    px = seams.batched_system(env.scene)
+    px = batched_system(env.scene)
     return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
 
 
@@ -353,7 +354,7 @@ def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[P
     scene: Any = task.env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
-    px = seams.batched_system(scene)
+    px = batched_system(scene)
     elsewhere = {} if px is None else px.elsewhere(env_idx)
     found = []
     for at, env in enumerate(env_idx):

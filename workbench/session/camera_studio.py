@@ -36,6 +36,7 @@ from workbench.core.step import StepResult
 from workbench.jobs.task import TaskDescription
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging
+from workbench.session.history import Shown
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.questions import DrawCamera

@@ -17,7 +17,8 @@ from collections.abc import Callable, Mapping
 from itertools import count
 
 from workbench.authoring.problem import Interrupted, TaskError
-from workbench.core import actions, seams
+from workbench.core import actions
+from workbench.core.cpu_system import batched_system
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
@@ -89,7 +90,7 @@ def _live_through(
     task, env = opened.env, opened.env.env
     width = actions.width(task.parts)
     ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (width,)}
-    px = seams.batched_system(env.scene)
+    px = batched_system(env.scene)
     if px is None or not ways:
         return []
     others = [i for i in range(task.num_envs) if i not in ways]
