@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.rescore_command import print_verdicts
 from workbench.session.verdict import Verdict
 

@@ -25,7 +25,8 @@ from workbench.jobs.task import TaskOptions
 from workbench.machine.atomic_files import replace_file
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
-from workbench.recording.sources import Source, UnreadableRecording, sources_among
+from workbench.recording.source import Source, UnreadableRecording
+from workbench.recording.sources import sources_among
 from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.open_task import open_task

@@ -8,7 +8,8 @@ from pathlib import Path
 from rich.progress import TimeRemainingColumn
 
 from workbench.recording.lerobot_export import DoesNotFit, ExportOptions
-from workbench.recording.sources import Source, sources_among
+from workbench.recording.source import Source
+from workbench.recording.sources import sources_among
 from workbench.terminal import progress_bar, refuse, say
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
 

@@ -23,7 +23,7 @@ from workbench.core.rules import Finding
 from workbench.jobs.pool import Answer
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.jobs.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status
 from workbench.session.questions import QUESTIONS
 from workbench.session.verdict import Rescore

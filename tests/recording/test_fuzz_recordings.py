@@ -31,7 +31,7 @@ from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.lerobot_export import export_lerobot
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import read_episode
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 from workbench.session.review_events import happenings
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -19,7 +19,7 @@ from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.read_episode import UnreadableRecording, read_episode
-from workbench.recording.sources import sources_among
+from workbench.recording.sources import read_source, sources_among
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -205,8 +205,8 @@ def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Pa
     broken, whole = sources_among([tmp_path])
     assert (broken.name, whole.name) == ("broken#0", "whole#0")
     with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
-        broken.read()
-    np.testing.assert_array_equal(whole.read().action, episode.action)
+        read_source(broken)
+    np.testing.assert_array_equal(read_source(whole).action, episode.action)
 
 
 def test_a_dataset_is_in_the_library_an_episode_a_row(
@@ -220,7 +220,7 @@ def test_a_dataset_is_in_the_library_an_episode_a_row(
         assert (first.name, first.kind, first.success) == ("sets/push#0", "lerobot", False)
         assert (second.success, second.length, second.seed) == (True, episode.length, episode.info.seed)
         assert second.problem is None
-        np.testing.assert_array_equal(second.source.read().action, episode.action)
+        np.testing.assert_array_equal(read_source(second.source).action, episode.action)
         with pytest.raises(LibraryError, match="delete the folder"):
             library.delete([first.id, second.id])
         assert is_lerobot(tmp_path / "sets" / "push")

@@ -26,7 +26,7 @@ from workbench.recording.library import Library
 from workbench.recording.library_row import Facts
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import read_episode
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

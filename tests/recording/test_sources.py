@@ -8,7 +8,8 @@ import pytest
 
 from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
-from workbench.recording.sources import Kind, Source, UnreadableRecording, sources_among
+from workbench.recording.source import Kind, Source, UnreadableRecording
+from workbench.recording.sources import read_source, sources_among
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is
 
 def test_an_episode_is_read_by_the_way_of_its_kind(child_process: None, tmp_path: Path) -> None:
     theirs = write_h5(tmp_path)
-    episode = Source(theirs, "traj_0").read()
+    episode = read_source(Source(theirs, "traj_0"))
     assert (episode.info.task, episode.length) == ("PickCube-v1", 3)
     with pytest.raises(UnreadableRecording, match="theirs"):
-        Source(theirs, "traj_1").read()
+        read_source(Source(theirs, "traj_1"))

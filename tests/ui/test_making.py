@@ -13,7 +13,8 @@ from tests.drive.waiting import until
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.sources import Source, sources_among
+from workbench.recording.source import Source
+from workbench.recording.sources import sources_among
 from workbench.ui.make_shared import Wanted
 from workbench.ui.making import Making, MakingView
 

@@ -16,7 +16,7 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from workbench.authoring.problem import Problem
 from workbench.recording.library import Library
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.session import rescore_words as words
 from workbench.session.judging import JudgedView
 from workbench.session.review import Review

@@ -10,7 +10,7 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.ui.door import Door
 from workbench.ui.file_reply import Offers
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted

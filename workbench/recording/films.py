@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from workbench.machine.atomic_files import new_file
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording.encoded_pictures import MOST_PIXELS, encode_jpeg
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 29

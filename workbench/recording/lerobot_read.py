@@ -29,7 +29,7 @@ from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures, L
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.recording.films import FilmPart
 from workbench.recording.library_row import Facts, text, whole
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 
 USUAL_FOVY = math.radians(60)
 """A dataset does not say how its cameras see; nothing is computed from this."""

@@ -37,7 +37,7 @@ from workbench.recording.library_row import (
 )
 from workbench.recording.library_scan import DATASET_KEY, NOTES, Found, broken
 from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 
 Kind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
 LONGEST_TAG = 40

@@ -29,7 +29,7 @@ from workbench.recording.encoded_pictures import (
 )
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 
 _PICTURES = ("sensor_data", "sensor_param")
 _UNKNOWN_DT = 0.05

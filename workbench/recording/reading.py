@@ -40,7 +40,7 @@ from workbench.recording.reader.requests import (
     SourcesFound,
     ToldRerun,
 )
-from workbench.recording.sources import Kind, Source, UnreadableRecording
+from workbench.recording.source import Kind, Source, UnreadableRecording
 
 ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0

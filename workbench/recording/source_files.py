@@ -9,7 +9,7 @@ from pathlib import Path
 from workbench.recording.document import Document, WrongDocument, read_document
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows
 from workbench.recording.read_maniskill import trajectories
-from workbench.recording.sources import Source, UnreadableRecording
+from workbench.recording.source import Source, UnreadableRecording
 
 _OURS = (".rrd", ".h5", ".json")
 

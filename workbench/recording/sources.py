@@ -1,55 +1,19 @@
-"""Which recordings somebody means by naming files, folders or rows of the library, and how each of them is read."""
+"""Which recordings are meant by naming files, folders or rows of the library; and each of them read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
-if TYPE_CHECKING:
-    from workbench.core.geometry import SharedShapes
-    from workbench.recording.episode import Episode
-
-Kind = Literal["ours", "maniskill", "lerobot"]
-"""Who made a recording: which of the three ways to read it."""
+from workbench.core.geometry import SharedShapes
+from workbench.recording.episode import Episode
+from workbench.recording.reading import find_sources, read_recording
+from workbench.recording.source import Source, UnreadableRecording
 
 
-class UnreadableRecording(ValueError):
-    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
-
-
-@dataclass(frozen=True)
-class Source:
-    """One recording, not read yet."""
-
-    path: Path
-    """A file of ours, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
-    part: str | None = None
-    """Which of several: ``traj_3``, or the number of the dataset's episode."""
-    id: str = ""
-    """What the caller knows it by."""
-    name: str = ""
-    """For people."""
-
-    @property
-    def stem(self) -> str:
-        """Of the names of what is made from it."""
-        stem = self.path.name if self.kind == "lerobot" else self.path.stem
-        return stem if self.part is None else f"{stem}_{self.part}"
-
-    @property
-    def kind(self) -> Kind:
-        if self.part is None:
-            return "ours"
-        return "maniskill" if self.path.suffix == ".h5" else "lerobot"
-
-    def read(self, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
-        """The episode; arguments and errors as of `read_recording`."""
-        # Not at the top: every worker knows sources, and few read one.
-        from workbench.recording.reading import read_recording
-
-        return read_recording(self.kind, self.path, self.part or "", shapes, folder)
+def read_source(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
+    """The episode; arguments and errors as of `read_recording`."""
+    return read_recording(source.kind, source.path, source.part or "", shapes, folder)
 
 
 def sources_among(paths: Sequence[Path]) -> tuple[Source, ...]:
@@ -59,8 +23,6 @@ def sources_among(paths: Sequence[Path]) -> tuple[Source, ...]:
         FileNotFoundError: there is nothing at one of them.
         UnreadableRecording: a file is, or all folders together hold, no recording; the message says what is looked for.
     """
-    from workbench.recording.reading import find_sources
-
     found: dict[str, Source] = {}
     for path in paths:
         path = Path(path)

@@ -24,7 +24,8 @@ from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import made_here
 from workbench.recording.side_files import side_files_in_words
-from workbench.recording.sources import Source, UnreadableRecording
+from workbench.recording.source import Source, UnreadableRecording
+from workbench.recording.sources import read_source
 from workbench.session.askers import Background
 from workbench.session.clearance import Clearances, NotCleared, Wanted, recorded_content
 from workbench.session.judging import JudgedView, Judging
@@ -168,11 +169,11 @@ def with_renderer(options: TaskOptions) -> TaskOptions:
 
 
 def _info_of(source: Source) -> EpisodeInfo:
-    """Raises as `Source.read`, which it spares where it can: pictures and meshes need not be read for it."""
+    """Raises as `read_source`, which it spares where it can: pictures and meshes need not be read for it."""
     try:
         return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
-        return source.read().info
+        return read_source(source).info
 
 
 MOST_AT_ONCE = 16

@@ -22,7 +22,8 @@ from workbench.core.recorded_state import apart, read_states
 from workbench.core.snapshot import only_these_move
 from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
+from workbench.recording.sources import read_source
 from workbench.session.open_task import OpenedTask, blamed, step_checked
 from workbench.session.relive import begin_again, put_there, why_not_lived_through
 from workbench.session.step_back import run_of
@@ -149,7 +150,7 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
 
 def _ready(opened: OpenedTask, file: Source, use_env_states: bool) -> _Seat | Verdict[Source]:
     try:
-        episode = file.read()
+        episode = read_source(file)
     except (UnreadableRecording, OSError) as error:
         return Verdict(file, why_not=str(error))
     run, info = run_of(episode), episode.info

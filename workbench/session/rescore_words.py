@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.session.number_text import length, mean_text, number_text
 from workbench.session.verdict import FLAGS, Verdict
 

@@ -28,7 +28,8 @@ from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
 from workbench.recording.library_row import LibraryRow
-from workbench.recording.sources import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
+from workbench.recording.sources import read_source
 from workbench.session.lane import Stopped
 from workbench.session.memory_limit import in_words, total_memory
 from workbench.session.recorded_scene import SceneError, SceneProcess
@@ -85,7 +86,7 @@ class Review:
         Args:
             library: knows recordings by their ids.
             read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a
-                sentence. None for `Source.read`.
+                sentence. None for `read_source`.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
             most_bytes: of memory that the recordings which are opened at once may take; None for `MEMORY_SHARE`.
@@ -93,7 +94,7 @@ class Review:
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._make_scene, self._clock = library, make_scene, clock
-        self._read = read or (lambda row, shapes: row.source.read(shapes, library.folder))
+        self._read = read or (lambda row, shapes: read_source(row.source, shapes, library.folder))
         self._memory = memory
         self._changed = threading.Condition()
         self._view = ReviewView()

@@ -27,7 +27,8 @@ from workbench.recording.episode_pictures import (
 )
 from workbench.recording.films import write_mp4
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
+from workbench.recording.sources import read_source
 from workbench.ui.fragments import counted
 from workbench.ui.scene_html import seconds_a_step, write_scene_html
 
@@ -101,7 +102,7 @@ def file_name(what: What, source: str, camera: str = "") -> str:
 
 
 def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> list[Path]:
-    episode = source.read()
+    episode = read_source(source)
     try:
         return _of_one(wanted, source, episode, on_progress)
     except ValueError as error:

@@ -17,7 +17,7 @@ import viser
 from workbench.authoring.reference import RecordedTask, named_file
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.library import Library
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.session import rescore_words as words
 from workbench.session.judging import RUNNING
 from workbench.session.rescore import Rescorer

@@ -21,7 +21,7 @@ from workbench.recording.episode_pictures import Eye, cameras_by_name
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.library import Library
 from workbench.recording.library_row import LibraryRow
-from workbench.recording.sources import Source
+from workbench.recording.source import Source
 from workbench.session.review_view import ReviewView
 from workbench.ui.door import Door
 from workbench.ui.file_reply import Offers

@@ -45,7 +45,7 @@ from workbench.recording.reader.requests import (
     SourcesFound,
     ToldRerun,
 )
-from workbench.recording.sources import Source, UnreadableRecording
+from workbench.recording.source import Source, UnreadableRecording
 
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""

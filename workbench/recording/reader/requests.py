@@ -13,7 +13,7 @@ from workbench.recording.document import CameraWords
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode
 from workbench.recording.library_row import Entry
-from workbench.recording.sources import Kind, Source
+from workbench.recording.source import Kind, Source
 
 
 class NewReader(msgspec.Struct, tag=True):
