@@ -46,10 +46,10 @@ from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.journal import before_writing
 from workbench.recording.landing import RecordingError
+from workbench.recording.reading import recovered_in_words
 from workbench.recording.recover import recover
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.session.open_task import describe
-from workbench.session.record_live import recovered_in_words
 
 logger = logging.getLogger(__name__)
 _MOST_HELD = 2048

@@ -11,7 +11,7 @@ import os
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -179,6 +179,18 @@ def mend(folder: Path) -> tuple[Path, ...]:
         return tuple(folder / Path(name).name for name in answer.made)
     why = answer if isinstance(answer, Failed) else Failed("unreadable", f"it gave {type(answer).__name__}.")
     raise RecordingError(why.words if why.why == "system" else f"{failed}{why.words}")
+
+
+def recovered_in_words(paths: Sequence[str]) -> str:
+    """Of what a session that was killed left half written, and this one mended; empty for nothing."""
+    if not paths:
+        return ""
+    one = len(paths) == 1
+    named = ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+    return (
+        f"{len(paths)} episode{'' if one else 's'} that an earlier session left half written "
+        f"{'was' if one else 'were'} mended: {named}"
+    )
 
 
 def _found(path: Path, trajectories: bool) -> list[Source]:

@@ -20,7 +20,7 @@ from pathlib import Path
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
-from workbench.recording.reading import mend
+from workbench.recording.reading import mend, recovered_in_words
 from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer
 from workbench.session.record_status import RecordingStatus
 
@@ -187,18 +187,6 @@ class LiveRecorder:
         if said:
             self._on_recovered(said)
         self._on_change()
-
-
-def recovered_in_words(paths: Sequence[str]) -> str:
-    """Of what a session that was killed left half written, and this one mended; empty for nothing."""
-    if not paths:
-        return ""
-    one = len(paths) == 1
-    named = ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
-    return (
-        f"{len(paths)} episode{'' if one else 's'} that an earlier session left half written "
-        f"{'was' if one else 'were'} mended: {named}"
-    )
 
 
 def _size(stepped: Stepped) -> int:

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 
 from workbench.jobs.task import TaskOptions
 from workbench.recording.library import Library
-from workbench.recording.reading import mend
+from workbench.recording.reading import mend, recovered_in_words
 from workbench.session.clearance import Clearances
-from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.rescore import Rescorer
 from workbench.session.review import Review

@@ -11,7 +11,7 @@ import shlex
 
 import viser
 
-from workbench.session.record_live import recovered_in_words
+from workbench.recording.reading import recovered_in_words
 from workbench.session.record_status import RecordingStatus
 from workbench.session.session import Session
 from workbench.session.view import SessionView
