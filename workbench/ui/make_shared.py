@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -144,7 +145,7 @@ def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnPro
 def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
     count = len(wanted.sources)
     made = export_lerobot(
-        [(source.stem, source.read) for source in wanted.sources],
+        [(source.stem, partial(read_source, source)) for source in wanted.sources],
         wanted.folder,
         wanted.export,
         lambda done, doing: on_progress(done / max(count, 1), doing),
