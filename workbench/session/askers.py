@@ -233,6 +233,7 @@ class Background(Asker):
         """
         if self._process is None:
             job.tell(0, 0, "starting a process in the background")
+            job.check()  # or a job that was stopped meanwhile would start a process for nobody
             self.start()
         if not self.has(load):
             self._loaded = None
