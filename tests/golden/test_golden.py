@@ -18,7 +18,8 @@ from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.cli import main
 from workbench.recording.library import Library
-from workbench.recording.read_episode import UnreadableRecording, read_episode
+from workbench.recording.read_episode import read_episode
+from workbench.recording.source import UnreadableRecording
 from workbench.session.session import Session
 from workbench.session.step_back import run_of
 from workbench.terminal import Exit

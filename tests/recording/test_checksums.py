@@ -16,7 +16,8 @@ from workbench.recording.annotations import write_into_description
 from workbench.recording.document import Checksum, check, checksum
 from workbench.recording.library_read import read_found
 from workbench.recording.library_scan import scan_folder
-from workbench.recording.read_episode import UnreadableRecording, read_episode
+from workbench.recording.read_episode import read_episode
+from workbench.recording.source import UnreadableRecording
 
 Maker = Callable[..., Made]
 

@@ -18,7 +18,8 @@ from workbench.recording.lerobot_export import ExportOptions, export_lerobot
 from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library import Library, LibraryError
-from workbench.recording.read_episode import UnreadableRecording, read_episode
+from workbench.recording.read_episode import read_episode
+from workbench.recording.source import UnreadableRecording
 from workbench.recording.sources import read_source, sources_among
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -20,12 +20,8 @@ from numpy.typing import NDArray
 from tests.drive.episodes import Made
 from workbench.core.geometry import SceneGeometry
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.read_episode import (
-    UnreadableRecording,
-    read_episode,
-    read_maniskill,
-    trajectories,
-)
+from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
+from workbench.recording.source import UnreadableRecording
 
 STEPS = 6
 SEED = 4

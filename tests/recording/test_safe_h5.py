@@ -14,8 +14,9 @@ import pytest
 from tests.recording.foreign_h5 import write
 from workbench.recording.library_read import read_found
 from workbench.recording.library_scan import scan_folder
-from workbench.recording.read_episode import UnreadableRecording, read_maniskill
+from workbench.recording.read_episode import read_maniskill
 from workbench.recording.safe_h5 import DEEPEST, RefusedH5, open_h5
+from workbench.recording.source import UnreadableRecording
 
 SECRET = b"the secret of another file, thirty-two bytes and more of it......"
 

@@ -23,8 +23,9 @@ from workbench.machine.user_folder import user_folder
 from workbench.recording.annotations import write_into_description
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
-from workbench.recording.read_episode import UnreadableRecording, read_episode
+from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
+from workbench.recording.source import UnreadableRecording
 from workbench.session.clearance import Clearances, Consent, NotCleared, Since, TrustQuestion, Wanted
 from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.step_back import recorded_source, reference_of

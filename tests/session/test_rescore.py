@@ -69,7 +69,7 @@ def judged(
     file.write_text(text)
     task = opened(str(file), num_envs)
     files = [Held(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
-    verdicts = list(rescore(task, files, use_env_states=use_env_states))
+    verdicts = list(rescore(task, files, use_env_states=use_env_states, read=Held.read))
     task.env.close()
     return sorted(verdicts, key=lambda verdict: verdict.of.name)
 
@@ -139,7 +139,7 @@ def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded
         Held(run.until(4), name="fine"),
         Held(replace(run, env_states={}), name="no states"),
     ]
-    told = {verdict.of.name: verdict for verdict in rescore(task, files, use_env_states=True)}
+    told = {verdict.of.name: verdict for verdict in rescore(task, files, use_env_states=True, read=Held.read)}
     task.env.close()
     assert "3 numbers" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
     assert told["no states"].why_not == "it holds no env states"
@@ -196,7 +196,7 @@ def test_a_task_without_a_robot_is_given_its_rewards(tmp_path: Path, use_env_sta
     low = np.array([step.evaluate["low"][0] for step in said])
     rows = {name: np.stack([state[name][0] for state in states]) for name in states[0]}
     run = RecordedRun("fallen", 0, {}, np.zeros((10, 0), np.float32), rows, {"low": low}, reward)
-    (verdict,) = rescore(task, [Held(run)], use_env_states=use_env_states)
+    (verdict,) = rescore(task, [Held(run)], use_env_states=use_env_states, read=Held.read)
     task.env.close()
     assert verdict.why_not == "" and reward[0] > reward[-1] and low[-1]
     np.testing.assert_array_equal(verdict.new_reward, reward)

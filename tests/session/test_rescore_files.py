@@ -24,7 +24,8 @@ from workbench.cli import main
 from workbench.core.recorded_state import apart, read_states
 from workbench.jobs.task import TaskOptions
 from workbench.recording.lerobot_export import ExportOptions
-from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
+from workbench.recording.read_episode import read_episode, read_maniskill
+from workbench.recording.source import UnreadableRecording
 from workbench.recording.sources import sources_among
 from workbench.rescore_command import RescoreOptions, rescore_all
 from workbench.session import rescore_words as words

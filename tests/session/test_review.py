@@ -18,7 +18,7 @@ from tests.drive.waiting import until
 from workbench.core.geometry import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
-from workbench.recording.read_episode import UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 from workbench.session.messages import CameraRequest
 from workbench.session.review import MOST_OPEN, Review
 from workbench.session.review_events import ACTION, TERMS, curves, happenings, success_words

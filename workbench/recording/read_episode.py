@@ -46,7 +46,7 @@ from workbench.recording.read_maniskill import read_maniskill as read_maniskill
 from workbench.recording.read_maniskill import trajectories as trajectories
 from workbench.recording.rerun_table import RerunTable, rows_at
 from workbench.recording.safe_h5 import open_h5
-from workbench.recording.source import UnreadableRecording as UnreadableRecording
+from workbench.recording.source import UnreadableRecording
 
 MOST_STATES = 10_000_000
 MOST_COLUMN_BYTES = 1 << 29

@@ -21,8 +21,8 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import apart, read_states
 from workbench.core.snapshot import only_these_move
 from workbench.core.step import StepResult
-from workbench.recording.read_episode import UnreadableRecording
-from workbench.recording.source import Source
+from workbench.recording.episode import Episode
+from workbench.recording.source import Source, UnreadableRecording
 from workbench.recording.sources import read_source
 from workbench.session.open_task import OpenedTask, blamed, step_checked
 from workbench.session.relive import begin_again, put_there, why_not_lived_through
@@ -78,12 +78,14 @@ def rescore(
     *,
     use_env_states: bool = False,
     on_steps: Callable[[int], None] = lambda steps: None,
+    read: Callable[[Source], Episode] = read_source,
 ) -> Iterator[Verdict[Source]]:
     """Judge these episodes with the code that is open; a verdict for each, in the order in which they end.
 
     Args:
         use_env_states: put every recorded state in after its step, so that nothing drifts.
         on_steps: called with the number of control steps of all episodes that were made so far.
+        read: gives the episode of a file; raises as `read_source`.
 
     Raises:
         TaskError: the task's code raised.
@@ -100,7 +102,7 @@ def rescore(
             if file is None:
                 more = False
                 break
-            told = _ready(opened, file, use_env_states)
+            told = _ready(opened, file, use_env_states, read)
             if isinstance(told, Verdict):
                 yield told
             else:
@@ -148,9 +150,11 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
     return Rescored(tuple(ready), steps)
 
 
-def _ready(opened: OpenedTask, file: Source, use_env_states: bool) -> _Seat | Verdict[Source]:
+def _ready(
+    opened: OpenedTask, file: Source, use_env_states: bool, read: Callable[[Source], Episode]
+) -> _Seat | Verdict[Source]:
     try:
-        episode = read_source(file)
+        episode = read(file)
     except (UnreadableRecording, OSError) as error:
         return Verdict(file, why_not=str(error))
     run, info = run_of(episode), episode.info
