@@ -8,8 +8,10 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.step import StepResult
 from workbench.jobs.task import Restored, Stepped
 from workbench.session.env_table import EnvTable
+from workbench.session.kept_worker import Death
 
 N, BODIES = 3, 4
+DEATH = Death("was killed by SIGSEGV", False, False, "stepping", "", False)
 
 
 def stepped(

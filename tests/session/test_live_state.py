@@ -11,11 +11,12 @@ import numpy as np
 
 from tests.drive.scripted import scripted
 from tests.drive.waiting import until
+from tests.session.moments import DEATH
 from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.authoring.reference import RecordedTask
 from workbench.core.pictures import Picture
 from workbench.jobs.task import Stepped, TaskOptions
-from workbench.session.kept_worker import Death, KeptWorker
+from workbench.session.kept_worker import KeptWorker
 from workbench.session.live_state import LiveState
 from workbench.session.messages import (
     CameraRequest,
@@ -32,7 +33,6 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 
 N = 3
-DEATH = Death("was killed by SIGSEGV", False, False, "stepping", "", False)
 
 
 def view(state: LiveState) -> SessionView:

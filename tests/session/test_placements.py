@@ -9,21 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.ui.scenes import camera, description, step_of, table_scene
+from tests.session.studio import BARE, EYE, FILE, INFO, KEY, LENS, TARGET
+from tests.ui.scenes import description, step_of, table_scene
 from workbench.core.camera_frames import LookAt, pose_from_look_at, target_of, with_pose
 from workbench.core.camera_settings import CameraSettings
 from workbench.session import studio_cameras
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import StudioCamera
-
-EYE, TARGET = (0.45, 0.0, 0.6), (0.08, 0.0, 0.2)
-"""It looks at something above the ground, which a line of sight does not tell."""
-LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 128, 128, 0.01, 10.0, "minimal")
-BARE = with_pose(LENS, pose_from_look_at(LookAt(EYE, TARGET)))
-"""As a file has it that names no target."""
-FILE = replace(BARE, distance=math.dist(EYE, TARGET))
-INFO = camera()
-KEY = INFO.key
 
 
 def opened(*said: CameraSettings, mount: str | None = None) -> StudioCameras:

@@ -10,15 +10,16 @@ from typing import Any, cast
 import pytest
 
 from tests.drive.waiting import until
-from tests.session.test_placements import BARE, FILE, INFO, KEY
+from tests.session.studio import BARE, FILE, INFO, KEY
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.camera_report import OfferedPlacement
+from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.history import ShownMoment
 from workbench.session.live_state import LiveState, SharedState
-from workbench.session.messages import PlaceCamera, Placed, Request, TaskDescription, TaskOptions
+from workbench.session.messages import PlaceCamera, Placed, Request
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioView, Wish, Writing
@@ -39,7 +40,15 @@ class Alone:
         send = self.sent.append
         self.versions = Versions(self.shared, send, lambda: None, lambda: None)
         past = TimeTravel(self.shared, send, lambda: None)
-        self.studio = CameraStudio(send, Asker(send), Background(), lambda: None, past, self.versions)
+        self.studio = CameraStudio(
+            send,
+            Asker(send),
+            Background(),
+            lambda: None,
+            past,
+            self.versions.same_again,
+            self.versions.open_file,
+        )
         self.step = step_of(POSES)
         self.studio.loaded(TASK, None)
         self.view()

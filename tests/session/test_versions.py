@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.drive.waiting import until
-from tests.session.test_live_state import DEATH
+from tests.session.moments import DEATH
 from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.live_state import LiveState, SharedState
