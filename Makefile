@@ -4,7 +4,7 @@
 #
 #   make open TASK=path/to/task.py ARGS="--num-envs 4 --port 8123"
 #   make test ARGS="-k camera"
-#   make mutants MODULES="ui/gate core/snapshot"
+#   make mutants MODULES="ui/server/access core/snapshots/snapshot"
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
@@ -42,7 +42,7 @@ help:
 	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
 	@echo "make test-fast ruff and the tests that need no process, renderer or browser: about two minutes"
 	@echo "make test-all  the slow tests too, all of them twice in random order (SEEDS=\"1 2\" makes two orders again)"
-	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/gate ..., or all)"
+	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/server/access ..., or all)"
 	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
 	@echo "               (without a network: WHEELS=DIR, filled by make gpu-wheels WHEELS=DIR elsewhere, and PHYSX_GPU=FILE)"
 	@echo "make lint      ruff and pyright"

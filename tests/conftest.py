@@ -121,9 +121,9 @@ def configuration_folder_is_removed() -> Iterator[None]:
 def no_process_left_behind() -> Iterator[None]:
     """Workers and browsers that tests started must be gone when the tests are."""
     yield
-    if "workbench.recording.reading" in sys.modules:
+    if "workbench.recording.reader.reading" in sys.modules:
         # It serves the whole process, for as long as that lives.
-        sys.modules["workbench.recording.reading"].stop_reading()
+        sys.modules["workbench.recording.reader.reading"].stop_reading()
     until(lambda: not _children(), "the end of all processes that tests started", 10, seen=_children)
 
 

@@ -1,6 +1,6 @@
 """Would a test notice? Single slips are planted in a module, and the tests that protect it are run on each.
 
-Not a test: ``make mutants MODULES="ui/gate core/snapshot"`` runs it, ``MODULES=all`` all of `PROTECTED`. Cosmic Ray
+Not a test: ``make mutants MODULES="ui/server/access core/snapshots/snapshot"`` runs it, ``MODULES=all`` all of `PROTECTED`. Cosmic Ray
 makes the slips; the rest is here: which of them, in a copy of the tree, and by which tests they should be found.
 """
 
@@ -41,22 +41,22 @@ ENOUGH = 85
 """Percent of a module's mutants that have to die."""
 
 PROTECTED = {
-    "recording/journal": "recording/test_journal.py",
-    "recording/reader/episode_wire": "recording/test_episode_wire.py",
-    "recording/recover": "recording/test_recover.py",
-    "recording/trash": "recording/test_trash.py",
-    "recording/document": "recording/test_document.py recording/test_checksums.py",
-    "recording/sources": "recording/test_sources.py",
-    "recording/from_journal": "recording/test_recover.py recording/test_episode_writer.py",
-    "recording/library": "recording/test_library.py -k 'not two_processes and not follows_the_folder'",
-    "recording/library_index": "recording/test_library_index.py",
-    "recording/made_here": "session/test_clearance.py recording/test_document.py",
-    "recording/episode_writer": "recording/test_episode_writer.py",
-    "machine/atomic_files": "recording/test_new_file.py recording/test_annotations.py recording/test_landing.py"
+    "recording/writing/journal": "recording/writing/test_journal.py",
+    "recording/reader/episode_wire": "recording/episode/test_episode_wire.py",
+    "recording/writing/recover": "recording/writing/test_recover.py",
+    "recording/library/trash": "recording/library/test_trash.py",
+    "recording/episode/document": "recording/episode/test_document.py recording/episode/test_checksums.py",
+    "recording/reader/reading": "recording/reader/test_sources.py",
+    "recording/writing/from_journal": "recording/writing/test_recover.py recording/writing/test_episode_writer.py",
+    "recording/library/library": "recording/library/test_library.py -k 'not two_processes and not follows_the_folder'",
+    "recording/library/index": "recording/library/test_index.py",
+    "recording/episode/made_here": "session/test_clearance.py recording/episode/test_document.py",
+    "recording/writing/episode_writer": "recording/writing/test_episode_writer.py",
+    "machine/files": "recording/test_new_file.py recording/episode/test_tags.py recording/writing/test_publish.py"
     " machine/test_user_folder.py authoring/camera_source/test_disk.py",
-    "authoring/registry": "authoring/test_registry.py",
-    "authoring/modules": "authoring/test_load.py authoring/test_task_content.py authoring/test_library_names.py"
-    " authoring/test_named_modules.py",
+    "authoring/loading/registry": "authoring/loading/test_registry.py",
+    "authoring/loading/modules": "authoring/loading/test_load.py authoring/loading/test_task_content.py authoring/loading/test_library_names.py"
+    " authoring/loading/test_named_modules.py",
     "authoring/source/text": "authoring/camera_source/test_which_camera.py authoring/camera_source/test_members.py"
     " authoring/camera_source/test_shapes.py authoring/source/test_text.py",
     "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
@@ -76,55 +76,55 @@ PROTECTED = {
     " authoring/camera_source/test_round_trip.py authoring/camera_source/test_shapes.py",
     "authoring/camera_source/run_hooks": "authoring/camera_source/test_which_camera.py"
     " authoring/camera_source/test_members.py",
-    "authoring/copy_task": "authoring/test_copy_task.py",
-    "authoring/watch": "authoring/test_watch.py",
-    "core/snapshot": "core/test_snapshot.py",
-    "core/partial_reset": "core/test_partial_reset.py",
-    "core/task_env": "core/test_task_env.py",
-    "core/contacts": "core/test_contact_queries.py",
-    "core/mirrors": "core/test_batched_cpu.py core/test_drive_targets.py core/test_strict.py",
-    "core/cpu_system": "core/test_batched_cpu.py core/test_gpu_members.py core/test_stepping.py core/test_strict.py",
-    "core/strict_system": "core/test_strict.py",
-    "core/scene_index": "core/test_scene_index.py core/test_state_columns.py core/test_merged_structs.py",
-    "core/camera_report": "core/test_camera_report.py",
-    "core/snapshot_parts": "core/test_snapshot_parts.py",
-    "core/task_buffers": "core/test_task_buffers.py",
-    "core/kept_rows": "core/test_kept_rows.py",
-    "core/struct_access": "core/test_strict.py core/test_drive_targets.py",
-    "core/entries": "core/test_entries.py authoring/test_returns.py",
-    "core/cpu_state": "core/test_snapshot.py core/test_fresh_physics.py",
-    "core/state_columns": "core/test_state_columns.py core/test_inspect_env.py core/test_recorded_state.py",
-    "core/take_pictures": "core/test_pictures.py core/test_step_pictures.py core/test_mounted_cameras.py",
+    "authoring/loading/copy_task": "authoring/loading/test_copy_task.py",
+    "authoring/loading/watch": "authoring/loading/test_watch.py",
+    "core/snapshots/snapshot": "core/snapshots/test_snapshot.py",
+    "core/env/partial_reset": "core/env/test_partial_reset.py",
+    "core/env/task_env": "core/env/test_task_env.py",
+    "core/simulation/contact_queries": "core/simulation/test_contact_queries.py",
+    "core/simulation/mirrors": "core/simulation/test_batched_cpu.py core/simulation/test_drive_targets.py core/env/test_strict.py",
+    "core/simulation/cpu_system": "core/simulation/test_batched_cpu.py core/test_gpu_members.py core/simulation/test_stepping.py core/env/test_strict.py",
+    "core/simulation/strict_system": "core/env/test_strict.py",
+    "core/scene/scene_index": "core/scene/test_scene_index.py core/capture/test_state_columns.py core/scene/test_merged_structs.py",
+    "core/cameras/report": "core/cameras/test_report.py",
+    "core/snapshots/packing": "core/snapshots/test_packing.py",
+    "core/snapshots/task_state": "core/snapshots/test_task_state.py",
+    "core/env/kept_rows": "core/env/test_kept_rows.py",
+    "core/simulation/accessors": "core/env/test_strict.py core/simulation/test_drive_targets.py",
+    "core/env/evaluate_entries": "core/env/test_evaluate_entries.py authoring/test_return_problems.py",
+    "core/snapshots/cpu_state": "core/snapshots/test_snapshot.py core/snapshots/test_fresh_physics.py",
+    "core/capture/state_columns": "core/capture/test_state_columns.py core/capture/test_inspect_env.py core/capture/test_recorded_state.py",
+    "core/cameras/render": "core/test_pictures.py core/cameras/test_step_pictures.py core/cameras/test_mounted_cameras.py",
     "jobs/pool": "jobs/test_pool.py",
-    "jobs/wire": "jobs/test_wire.py jobs/test_line.py",
-    "session/askers": "session/test_askers.py",
-    "session/history": "session/test_history.py session/test_env_table.py",
-    "session/env_table": "session/test_env_table.py session/test_outlier_watch.py",
-    "session/curves": "session/test_curves.py",
-    "session/verdict": "session/test_verdict.py",
-    "session/judgement": "session/test_judgement.py session/test_judge.py",
-    "session/kept_worker": "session/test_kept_worker.py",
-    "session/versions": "session/test_recovery.py session/test_versions.py",
-    "session/given_actions": "session/test_given_actions.py",
-    "session/record_live": "session/test_recorder_thread.py",
-    "session/studio_cameras": "session/test_placements.py",
-    "session/studio_file": "session/test_studio_alone.py session/test_camera_writing.py",
-    "session/camera_studio": "session/test_studio_alone.py",
-    "ui/gate": "ui/test_gate.py",
-    "ui/camera_moves": "ui/test_camera_moves.py ui/test_camera_numbers.py",
-    "ui/camera_numbers": "ui/test_camera_numbers.py",
-    "ui/review_timeline": "ui/test_review_page.py -k 'strip or timeline or opened'",
-    "ui/library_list": "ui/test_library_panel.py",
-    "ui/door": "ui/test_door.py ui/test_socket_and_renewal.py ui/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"
-    " ui/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
-    " ui/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
+    "machine/processes/wire": "machine/processes/test_wire.py machine/processes/test_line.py",
+    "session/process/askers": "session/process/test_askers.py",
+    "session/history/history": "session/history/test_history.py session/history/test_env_table.py",
+    "session/history/env_table": "session/history/test_env_table.py session/history/test_outlier_watch.py",
+    "session/history/curves": "session/history/test_curves.py",
+    "jobs/verdict": "jobs/test_verdict.py",
+    "session/rescore/past": "session/rescore/test_past.py session/rescore/test_judge.py",
+    "session/process/supervisor": "session/process/test_supervisor.py",
+    "session/live/versions": "session/live/test_recovery.py session/live/test_versions.py",
+    "jobs/actions": "jobs/test_given_actions.py",
+    "session/record/live": "session/record/test_recorder_thread.py",
+    "session/cameras/selection": "session/cameras/test_placements.py",
+    "session/cameras/file_edits": "session/cameras/test_studio_alone.py session/cameras/test_edit_state.py",
+    "session/cameras/studio": "session/cameras/test_studio_alone.py",
+    "ui/server/access": "ui/server/test_access.py",
+    "ui/cameras/pose_math": "ui/cameras/test_pose_math.py ui/cameras/test_fields.py",
+    "ui/cameras/fields": "ui/cameras/test_fields.py",
+    "ui/app/review_page": "ui/app/test_review_page.py -k 'strip or timeline or opened'",
+    "ui/library/listing": "ui/library/test_panel.py",
+    "ui/server/gated_server": "ui/server/test_gated_server.py ui/server/test_socket_and_renewal.py ui/server/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"
+    " ui/server/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
+    " ui/server/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
     " -k 'not nothing_is_printed and not command and not palette and not many_that_start'",
-    "ui/judged_panel": "ui/test_rescore_panel.py ui/test_judgement_panel.py",
-    "ui/parts": "ui/test_parts.py",
-    "ui/presses": "ui/test_presses.py ui/test_env_panel.py ui/test_judgement_panel.py ui/test_rescore_panel.py",
-    "ui/replies": "ui/test_replies.py",
-    "ui/timeline_panel": "ui/test_timeline_panel.py ui/test_timeline_strip.py",
-    "ui/file_reply": "ui/test_file_reply.py",
+    "ui/widgets/rescored": "ui/review/test_rescore.py ui/live/test_rescored.py",
+    "ui/widgets/parts": "ui/widgets/test_parts.py",
+    "ui/widgets/click_targets": "ui/widgets/test_click_targets.py ui/live/test_env_panel.py ui/live/test_rescored.py ui/review/test_rescore.py",
+    "ui/server/responses": "ui/server/test_replies.py",
+    "ui/live/timeline": "ui/live/test_timeline.py ui/live/test_timeline_strip.py",
+    "ui/server/file_response": "ui/server/test_file_response.py",
 }
 """The tests below ``tests/`` that should notice a slip in a module below ``workbench/``: the fast ones among them, since
 each mutant runs them all until one fails."""

@@ -167,7 +167,7 @@ def test_python_m_leaves_the_current_folder_out_as_well(tmp_path: Path) -> None:
     """As far as we can: what Python itself imports to find the module comes before us."""
     plant(tmp_path, *IMPORTED_FIRST)
     done = subprocess.run(
-        [sys.executable, "-m", "workbench.cli", "view", "--help"],
+        [sys.executable, "-m", "workbench.cli.main", "view", "--help"],
         cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

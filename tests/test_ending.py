@@ -33,7 +33,7 @@ def signal_thread(pid: int, thread: int, number: signal.Signals) -> None:
 
 def workers_of(server: psutil.Process) -> int:
     """Each is one child of the server, its keeper."""
-    return sum("workbench.session.worker_start" in child.cmdline() for child in server.children())
+    return sum("workbench.session.worker.start" in child.cmdline() for child in server.children())
 
 
 @pytest.mark.parametrize(

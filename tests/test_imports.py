@@ -1,55 +1,151 @@
-"""Which part of the workbench may import which."""
+"""Which part of the workbench may import which, and how large its folders are."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
-BELOW = {
-    "ui": {"session", "jobs", "authoring", "recording", "core", "machine"},
-    "session": {"jobs", "authoring", "recording", "core", "machine"},
-    "jobs": {"authoring", "core", "machine"},
-    "authoring": {"core", "machine"},
-    "recording": {"jobs", "core", "machine"},
-    "core": {"machine"},
-    "machine": set(),
+TESTS = Path(__file__).parent
+ARCHITECTURE = PACKAGE.parent / "web_assets" / "docs" / "architecture.md"
+LAYERS = ("cli", "ui", "session", "jobs", "recording", "authoring", "core", "machine")
+"""From the top to the bottom: a layer imports those behind it. Recording and authoring do not import each other."""
+APART = {("recording", "authoring")}
+MOST_ENTRIES = 12
+FEWEST_LINES = 60
+SHORT_FOR_A_REASON = {
+    "authoring/reload/inherited": "it alone of its folder imports ManiSkill, and the rest is asked without",
+    "core/env_numbers": "snapshots, cameras and resets read the numbers of envs by it, and none of them may import another",
+    "jobs/record_options": "`--help` does not wait for what records",
+    "machine/chromium": "the tests ask it, and the doctor",
+    "machine/processes/breakpoints": "every process that runs a task's code calls it before anything else is imported",
+    "machine/processes/child_python": "every process is started by it",
+    "machine/processes/current_folder": "whatever calls a task's code holds the folder by it",
+    "machine/processes/own_path": "it is imported before anything else, so that nothing else is imported from the wrong place",
+    "machine/web_assets": "it says where the page's files lie, to parts that may not import each other",
+    "recording/episode/source": "what lies below the readers names a recording by it",
+    "session/record/status": "the page reads it without what records",
 }
-"""Each part, and those that it may import. Modules beside them are the commands, which nothing imports."""
-OF_NO_PART = {"web_assets"}
-"""Where the files of the page are."""
+"""Modules below `FEWEST_LINES` lines, each with why it stays apart."""
+
+
+def modules() -> dict[str, Path]:
+    """Name below the package, with slashes, to file; without ``__init__``."""
+    files = (file for file in PACKAGE.rglob("*.py") if file.name != "__init__.py")
+    return {file.relative_to(PACKAGE).with_suffix("").as_posix(): file for file in files}
+
+
+MODULES = modules()
 
 
 def imported(file: Path) -> Iterator[tuple[int, str]]:
-    """Line and name below the package; also within functions, and of types alone."""
+    """Line and module below the package, with slashes; also within functions, and of types alone."""
     for node in ast.walk(ast.parse(file.read_text())):
         names: list[str] = []
-        if isinstance(node, ast.ImportFrom) and node.module == "workbench":
-            names = [f"workbench.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module]
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "workbench":
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names = [alias.name for alias in node.names if alias.name.split(".")[0] == "workbench"]
         for name in names:
-            if name.startswith("workbench."):
-                yield getattr(node, "lineno", 0), name.split(".")[1]
+            path = name.replace(".", "/").removeprefix("workbench/")
+            if path not in MODULES:
+                path = path.rsplit("/", 1)[0]
+            if path in MODULES:
+                yield getattr(node, "lineno", 0), path
 
 
-@pytest.mark.parametrize("part", BELOW)
-def test_imports_run_one_way(part: str) -> None:
-    files = list((PACKAGE / part).rglob("*.py"))
-    assert files
+IMPORTS = {module: tuple(imported(file)) for module, file in MODULES.items()}
+
+
+def layer_of(module: str) -> str:
+    """Modules at the top of the package are what users import (`workbench.make`): no layer imports them."""
+    return module.split("/")[0] if "/" in module else ""
+
+
+def folder_of(module: str) -> str:
+    return module.rpartition("/")[0]
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_imports_run_one_way(layer: str) -> None:
+    below = {layer, *LAYERS[LAYERS.index(layer) :]} - {b for a, b in APART if a == layer}
     wrong = [
-        f"{file.relative_to(PACKAGE)}:{line} imports {name}"
-        for file in files
-        for line, name in imported(file)
-        if name not in {part, *BELOW[part], *OF_NO_PART}
+        f"{module}:{line} imports {name}"
+        for module in MODULES
+        if layer_of(module) == layer
+        for line, name in IMPORTS[module]
+        if layer_of(name) not in below
+    ]
+    assert any(layer_of(module) == layer for module in MODULES) and wrong == []
+
+
+def test_what_users_import_needs_no_session_and_no_page() -> None:
+    wrong = [
+        f"{module}:{line} imports {name}"
+        for module in MODULES
+        if layer_of(module) == ""
+        for line, name in IMPORTS[module]
+        if layer_of(name) in ("cli", "ui", "session")
     ]
     assert wrong == []
+
+
+def test_no_folder_imports_one_that_imports_it() -> None:
+    below: dict[str, set[str]] = defaultdict(set)
+    for module, names in IMPORTS.items():
+        below[folder_of(module)] |= {folder_of(name) for _, name in names} - {folder_of(module)}
+    reached: dict[str, set[str]] = {}
+
+    def reach(folder: str, way: tuple[str, ...]) -> set[str]:
+        assert folder not in way, f"a circle: {' imports '.join((*way[way.index(folder) :], folder))}"
+        if folder not in reached:
+            reached[folder] = below[folder].union(*(reach(f, (*way, folder)) for f in sorted(below[folder])))
+        return reached[folder]
+
+    for folder in sorted(below):
+        reach(folder, ())
+    assert "core" in reached["ui/app"]
+
+
+def test_no_folder_is_a_hall_of_doors() -> None:
+    entries: dict[str, set[str]] = defaultdict(set)
+    for module in MODULES:
+        parts = module.split("/")
+        for depth in range(len(parts)):
+            entries["/".join(parts[:depth])].add(parts[depth])
+    assert {folder: len(names) for folder, names in entries.items() if len(names) > MOST_ENTRIES} == {}
+
+
+def test_a_short_module_has_a_reason() -> None:
+    lines = {module: len(file.read_text().splitlines()) for module, file in MODULES.items()}
+    assert {module for module, count in lines.items() if count < FEWEST_LINES} == set(SHORT_FOR_A_REASON)
+
+
+def test_the_architecture_page_tells_of_each_folder_what_it_holds_and_what_it_imports() -> None:
+    """A row each of its table: the folder, the sentence of its ``__init__``, and the folders of its layer that it imports."""
+    rows = re.findall(r"^\| `([a-z_/]+)` \| (.+?) \| (.*?) ?\|$", ARCHITECTURE.read_text(), re.M)
+    told = {folder: (holds, set(re.findall(r"[a-z_/]+", imports))) for folder, holds, imports in rows}
+    folders = {folder_of(module) for module in MODULES} - {""}
+    folders |= {folder.split("/")[0] for folder in folders}
+    for folder in sorted(folders):
+        (holds, *_) = (
+            ast.get_docstring(ast.parse((PACKAGE / folder / "__init__.py").read_text())) or ""
+        ).split("\n\n")
+        names = {
+            folder_of(name)
+            for module in MODULES
+            if folder_of(module) == folder
+            for _, name in IMPORTS[module]
+        }
+        same_layer = {name for name in names - {folder} if layer_of(f"{name}/") == layer_of(f"{folder}/")}
+        assert told.get(folder) == (holds, same_layer), folder
+    assert set(told) == folders
 
 
 def test_the_page_is_the_only_part_that_knows_viser() -> None:
@@ -61,9 +157,6 @@ def test_the_page_is_the_only_part_that_knows_viser() -> None:
         or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "viser")
     }
     assert knowing == {"ui"}
-
-
-TESTS = Path(__file__).parent
 
 
 def test_nothing_is_imported_from_a_test() -> None:

@@ -26,10 +26,10 @@ import workbench
 from tests.drive.envs import CPU
 from workbench import gym_env
 from workbench.authoring.problem import TaskError
-from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, why_no_gpu_simulation
 from workbench.core.broken_rule import WrongReturn
-from workbench.core.cpu_scene import SIM_BACKEND
+from workbench.core.env.assets import MissingAssets
+from workbench.core.env.cpu_scene import SIM_BACKEND
 
 pytestmark = pytest.mark.thorough
 

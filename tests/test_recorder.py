@@ -17,9 +17,9 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.envs import CPU
-from workbench.recording.episode import NO_SEED, Episode
-from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
-from workbench.recording.recover import recover
+from workbench.recording.episode.episode import NO_SEED, Episode
+from workbench.recording.reader.read_episode import read_episode, read_maniskill, trajectories
+from workbench.recording.writing.recover import recover
 
 TASKS = Path(__file__).parents[1] / "tasks"
 

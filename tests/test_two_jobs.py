@@ -19,13 +19,12 @@ import pytest
 
 from tests.drive.waiting import until
 from tests.golden.make import GOLDEN
-from workbench.recording.episode import Episode
-from workbench.recording.read_episode import read_episode
-from workbench.recording.sources import sources_among
+from workbench.recording.episode.episode import Episode
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.reader.reading import sources_among
 from workbench.session.clearance import Clearances
-from workbench.session.rescore import Rescorer
-from workbench.ui.make_shared import Wanted
-from workbench.ui.making import Making
+from workbench.session.rescore.recordings import Rescorer
+from workbench.ui.share.make import Making, Wanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 PATIENCE = 200.0
@@ -71,7 +70,7 @@ class Judging:
         self._rescorer.start(self._files)
 
     def pids(self) -> list[int]:
-        return running("workbench.session.worker_start")
+        return running("workbench.session.worker.start")
 
     def ended(self) -> bool:
         return self._rescorer.judging.view.state in ("done", "failed")
@@ -170,7 +169,7 @@ def recording(folder: Path, name: str, seed: int) -> Iterator[subprocess.Popen[s
     command = [
         sys.executable,
         "-m",
-        "workbench.cli",
+        "workbench.cli.main",
         "record",
         "push.py",
         "--out",

@@ -1,7 +1,7 @@
 // What the handlers in the server's templates do: press, choose, place, copy, bring into sight.
 //
 // The page's policy runs no code that is written in HTML, whoever put it there, but for a few fixed calls of what is
-// here (HANDLERS in workbench/ui/page_policy.py). Values come from data attributes, never from the text of a handler.
+// here (HANDLERS in workbench/ui/server/responses.py). Values come from data attributes, never from the text of a handler.
 "use strict";
 {
   const setValue = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set;

@@ -33,14 +33,14 @@ from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import CameraObsTextures
 
-from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, class_of_module, load_task, task_of_class
+from workbench.authoring.loading import registry
+from workbench.authoring.loading.load import LoadedTask, class_of_module, load_task, task_of_class
+from workbench.authoring.loading.reference import split_reference
 from workbench.authoring.problem import definition_line
-from workbench.authoring.reference import split_reference
 from workbench.core.backends import BackendUnavailable, find_renderer
 from workbench.core.broken_rule import class_is_installed, is_installed
+from workbench.core.env.task_env import Backend, EnvOptions, build_env, default_reward_mode
 from workbench.core.rules import Degree
-from workbench.core.task_env import Backend, EnvOptions, build_env, default_reward_mode
 
 _STATE_MODES = {"state", "state_dict", "none"}
 """The parts of an ``obs_mode`` for which nothing is drawn."""

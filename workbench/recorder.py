@@ -33,23 +33,23 @@ import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
-from workbench.authoring.load import task_of_class
-from workbench.core import actions
-from workbench.core.pictures import Picture
-from workbench.core.seams import draws_its_own_seeds, last_observation, open_env, task_class
-from workbench.core.state_columns import StateReading, read_states
-from workbench.core.step import StepResult
-from workbench.core.take_pictures import Request, recorded_pictures, step_pictures
-from workbench.core.task_env import TaskEnv
+from workbench.authoring.loading.load import task_of_class
+from workbench.core.camera_data import Picture
+from workbench.core.cameras.render import Request, recorded_pictures, step_pictures
+from workbench.core.capture.state_columns import StateReading, read_states
+from workbench.core.env import actions
+from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.maniskill_private import draws_its_own_seeds, last_observation, open_env, task_class
+from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
+from workbench.jobs.open_task import describe
 from workbench.jobs.task import Stepped, TaskDescription
-from workbench.recording.episode import NO_SEED
-from workbench.recording.episode_writer import EpisodeFiles
-from workbench.recording.journal import before_writing
-from workbench.recording.landing import RecordingError
-from workbench.recording.reading import recovered_in_words
-from workbench.recording.recover import recover
-from workbench.session.episodes import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
-from workbench.session.open_task import describe
+from workbench.recording.episode.episode import NO_SEED
+from workbench.recording.reader.reading import recovered_in_words
+from workbench.recording.writing.episode_writer import EpisodeFiles
+from workbench.recording.writing.journal import before_writing
+from workbench.recording.writing.publish import RecordingError
+from workbench.recording.writing.recover import recover
 
 logger = logging.getLogger(__name__)
 _MOST_HELD = 2048

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.load import load_task
+from workbench.authoring.loading.load import load_task
 from workbench.authoring.problem import Problem, TaskError
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.authoring.load import LoadedTask, load_task
+from workbench.authoring.loading.load import LoadedTask, load_task
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
 
 Write = Callable[..., Path]

@@ -26,10 +26,10 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.reload import cold_restart
 from tests.drive.page import TASK
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
-from workbench.session.messages import CameraRequest
-from workbench.session.session import Session
+from workbench.session.live.session import Session
+from workbench.session.protocol.messages import CameraRequest
 
 BASE: CameraKey = ("sensor", "base_camera")
 BAR = 0.2

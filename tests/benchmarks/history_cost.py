@@ -23,13 +23,13 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
-from workbench.core import actions
-from workbench.core.scene_geometry import read_geometry
-from workbench.core.snapshot_parts import SnapshotPacker
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.env import actions
+from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.scene.read_scene import read_geometry
+from workbench.core.snapshots.packing import SnapshotPacker
 from workbench.jobs.task import Stepped
-from workbench.session.env_table import EnvTable
-from workbench.session.history import History
+from workbench.session.history.env_table import EnvTable
+from workbench.session.history.history import History
 
 
 @dataclass

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import workbench
-from workbench.recording import make_files
+from workbench.recording.writing import finish as make_files
 
 SIDES = ("RecordEpisode", "Recorder")
 

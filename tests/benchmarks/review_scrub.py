@@ -64,7 +64,7 @@ class Options:
 def command(*arguments: str) -> Iterator[str]:
     """A running command of the workbench with a page; its address."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "workbench.cli", *arguments, "--port", "0"],
+        [sys.executable, "-m", "workbench.cli.main", *arguments, "--port", "0"],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -176,7 +176,7 @@ def main(options: Options) -> None:
         folder = Path(name)
         envs = str(options.envs)
         subprocess.run(
-            [sys.executable, "-m", "workbench.cli", "record", str(TASK), "--episodes", envs, "--num-envs", envs,
+            [sys.executable, "-m", "workbench.cli.main", "record", str(TASK), "--episodes", envs, "--num-envs", envs,
              "--no-pictures", "--out", str(folder)],
             check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip

@@ -105,7 +105,7 @@ class Desk:
 
     def workers(self) -> list[psutil.Process]:
         found = [
-            p for p in self.server.children() if "workbench.session.worker_start" in " ".join(p.cmdline())
+            p for p in self.server.children() if "workbench.session.worker.start" in " ".join(p.cmdline())
         ]
         return sorted(found, key=lambda process: process.create_time())
 

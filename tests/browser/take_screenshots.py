@@ -160,7 +160,7 @@ def record(file: Path, folder: Path, *arguments: str) -> None:
     command = [
         sys.executable,
         "-m",
-        "workbench.cli",
+        "workbench.cli.main",
         "record",
         str(file),
         "--actions",

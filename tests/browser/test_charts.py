@@ -15,8 +15,8 @@ from tests.drive.page import page_at
 from tests.drive.panels import Clock
 from tests.drive.waiting import until
 from tests.ui.scenes import running
-from workbench.session.curves import Curves
-from workbench.ui.curves_panel import CurvesPanel
+from workbench.session.history.curves import Curves
+from workbench.ui.live.reward import CurvesPanel
 
 pytestmark = pytest.mark.browser
 ENVS = 3

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.drive.waiting import until
-from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import Door, DoorOptions, open_door
 
 pytestmark = pytest.mark.browser
 A_CARD = """

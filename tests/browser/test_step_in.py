@@ -11,8 +11,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
 from tests.drive.waiting import until
+from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.task import TaskOptions
-from workbench.session.record import RecordOptions, record
 
 pytestmark = pytest.mark.browser
 PATIENT = 120_000

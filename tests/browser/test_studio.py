@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from tests.drive.page import page_on
 from tests.drive.studio import HEIGHT, VIEW, WIDTH, choose, field, numbers, option, picture, press, tool, view
 from tests.drive.waiting import until
-from workbench.ui.studio_panel import NOBODY
+from workbench.ui.cameras.studio import NOBODY
 
 pytestmark = pytest.mark.browser
 FILE = "push_cube.py"

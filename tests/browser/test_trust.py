@@ -10,9 +10,9 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
+from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.task import TaskOptions
-from workbench.session.record import RecordOptions, record
-from workbench.ui.trust_dialog import DO_NOT, ONCE
+from workbench.ui.app.trust_dialog import DO_NOT, ONCE
 
 pytestmark = pytest.mark.browser
 PATIENT = 120_000

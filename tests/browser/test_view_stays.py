@@ -10,8 +10,8 @@ from playwright.sync_api import Browser
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from workbench.ui.commands import Command, register
-from workbench.ui.door import DoorOptions, open_door
+from workbench.ui.server.gated_server import DoorOptions, open_door
+from workbench.ui.widgets.hotkeys import Command, register
 
 pytestmark = pytest.mark.browser
 

@@ -16,7 +16,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from tests.sweeps import follow_stock
 from tests.sweeps.follow_stock import MOVED_BY_THE_TASK, batch_of, compare, packed, take_over, touching
-from workbench.core import actions
+from workbench.core.env import actions
 
 pytestmark = pytest.mark.thorough
 

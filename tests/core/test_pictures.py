@@ -15,9 +15,9 @@ from mani_skill.utils.structs import Pose
 
 from tests.core.drawn_envs import batched, stock
 from workbench.core.backends import keep_render_device
-from workbench.core.pictures import Picture
-from workbench.core.scene_index import scene_index
-from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
+from workbench.core.camera_data import Picture
+from workbench.core.cameras.render import list_cameras, segmentation_names, take_pictures
+from workbench.core.scene.scene_index import scene_index
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

@@ -16,8 +16,8 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import CPU, PICK_CUBE, batched
 from workbench.core.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
+from workbench.core.env.task_env import EnvOptions
 from workbench.core.rules import RULES, Finding, degrees_of
-from workbench.core.task_env import EnvOptions
 
 N = 3
 Hook = Callable[..., None]

@@ -19,7 +19,7 @@ from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.base import BaseStruct, PhysxRigidBodyComponentStruct
 from mani_skill.utils.structs.render_camera import RenderCamera
 
-from workbench.core import seams
+from workbench.core import maniskill_private
 
 
 @pytest.mark.parametrize("name", ["_objs", "_scene_idxs"])
@@ -112,8 +112,8 @@ def test_a_config_knows_where_it_was_made(monkeypatch: pytest.MonkeyPatch) -> No
     stock = getattr(CameraConfig.__init__, "_workbench_stock", CameraConfig.__init__)
     monkeypatch.setattr(CameraConfig, "__init__", stock)
     monkeypatch.setattr(sapien_utils, "look_at", sapien_utils.look_at)  # to be put back
-    seams.mark_camera_configs()
-    seams.mark_camera_configs()
+    maniskill_private.mark_camera_configs()
+    maniskill_private.mark_camera_configs()
 
     def hook() -> list[CameraConfig]:
         pose = sapien.Pose()
@@ -129,9 +129,9 @@ def test_a_config_knows_where_it_was_made(monkeypatch: pytest.MonkeyPatch) -> No
         ]  # fmt: skip
 
     first = inspect.getsourcelines(hook)[1]
-    sites = [seams.camera_site(copy.copy(config)) for config in hook()]
+    sites = [maniskill_private.camera_site(copy.copy(config)) for config in hook()]
     assert [site and (site.file, site.line - first) for site in sites] == [(__file__, 3), (__file__, 4)]
     if sys.version_info >= (3, 11):
         assert sites[0].function == "test_a_config_knows_where_it_was_made.<locals>.hook"  # type: ignore[union-attr]
     monkeypatch.setattr(CameraConfig, "__init__", stock)
-    assert seams.camera_site(hook()[0]) is None
+    assert maniskill_private.camera_site(hook()[0]) is None

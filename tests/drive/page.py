@@ -118,7 +118,7 @@ def open_workbench(
     *arguments: str, cwd: Path | None = None, what: str = "open", env: dict[str, str] | None = None
 ) -> Iterator[Opened]:
     """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends."""
-    command = [sys.executable, "-m", "workbench.cli", what, *arguments, "--port", "0"]
+    command = [sys.executable, "-m", "workbench.cli.main", what, *arguments, "--port", "0"]
     process = subprocess.Popen(
         command,
         cwd=cwd,

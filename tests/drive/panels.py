@@ -20,8 +20,8 @@ from typing import Any, Literal
 import viser
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage, GuiUpdateMessage
 
-from workbench.ui.control_values import check_value, name_of
-from workbench.ui.viser_seam import element_id
+from workbench.ui.server.control_values import check_value, name_of
+from workbench.ui.server.viser_private import element_id
 
 Kind = Literal["button", "field"]
 """Of an input. A button and what it is for may have the same label."""
@@ -257,7 +257,7 @@ class Panels:
 
     def _say(self, control: Any, value: object) -> None:
         try:
-            # The door's own, before viser hears of it (`workbench.ui.page_guard`).
+            # The door's own, before viser hears of it (`workbench.ui.server.page_guard`).
             check_value(control, list(value) if isinstance(value, tuple) else value)
         except ValueError as error:
             self.client.notices.append(str(error))

@@ -9,10 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.pictures import Picture
-from workbench.core.step import OtherEntry
-from workbench.recording.columns import BATCH, EVALUATE, OBS, STATE, BatchPacker, Layout
-from workbench.recording.episode_writer import EpisodeWriter
+from workbench.core.camera_data import Picture
+from workbench.core.env.step_result import OtherEntry
+from workbench.recording.episode.columns import BATCH, EVALUATE, OBS, STATE, BatchPacker, Layout
+from workbench.recording.writing.episode_writer import EpisodeWriter
 
 
 @dataclass(frozen=True)

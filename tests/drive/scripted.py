@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from tests.ui.scenes import camera, description, step_of, table_scene
-from workbench.core.pictures import CameraInfo, Picture
-from workbench.core.step import StepResult
+from workbench.core.camera_data import CameraInfo, Picture
+from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped, TaskDescription
-from workbench.session.kept_worker import Death, KeptWorker, Vitals, WorkerOptions
-from workbench.session.last_words import Busy
-from workbench.session.messages import (
+from workbench.session.process.heartbeat import Busy
+from workbench.session.process.supervisor import Death, KeptWorker, Vitals, WorkerOptions
+from workbench.session.process.worker_process import Output
+from workbench.session.protocol.messages import (
     Event,
     Load,
     Loaded,
@@ -34,7 +35,6 @@ from workbench.session.messages import (
     Status,
     WarmUp,
 )
-from workbench.session.process import Output
 
 STEP_SECONDS = 0.02
 """Between two steps while it plays."""

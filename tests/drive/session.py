@@ -8,11 +8,11 @@ from pathlib import Path
 
 from tests.drive.waiting import until
 from workbench.jobs.task import TaskOptions
-from workbench.session.judging import JudgedView
-from workbench.session.kept_worker import WorkerOptions
-from workbench.session.rescore import Rescorer
-from workbench.session.session import Session
-from workbench.session.view import SessionView
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.process.supervisor import WorkerOptions
+from workbench.session.rescore.background import JudgedView
+from workbench.session.rescore.recordings import Rescorer
 
 TASKS = Path(__file__).parents[2] / "tasks"
 

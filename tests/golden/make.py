@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from workbench.recording.episode import Episode
-from workbench.recording.library import Library
-from workbench.recording.read_episode import read_episode
-from workbench.recording.reading import mend
+from workbench.recording.episode.episode import Episode
+from workbench.recording.library.library import Library
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.reader.reading import mend
 
 GOLDEN = Path(__file__).parent
 PLACE = Path("/tmp/golden")
@@ -130,7 +130,7 @@ def read_folder(folder: Path) -> dict[str, Any]:
 
 
 def command(folder: Path, task: str, policy: str, *arguments: str) -> list[str]:
-    record = [sys.executable, "-m", "workbench.cli", "record", f"tasks/{task}", "--num-envs", "1"]
+    record = [sys.executable, "-m", "workbench.cli.main", "record", f"tasks/{task}", "--num-envs", "1"]
     return [*record, "--actions", f"tasks/push/act.py:{policy}", "--out", str(folder), *arguments]
 
 

@@ -19,8 +19,8 @@ from typing import Any, NoReturn
 import pytest
 
 from tests.golden.make import GOLDEN
-from workbench import cli
-from workbench.terminal import Exit
+from workbench.cli import main
+from workbench.cli.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
 COMMANDS = ("open", "record", "review", "rescore", "share", "export", "view", "doctor")
@@ -111,7 +111,7 @@ def plain_terminal(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
 def run(capsys: pytest.CaptureFixture[str], call: str) -> tuple[int, str]:
     """Exit code and all that it says but bars and calls of a traceback, with nothing in it that belongs to this machine."""
     with pytest.raises(SystemExit) as ended:
-        cli.main(shlex.split(call))
+        main.main(shlex.split(call))
     told = capsys.readouterr()
     said = (told.out + told.err).replace(os.getcwd(), "HERE").replace(sys.executable, "PYTHON")
     said = re.sub(r"^Traceback .*\n(?: .*\n)*", "", said, flags=re.MULTILINE)

@@ -16,13 +16,13 @@ import pytest
 
 from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
-from workbench.cli import main
-from workbench.recording.library import Library
-from workbench.recording.read_episode import read_episode
-from workbench.recording.source import UnreadableRecording
-from workbench.session.session import Session
-from workbench.session.step_back import run_of
-from workbench.terminal import Exit
+from workbench.cli.main import main
+from workbench.cli.terminal import Exit
+from workbench.jobs.from_recording import run_of
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.library.library import Library
+from workbench.recording.reader.read_episode import read_episode
+from workbench.session.live.session import Session
 
 # Recordings are read, mended and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")

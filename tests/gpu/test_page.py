@@ -13,8 +13,8 @@ import pytest
 from tests.drive.session import wait_until
 from tests.gpu.conftest import Simulation, Told
 from workbench.jobs.task import TaskOptions
-from workbench.session.messages import CameraRequest
-from workbench.session.session import Session
+from workbench.session.live.session import Session
+from workbench.session.protocol.messages import CameraRequest
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 STEPS, PICTURES = 100, 5

@@ -16,8 +16,8 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs.pose import Pose
 
 from tests.gpu.conftest import Simulation
-from workbench.core.take_pictures import take_pictures
-from workbench.core.task_env import EnvOptions, make_env
+from workbench.core.cameras.render import take_pictures
+from workbench.core.env.task_env import EnvOptions, make_env
 
 N = 2
 MODE = "rgb+depth+segmentation"

@@ -18,12 +18,12 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.gpu.conftest import Simulation
-from workbench.core import actions
-from workbench.core.assets import MissingAssets
-from workbench.core.contact_list import list_contacts
-from workbench.core.scene_index import scene_index
-from workbench.core.snapshot import restore_snapshot, take_snapshot
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.capture.inspect_env import list_contacts
+from workbench.core.env import actions
+from workbench.core.env.assets import MissingAssets
+from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.scene.scene_index import scene_index
+from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 N = 4
 SEEDS = [40, 41, 42, 43]

@@ -6,12 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.regular_file import (
-    FileTooLarge,
-    NotARegularFile,
-    open_regular_file,
-    read_regular_file,
-)
+from workbench.machine.files import FileTooLarge, NotARegularFile, open_regular_file, read_regular_file
 
 
 def test_a_file_and_a_link_to_one_are_read(tmp_path: Path) -> None:

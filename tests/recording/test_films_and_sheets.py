@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
-from workbench.recording.episode import Episode
-from workbench.recording.episode_pictures import (
+from workbench.recording.episode.encoded_pictures import EncodedPictures, encode_jpeg
+from workbench.recording.episode.episode import Episode
+from workbench.recording.films import (
+    Encoding,
     Eye,
     camera_of,
     cameras_by_name,
@@ -26,9 +27,9 @@ from workbench.recording.episode_pictures import (
     enlarged,
     frames,
     usual_eye,
+    write_mp4,
 )
-from workbench.recording.films import Encoding, write_mp4
-from workbench.recording.read_episode import read_episode
+from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -134,7 +135,7 @@ def test_small_pictures_are_enlarged_by_whole_pixels() -> None:
 
 def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:
     """From the recorded place of a camera the drawn scene and the camera's picture are of the same things."""
-    from workbench.core.recorded_scene import RecordedScene
+    from workbench.core.cameras.render_recorded import RecordedScene
 
     camera = camera_of(episode, "base_camera")
     assert episode.geometry is not None and episode.poses is not None and camera.rgb is not None

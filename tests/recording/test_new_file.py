@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.refused_calls import descriptors, left_open, refused
-from workbench.machine.atomic_files import new_file
+from workbench.machine.files import new_file
 
 
 def write(path: Path, content: bytes = b"whole") -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import live_session
-from workbench.session.session import Session
+from workbench.session.live.session import Session
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from tests.drive.session import TASKS
-from workbench.core.step import StepResult
+from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Stepped
-from workbench.jobs.wire import pack, pack_message
+from workbench.machine.processes.wire import pack, pack_message
 
 _MISCHIEF = """
 import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading as _threading, time as _time

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from workbench.core.geometry import SceneGeometry
-from workbench.core.step import StepResult
+from workbench.core.env.step_result import StepResult
+from workbench.core.scene.shapes import SceneGeometry
 from workbench.jobs.task import Restored, Stepped
-from workbench.session.env_table import EnvTable
-from workbench.session.kept_worker import Death
+from workbench.session.history.env_table import EnvTable
+from workbench.session.process.supervisor import Death
 
 N, BODIES = 3, 4
 DEATH = Death("was killed by SIGSEGV", False, False, "stepping", "", False)

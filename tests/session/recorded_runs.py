@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.core import actions
-from workbench.core.recorded_run import RecordedRun
-from workbench.core.recorded_state import read_states
-from workbench.core.step import StepResult
+from workbench.core.capture.recorded_run import RecordedRun
+from workbench.core.capture.recorded_state import read_states
+from workbench.core.env import actions
+from workbench.core.env.step_result import StepResult
+from workbench.jobs.open_task import OpenedTask, open_task, reset_checked, step_checked
 from workbench.jobs.task import TaskOptions
-from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked
 
 States = dict[str, np.ndarray]
 

@@ -19,12 +19,12 @@ from typing import Any, get_args
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
 from workbench.jobs.pool import Answer
-from workbench.jobs.wire import Call, Unpacker, pack_message
-from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
-from workbench.session.messages import ListenForDebugger, Load, Loaded, Loading, Quit, Request
-from workbench.session.pulse import PulseWriter
-from workbench.session.questions import QUESTIONS, RunCameras
-from workbench.session.worker_start import main
+from workbench.machine.processes.wire import Call, Unpacker, pack_message
+from workbench.session.process.heartbeat import PulseWriter
+from workbench.session.process.interrupts import INTERRUPT_SIGNAL, Interrupts
+from workbench.session.protocol.messages import ListenForDebugger, Load, Loaded, Loading, Quit, Request
+from workbench.session.protocol.questions import QUESTIONS, RunCameras
+from workbench.session.worker.start import main
 
 
 class SmallWorker:
@@ -124,7 +124,7 @@ class SmallWorker:
 
 
 if __name__ == "__main__":
-    instead: Any = types.ModuleType("workbench.session.worker")
+    instead: Any = types.ModuleType("workbench.session.worker.loop")
     instead.work = lambda fd, pulse: SmallWorker(multiprocessing.connection.Connection(fd), pulse).run()
-    sys.modules["workbench.session.worker"] = instead
+    sys.modules["workbench.session.worker.loop"] = instead
     main()

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from tests.ui.scenes import camera as camera_of
-from workbench.core.camera_frames import LookAt, pose_from_look_at, with_pose
-from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.session.session import Session
-from workbench.session.studio_view import StudioCamera, StudioView
-from workbench.session.view import SessionView
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.core.cameras.conventions import LookAt, pose_from_look_at, with_pose
+from workbench.session.cameras.view import StudioCamera, StudioView
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
 
 BASE: CameraKey = ("sensor", "base_camera")
 

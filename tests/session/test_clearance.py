@@ -15,20 +15,20 @@ from typing import Any
 import pytest
 
 from tests.drive.episodes import begin, made, write
-from workbench.authoring.reference import RecordedTask
-from workbench.authoring.task_content import TaskContent, read_content
-from workbench.authoring.trust import STORE_FILE, TrustStore
-from workbench.machine.child_python import child_environment, python_command
+from workbench.authoring.loading.reference import RecordedTask
+from workbench.authoring.loading.task_content import TaskContent, read_content
+from workbench.authoring.loading.trust import STORE_FILE, TrustStore
+from workbench.jobs.from_recording import recorded_source, reference_of
+from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.user_folder import user_folder
-from workbench.recording.annotations import write_into_description
-from workbench.recording.episode import EpisodeInfo
-from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
-from workbench.recording.read_episode import read_episode
-from workbench.recording.recover import recover
-from workbench.recording.source import UnreadableRecording
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.made_here import KEY_FILE, MadeHere, made_here
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.tags import write_into_description
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.writing.recover import recover
 from workbench.session.clearance import Clearances, Consent, NotCleared, Since, TrustQuestion, Wanted
-from workbench.session.recorded_scene import SceneError, SceneProcess
-from workbench.session.step_back import recorded_source, reference_of
+from workbench.session.review.recorded_scene import SceneError, SceneProcess
 
 TEXT = "import helper\nclass Push: ...\n"
 
@@ -462,7 +462,7 @@ def test_a_user_without_a_home_has_no_folder_and_nothing_is_made_in_the_current_
 ) -> None:
     tmp_path.chmod(0o777)
     program = (
-        "import os, workbench.authoring.trust as trust, workbench.authoring.task_content as content\n"
+        "import os, workbench.authoring.loading.trust as trust, workbench.authoring.loading.task_content as content\n"
         "os.setgid(54321); os.setuid(54321)\n"
         "store, one = trust.TrustStore(), content.TaskContent('a.py', {'a.py': ''})\n"
         "store.trust(one)\n"

@@ -22,20 +22,20 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.session import rescored
 from tests.drive.waiting import until
-from workbench.cli import main
+from workbench.cli.main import main
+from workbench.cli.rescore import RescoreOptions, rescore_all
+from workbench.cli.terminal import Exit
+from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.task import TaskOptions
-from workbench.recording.library import Library
-from workbench.recording.sources import sources_among
-from workbench.rescore_command import RescoreOptions, rescore_all
+from workbench.recording.library.library import Library
+from workbench.recording.reader.reading import sources_among
 from workbench.session.clearance import Clearances, Consent, NotTrusted, TrustQuestion
-from workbench.session.make_scene import make
-from workbench.session.questions import MakeScene
-from workbench.session.record import RecordOptions, record
-from workbench.session.recorded_scene import SceneProcess
-from workbench.session.rescore import Rescorer
-from workbench.session.review import Review
-from workbench.terminal import Exit
-from workbench.ui.judged_panel import status_html
+from workbench.session.protocol.questions import MakeScene
+from workbench.session.rescore.recordings import Rescorer
+from workbench.session.review.recorded_scene import SceneProcess
+from workbench.session.review.review import Review
+from workbench.session.worker.make_scene import make
+from workbench.ui.widgets.rescored import status_html
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -20,13 +20,13 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from torch.utils import _pytree as pytree
 
 from tests.sweeps.upstream_faults import Fault, faults_of, where_it_fails
-from workbench.core import actions
-from workbench.core.assets import MissingAssets, robots_of
-from workbench.core.cpu_layout import BODY
-from workbench.core.entries import wrong_evaluate
-from workbench.core.snapshot import restore_snapshot, take_snapshot
-from workbench.core.take_pictures import Request, list_cameras, take_pictures
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.cameras.render import Request, list_cameras, take_pictures
+from workbench.core.env import actions
+from workbench.core.env.assets import MissingAssets, robots_of
+from workbench.core.env.evaluate_entries import wrong_evaluate
+from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.simulation.state_layout import BODY
+from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 NUM_ENVS = 4
 SEEDS = [11, 12, 13, 14]

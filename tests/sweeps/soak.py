@@ -24,9 +24,9 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.session.hazards import calm, provoke, write_task
 from workbench.jobs.task import TaskOptions
-from workbench.session.kept_worker import WorkerOptions
-from workbench.session.session import Session
-from workbench.session.view import SessionView
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.process.supervisor import WorkerOptions
 
 DEATHS = ("segfault", "exit", "kill", "abort", "children")
 PATIENCE = 120.0

@@ -9,10 +9,10 @@ import viser
 from tests.drive.panels import Clock, Panels
 from tests.drive.scripted import Evaluate, no_success, scripted
 from tests.drive.session import wait_until
-from workbench.core.pictures import CameraInfo
+from workbench.core.camera_data import CameraInfo
 from workbench.jobs.task import TaskOptions
-from workbench.session.session import Session
-from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.session.live.session import Session
+from workbench.ui.server.gated_server import Door, DoorOptions, open_door
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from workbench.session.env_table import KEPT_REWARDS, EnvRows, Kind, LastEpisode, Outlier
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, Kind, LastEpisode, Outlier
 
 FELL = Outlier(Kind.DROPPED, 12, "cube dropped 0.90 m")
 

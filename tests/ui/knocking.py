@@ -14,9 +14,9 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from tests.drive.waiting import until
-from workbench.ui.door import Door
-from workbench.ui.gate import cookie_name
-from workbench.ui.viser_seam import element_id
+from workbench.ui.server.access import cookie_name
+from workbench.ui.server.gated_server import Door
+from workbench.ui.server.viser_private import element_id
 
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {

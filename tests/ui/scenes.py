@@ -8,13 +8,13 @@ import numpy as np
 import trimesh
 
 from workbench.authoring.problem import Problem
-from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
-from workbench.core.pictures import CameraInfo, CameraKind
-from workbench.core.step import StepResult
+from workbench.core.camera_data import CameraInfo, CameraKind
+from workbench.core.env.step_result import StepResult
+from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.jobs.task import ActionDimension, TaskDescription
-from workbench.session.messages import Settings
-from workbench.session.record_status import RecordingStatus
-from workbench.session.view import SessionView
+from workbench.session.live.view import SessionView
+from workbench.session.protocol.messages import Settings
+from workbench.session.record.status import RecordingStatus
 
 
 def box_mesh(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Mesh:

@@ -26,7 +26,7 @@ import zstandard
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
-from workbench.ui.gate import cookie_name
+from workbench.ui.server.access import cookie_name
 
 
 def handshake(url: str) -> tuple[str, dict[str, Any]]:

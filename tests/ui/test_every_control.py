@@ -21,10 +21,10 @@ from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.knocking import claim, client, say
 from workbench.jobs.task import TaskOptions
-from workbench.session.session import Session
-from workbench.ui import page_guard
-from workbench.ui.door import Door, DoorOptions, open_door
-from workbench.ui.put_together import Workplace
+from workbench.session.live.session import Session
+from workbench.ui.app.workplace import Workplace
+from workbench.ui.server import page_guard
+from workbench.ui.server.gated_server import Door, DoorOptions, open_door
 
 NASTY = (
     *(None, False, 0, 0.5, -1, 1e30, -1e30, 2**63, 2**64 - 1, -(2**63), 1e308, float("nan"), float("inf")),

@@ -1,1 +1,1 @@
-"""From a source file to a running task class, and what went wrong in it."""
+"""From the author's file to a task class, and edits back into the file. Executes nothing but in `loading`."""

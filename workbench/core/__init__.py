@@ -1,4 +1,1 @@
-"""The batched env core: N environments of one ManiSkill task, on CPU or GPU.
-
-Knows ManiSkill, SAPIEN and torch; knows nothing of viser, rerun, files or processes.
-"""
+"""The batched env core: N envs of one ManiSkill task, on the CPU or a GPU. Knows no page, no file format and no process."""

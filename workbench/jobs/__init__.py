@@ -1,1 +1,1 @@
-"""Work that needs no page: cut into numbered items, done by several processes."""
+"""Work that needs no page: a task opened, recorded, replayed and rescored, in one process or several."""

@@ -21,11 +21,11 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Protocol, TypeVar
 
 from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_c
-from workbench.jobs.wire import Line, Unpacker, Unreadable, pack, pack_message
-from workbench.machine.breakpoints import ONE_PROCESS, refuse_breakpoints
-from workbench.machine.child_python import child_environment, python_command, quick_imports
-from workbench.machine.family import describe_exit, end_family
-from workbench.machine.terminal_text import guard_terminal
+from workbench.machine.processes.breakpoints import ONE_PROCESS, refuse_breakpoints
+from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
+from workbench.machine.processes.family import describe_exit, end_family
+from workbench.machine.processes.wire import Line, Unpacker, Unreadable, pack, pack_message
+from workbench.machine.text import guard_terminal
 
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0
@@ -231,7 +231,7 @@ class _Pool:
             with theirs:
                 module = ("workbench.jobs.pool", str(theirs.fileno()))
                 keeper = subprocess.Popen(
-                    python_command("-m", "workbench.machine.family", str(os.getpid()), *module),
+                    python_command("-m", "workbench.machine.processes.family", str(os.getpid()), *module),
                     stdin=subprocess.DEVNULL,
                     pass_fds=[theirs.fileno()],
                     start_new_session=True,  # Ctrl-C in the terminal is for this process, which tells them
@@ -370,7 +370,7 @@ class _FarShare:
 
 
 def main(socket_fd: str) -> None:
-    """Entry of a process, which `machine.family` has started."""
+    """Entry of a process, which `machine.processes.family` has started."""
     guard_terminal()
     refuse_breakpoints(ONE_PROCESS)
     nobody_presses_ctrl_c()

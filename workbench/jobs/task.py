@@ -8,12 +8,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_report import ObjectToSee
-from workbench.core.camera_settings import CameraKey
-from workbench.core.geometry import SceneGeometry
-from workbench.core.pictures import CameraInfo, Picture
+from workbench.core.camera_data import CameraInfo, CameraKey, Picture
+from workbench.core.cameras.report import ObjectToSee
+from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Degree
-from workbench.core.step import StepResult
+from workbench.core.scene.shapes import SceneGeometry
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -131,7 +130,7 @@ class Stepped:
     seeds: NDArray[np.int64] | None = None
     """(N,) episode seed of each env, where a reset was part of this."""
     snapshot: bytes = b""
-    """The body of the snapshot of the whole batch at this moment (see `core.snapshot_parts`): opaque to the
+    """The body of the snapshot of the whole batch at this moment (see `core.snapshots.packing`): opaque to the
     server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
     part_keys: tuple[int, ...] | None = None
     """The parts of the snapshot; None where they are those of the event before."""
@@ -141,7 +140,7 @@ class Stepped:
     """Counts these events since the worker began; `Pictures.number` refers to it."""
     restored: Restored | None = None
     columns: dict[str, NDArray] = field(default_factory=dict)
-    """(N, ...) each, as `core.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    """(N, ...) each, as `core.capture.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
     acted_by: str = ""
     """What chose the action of this step, as a recording is to say it; empty where it is known beforehand."""

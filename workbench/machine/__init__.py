@@ -1,3 +1,3 @@
-"""What the machine at hand can do, and bringing what it lacks: render driver, browser, system libraries."""
+"""What this machine has: files, text, a browser, something to render with."""
 
 DISTRIBUTION = "maniskill-workbench"

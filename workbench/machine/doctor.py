@@ -28,10 +28,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from workbench.machine import DISTRIBUTION
-from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
-from workbench.machine.confinement import landlock_version
-from workbench.machine.render_device import driver_files
+from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.confinement import landlock_version
+from workbench.machine.render_probe import driver_files
 from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import platformdirs
 
-from workbench.machine.atomic_files import create_file, written_beside
+from workbench.machine.files import create_file, written_beside
 
 MOST_BYTES = 16 << 20
 

@@ -1,1 +1,1 @@
-"""Episodes: gathered as columns, written as one ``.rrd`` a file, read back and opened in rerun."""
+"""Episodes on disk: written, read, listed, and made into films and datasets."""

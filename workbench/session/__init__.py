@@ -1,1 +1,1 @@
-"""The live session: the worker process that owns the env, the messages to it, and the player."""
+"""The live session and the review: what the page asks for and what it sees."""

@@ -16,13 +16,13 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring.reference import RecordedTask, TaskName, is_like_a_file
-from workbench.authoring.task_content import CannotRead, TaskContent, read_content
-from workbench.authoring.trust import TrustStore
-from workbench.machine.terminal_text import short_line
-from workbench.recording.episode import EpisodeInfo
-from workbench.recording.made_here import MadeHere, made_here
-from workbench.session.step_back import NoText, below_one_folder
+from workbench.authoring.loading.reference import RecordedTask, TaskName, is_like_a_file
+from workbench.authoring.loading.task_content import CannotRead, TaskContent, read_content
+from workbench.authoring.loading.trust import TrustStore
+from workbench.jobs.from_recording import NoText, below_one_folder
+from workbench.machine.text import short_line
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.made_here import MadeHere, made_here
 
 SHORT_HASH = 12
 LONGEST = 400

@@ -1,1 +1,1 @@
-"""The page: viser and nothing else talks to the browser."""
+"""The page. Nothing else knows viser."""

@@ -22,7 +22,7 @@ from workbench.authoring.camera_source.cameras import Ran, Run
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls, owners
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_data import CameraKey, CameraSettings
 
 FILE = "/author/task.py"
 HEADER = """\

@@ -15,7 +15,7 @@ from tests.authoring.camera_source.real_cameras import FILE, real_settings, run_
 from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source.disk import FileChange, SourceEdit, apply, revert
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.modules import exact_text
+from workbench.authoring.loading.modules import exact_text
 from workbench.authoring.source.text import Refused, plain_line_ends
 
 SOURCE = WRITTEN["an argument a line, with remarks"]

@@ -18,7 +18,7 @@ from workbench.authoring.camera_source.cameras import HOOKS, Ran
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls
-from workbench.core.camera_settings import CameraKey
+from workbench.core.camera_data import CameraKey
 
 PACKAGE = Path(mani_skill.__file__).parent
 FILES = sorted(

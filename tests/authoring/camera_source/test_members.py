@@ -26,9 +26,8 @@ from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_frames import LookAt, pose_from_look_at, with_pose
-from workbench.core.camera_settings import CameraSettings
-from workbench.core.pictures import CameraKind
+from workbench.core.camera_data import CameraKind, CameraSettings
+from workbench.core.cameras.conventions import LookAt, pose_from_look_at, with_pose
 
 NEW = CameraSettings((0.1, 0.25, 1.5), (0.5, 0.5, 0.5, -0.5), 1.25, None, 64, 48, 0.02, 12.0, "default")
 HUMAN = "_default_human_render_camera_configs"

@@ -13,7 +13,7 @@ from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
 from workbench.authoring.source.numbers import look_at, quaternion_texts, same_side, to_euler
-from workbench.core.camera_frames import angle_between
+from workbench.core.cameras.conventions import angle_between
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)
 parts = st.floats(-1, 1)

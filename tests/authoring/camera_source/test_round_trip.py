@@ -26,8 +26,8 @@ from workbench.authoring.camera_source.cameras import changed_fields
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_frames import angle_between
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.core.cameras.conventions import angle_between
 
 KEY: CameraKey = ("sensor", "cam")
 FORMS = (

@@ -26,8 +26,8 @@ from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_frames import angle_between
-from workbench.core.camera_settings import CameraSettings
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras.conventions import angle_between
 
 Edit = Callable[[CameraSettings], CameraSettings]
 

@@ -17,7 +17,7 @@ from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.source.text import Refused
 from workbench.authoring.source.trace import Place, Read
-from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings
+from workbench.core.camera_data import CallSite, CameraKey, CameraSettings
 
 TWO = HEADER + dedent(
     """\

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 from workbench.authoring.source.text import LOOPS, SourceFile
 from workbench.authoring.source.trace import Trace
-from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
-from workbench.core.pictures import CameraKind
+from workbench.core.camera_data import CallSite, CameraKey, CameraKind, CameraSettings, differences
 
 FIELDS = ("pose", "fov", "intrinsic", "width", "height", "near", "far", "shader_pack")
 PARAMETERS = (

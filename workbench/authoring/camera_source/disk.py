@@ -16,11 +16,11 @@ import stat
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-from workbench.authoring.library_names import LIBRARY_FOLDERS
-from workbench.authoring.modules import read_exactly
+from workbench.authoring.loading.library_names import LIBRARY_FOLDERS
+from workbench.authoring.loading.modules import read_exactly
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_settings import CameraSettings
-from workbench.machine.atomic_files import replace_file
+from workbench.core.camera_data import CameraSettings
+from workbench.machine.files import replace_file
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from workbench.authoring.camera_source.hooks import snippet
 from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.text import Refused, SourceFile, arguments
-from workbench.core.camera_settings import CameraKey, CameraSettings, differences, why_no_camera
+from workbench.core.camera_data import CameraKey, CameraSettings, differences, why_no_camera
 
 
 class CameraEdit(Changes):

@@ -15,8 +15,7 @@ from workbench.authoring.source.numbers import (
     quaternion_texts,
 )
 from workbench.authoring.source.text import Function, Refused, Replacement, SourceFile, walk
-from workbench.core.camera_settings import CameraSettings
-from workbench.core.pictures import CameraKind
+from workbench.core.camera_data import CameraKind, CameraSettings
 
 HOOK_OF: dict[CameraKind, str] = {kind: hook for hook, kind in HOOKS.items() if hook.startswith("_default")}
 

@@ -29,8 +29,7 @@ from workbench.authoring.camera_source.hooks import (
 )
 from workbench.authoring.camera_source.write_pose import look_at_text
 from workbench.authoring.source.text import FUNCTIONS, Refused, Replacement, SourceFile
-from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings
-from workbench.core.pictures import CameraKind
+from workbench.core.camera_data import CallSite, CameraKey, CameraKind, CameraSettings
 
 
 def plan_add(

@@ -18,8 +18,8 @@ from workbench.authoring.camera_source.write_pose import ANGLE_STEP, POSITION_ST
 from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.numbers import matrix_text, number_text
 from workbench.authoring.source.text import Refused, Replacement
-from workbench.core.camera_frames import angle_between
-from workbench.core.camera_settings import CameraKey, CameraSettings, in_words
+from workbench.core.camera_data import CameraKey, CameraSettings, in_words
+from workbench.core.cameras.conventions import angle_between
 
 
 def plan_edit(

@@ -14,9 +14,9 @@ from workbench.authoring.camera_source.cameras import FIELDS, HOOKS, PARAMETERS,
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import trace_call
 from workbench.authoring.source.trace import Trace
-from workbench.core import seams
-from workbench.core.camera_settings import CameraSettings
-from workbench.core.place_camera import settings_of
+from workbench.core import maniskill_private
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras.place import settings_of
 
 Noted = dict[int, tuple[Any, CameraSettings | None, Trace | None]]
 """By identity of a config: it, what it was made with, and its call."""
@@ -31,16 +31,17 @@ def noting_calls(sources: Mapping[str, str]) -> Iterator[Noted]:
         values = {name: getattr(config, name) for name in FIELDS}
         noted[id(config)] = config, settings_of(config), trace_call(project, frame, PARAMETERS, values)
 
-    with seams.noting_cameras(note):
+    with maniskill_private.noting_cameras(note):
         yield noted
 
 
 def run_hooks(env: Any, sources: Mapping[str, str]) -> Ran:
     """Calls the hooks of an env whose classes were made of these texts."""
     with noting_calls(sources) as noted:
-        configs = seams.camera_configs(env)
+        configs = maniskill_private.camera_configs(env)
     return Ran(
-        {key: camera_run(config, noted) for key, config in configs.items()}, owners(seams.task_class(env))
+        {key: camera_run(config, noted) for key, config in configs.items()},
+        owners(maniskill_private.task_class(env)),
     )
 
 
@@ -48,7 +49,7 @@ def camera_run(config: Any, noted: Noted) -> CameraRun:
     _, made, trace = noted.get(id(config), (None, None, None))
     name = getattr(config.mount, "name", None)
     mount = f"{config.entity_uid} {name if isinstance(name, str) else type(config.mount).__name__}"
-    return CameraRun(made, settings_of(config), mount, seams.camera_site(config), trace)
+    return CameraRun(made, settings_of(config), mount, maniskill_private.camera_site(config), trace)
 
 
 def owners(task: type) -> dict[str, tuple[str, str]]:

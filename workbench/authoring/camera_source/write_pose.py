@@ -20,8 +20,8 @@ from workbench.authoring.source.changes import Changes, settled
 from workbench.authoring.source.numbers import list_text, look_at, quaternion_texts, same_side, to_euler
 from workbench.authoring.source.text import Replacement, SourceFile
 from workbench.authoring.source.trace import Part
-from workbench.core.camera_frames import angle_between, rotation_matrix, target_of
-from workbench.core.camera_settings import CameraSettings
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras.conventions import angle_between, rotation_matrix, target_of
 
 POSITION_STEP = 1e-4
 """0.1 mm: what is written."""

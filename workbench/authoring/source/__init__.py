@@ -1,1 +1,1 @@
-"""Values traced to where they stand in the author's files, and smallest edits of them."""
+"""Where values of a running call stand in the source, and edits of them."""

@@ -21,7 +21,7 @@ from mani_skill.utils.structs.pose import Pose
 from transforms3d import euler
 
 from workbench.authoring.source.trace import Plain
-from workbench.core import seams
+from workbench.core import maniskill_private
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Known:
 
 @cache
 def known_functions() -> dict[Callable[..., Any], Known]:
-    seams.mark_camera_configs()  # puts a look_at of its own before ManiSkill's, which others may have imported before
+    maniskill_private.mark_camera_configs()  # puts a look_at of its own before ManiSkill's, which others may have imported before
     same, number, look_at = Known(same=True), Known(), Known("look_at", ("eye", "target", "up", "device"))
     table: dict[Callable[..., Any], Known] = {
         sapien_utils.look_at: look_at,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from transforms3d.quaternions import mat2quat
 
-from workbench.core.camera_frames import normalised, rotation_matrix
+from workbench.core.cameras.conventions import normalised, rotation_matrix
 
 
 def number_text(value: float, decimals: int, like: str = "0.0") -> str:

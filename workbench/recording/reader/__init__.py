@@ -1,0 +1,1 @@
+"""Recordings read in confined processes."""

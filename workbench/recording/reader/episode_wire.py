@@ -15,16 +15,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes, Visual
-from workbench.recording.columns import MOST_LINES
-from workbench.recording.document import CameraWords
-from workbench.recording.encoded_pictures import (
-    MOST_PIXELS,
-    EncodedPictures,
-    LazyPictures,
-    Modality,
-)
-from workbench.recording.episode import CameraTrack, Episode, Unread
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
+from workbench.recording.episode.columns import MOST_LINES
+from workbench.recording.episode.document import CameraWords
+from workbench.recording.episode.encoded_pictures import MOST_PIXELS, EncodedPictures, LazyPictures, Modality
+from workbench.recording.episode.episode import CameraTrack, Episode, Unread
 from workbench.recording.reader.requests import CameraRead, EpisodeRead, PictureRead, ShapeRead, VisualRead
 
 FetchPicture = Callable[[int, Modality, int, bool], PictureRead]

@@ -16,15 +16,15 @@ import sys
 from collections import OrderedDict
 from typing import Literal, get_args
 
-from workbench.jobs.wire import Line, Unpacker, pack, pack_message
-from workbench.machine.confinement import confine
-from workbench.machine.family import end_with_parent
-from workbench.recording.encoded_pictures import EncodedPictures
-from workbench.recording.episode import CameraTrack
-from workbench.recording.library_read import read_found
-from workbench.recording.library_row import text
-from workbench.recording.library_scan import Found
+from workbench.machine.processes.confinement import confine
+from workbench.machine.processes.family import end_with_parent
+from workbench.machine.processes.wire import Line, Unpacker, pack, pack_message
+from workbench.recording.episode.encoded_pictures import EncodedPictures
+from workbench.recording.episode.episode import CameraTrack
+from workbench.recording.episode.row import text
+from workbench.recording.episode.source import Source, UnreadableRecording
 from workbench.recording.reader.episode_wire import SentShapes, packed
+from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.requests import (
     Answer,
     Ended,
@@ -45,7 +45,7 @@ from workbench.recording.reader.requests import (
     SourcesFound,
     ToldRerun,
 )
-from workbench.recording.source import Source, UnreadableRecording
+from workbench.recording.reader.scan import Found
 
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
@@ -104,9 +104,6 @@ def _be_a_reader(end: socket.socket, wanted: NewReader, nursery: int) -> None:
 
 def warm_up() -> None:
     """Import what reads an episode."""
-    import workbench.recording.blueprint_in_file
-    import workbench.recording.lerobot_read
-    import workbench.recording.read_episode  # noqa: F401
 
 
 def serve(line: Line) -> None:
@@ -165,13 +162,13 @@ class _Reader:
         if isinstance(wanted, ForRerun):
             return _told_rerun(wanted)
         assert isinstance(wanted, Recover)
-        from workbench.recording.recover import recover
+        from workbench.recording.writing.recover import recover
 
         return Recovered([files.rrd.name for files in recover(wanted.folder)])
 
     def _open(self, wanted: Open) -> EpisodeRead:
-        from workbench.recording.lerobot_read import read_lerobot
-        from workbench.recording.read_episode import read_inert, read_maniskill
+        from workbench.recording.lerobot.read import read_lerobot
+        from workbench.recording.reader.read_episode import read_inert, read_maniskill
 
         shapes = self._shapes.setdefault(wanted.sharing, SentShapes())
         self._shapes.move_to_end(wanted.sharing)
@@ -201,8 +198,8 @@ class _Reader:
 
 
 def _sources(wanted: Sources) -> SourcesFound:
-    from workbench.recording.read_maniskill import trajectories
-    from workbench.recording.source_files import sources_in
+    from workbench.recording.maniskill.read import trajectories
+    from workbench.recording.reader.read_episode import sources_in
 
     if wanted.trajectories:
         return SourcesFound([Source(wanted.path, name) for name in trajectories(wanted.path)])
@@ -210,8 +207,8 @@ def _sources(wanted: Sources) -> SourcesFound:
 
 
 def _told_rerun(wanted: ForRerun) -> ToldRerun:
-    from workbench.recording.blueprint_in_file import blueprint_stream
-    from workbench.recording.rerun_seam import store_id
+    from workbench.recording.rerun.append_blueprint import blueprint_stream
+    from workbench.recording.rerun.private_api import store_id
 
     found = []
     for ask in (store_id, blueprint_stream):

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from workbench.jobs.wire import Line, Unpacker, Unreadable, pack
-from workbench.machine.child_python import child_environment, python_command
-from workbench.machine.family import describe_exit
+from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.family import describe_exit
+from workbench.machine.processes.wire import Line, Unpacker, Unreadable, pack
 from workbench.recording.reader.requests import Answer, Ended, Forget, NewReader, Request
 
 START_SECONDS = 60.0

@@ -8,12 +8,12 @@ from typing import Literal
 import msgspec
 from numpy.typing import NDArray
 
-from workbench.core.geometry import Material, Mesh
-from workbench.recording.document import CameraWords
-from workbench.recording.encoded_pictures import Modality
-from workbench.recording.episode import Episode
-from workbench.recording.library_row import Entry
-from workbench.recording.source import Kind, Source
+from workbench.core.scene.shapes import Material, Mesh
+from workbench.recording.episode.document import CameraWords
+from workbench.recording.episode.encoded_pictures import Modality
+from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.row import Entry
+from workbench.recording.episode.source import Kind, Source
 
 
 class NewReader(msgspec.Struct, tag=True):

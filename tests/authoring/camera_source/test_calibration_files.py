@@ -1,0 +1,201 @@
+"""Cameras in the files of other programs: read by OpenCV itself, and read back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from workbench.authoring.camera_source.calibration_files import (
+    CameraToExport,
+    camera_as_ros_yaml,
+    camera_pose,
+    cameras_as_json,
+    cameras_as_opencv_yaml,
+    find_poses,
+)
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras import conventions as frames
+from workbench.core.cameras.conventions import LookAt
+
+POSE = frames.pose_from_look_at(LookAt((0.5, -0.4, 0.7), (0.0, 0.1, 0.05), 0.2))
+PLAIN = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 320, 240, 0.01, 10.0, "minimal")
+STANDING = CameraToExport(("sensor", "base: camera/1"), frames.with_pose(PLAIN, POSE))
+RIDING = CameraToExport(
+    ("sensor", "base: camera 1"),
+    CameraSettings(
+        (0.1, 0, 0), (1, 0, 0, 0), None, ((200, 0, 150), (0, 210, 110), (0, 0, 1)), 320, 240, 0.01, 5, "rt"
+    ),
+    mount="panda/panda_hand",
+    mount_pose=POSE,
+)
+unhurried = settings(deadline=None)  # a busy machine is no failure
+CONVENTIONS: Any = ["maniskill", "opencv", "opengl"]
+DIRECTIONS: Any = ["camera_to_world", "world_to_camera"]
+
+
+def assert_same_pose(a: Any, b: Any, atol: float = 1e-9) -> None:
+    assert_allclose(a[:3], b[:3], atol=atol)
+    assert abs(float(np.dot(a[3:], b[3:]))) == pytest.approx(1, abs=1e-7)
+
+
+def test_json_says_every_number_and_is_read_back() -> None:
+    text = cameras_as_json([STANDING, RIDING])
+    told = json.loads(text)
+    first, second = told["cameras"]
+    assert_allclose(first["intrinsic"], frames.intrinsic_from_fov(0.9, 320, 240))
+    assert_allclose(first["extrinsic_opencv"], frames.opencv_extrinsic(POSE))
+    assert_allclose(second["model_matrix_opengl"], frames.opengl_model_matrix(RIDING.pose_in_env))
+    assert (second["mount"], second["position_in_mount"]) == ("panda/panda_hand", [0.1, 0, 0])
+    assert set(told["conventions"]) <= {"length", "fov"} | set(first), "what is explained is there"
+    assert len(text.splitlines()) < 80, "a row of a matrix is a line"
+    for found, camera in zip(find_poses(text), (STANDING, RIDING), strict=True):
+        assert_same_pose(camera_pose(found), camera.pose_in_env)
+
+
+def test_opencv_reads_its_yaml(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.yaml"
+    path.write_text(cameras_as_opencv_yaml([STANDING, RIDING]))
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    for key, camera in [("sensor_base__camera_1", STANDING), ("sensor_base__camera_1_", RIDING)]:
+        node = storage.getNode(key)
+        assert int(node.getNode("image_width").real()) == 320
+        assert_allclose(node.getNode("camera_matrix").mat(), frames.intrinsic_of(camera.settings), rtol=1e-12)
+        assert_allclose(
+            node.getNode("extrinsic").mat(), frames.opencv_extrinsic(camera.pose_in_env), rtol=1e-12
+        )
+        assert node.getNode("distortion_coefficients").mat().shape == (1, 5)
+    storage.release()
+    found = {pose.label: pose for pose in find_poses(path.read_text())}
+    assert_same_pose(
+        camera_pose(found["sensor_base__camera_1 / extrinsic"], "opencv", "world_to_camera"), POSE
+    )
+
+
+def test_ros_camera_info_is_of_the_form_that_its_parsers_read() -> None:
+    text = camera_as_ros_yaml(RIDING)
+    info = yaml.safe_load(text)
+    assert (info["image_width"], info["image_height"], info["camera_name"]) == (320, 240, "base: camera 1")
+    sizes = {
+        "camera_matrix": (3, 3),
+        "distortion_coefficients": (1, 5),
+        "rectification_matrix": (3, 3),
+        "projection_matrix": (3, 4),
+    }
+    for name, (rows, columns) in sizes.items():
+        assert (info[name]["rows"], info[name]["cols"], len(info[name]["data"])) == (
+            rows,
+            columns,
+            rows * columns,
+        )
+        assert all(isinstance(number, float) for number in info[name]["data"])
+    assert_allclose(np.reshape(info["camera_matrix"]["data"], (3, 3)), frames.intrinsic_of(RIDING.settings))
+    assert info["distortion_model"] == "plumb_bob"
+    words = text.splitlines()[0].split("--")[1:]
+    told = {word.split()[0]: float(word.split()[1]) for word in words}
+    r = frames.rotation_matrix([told["qw"], told["qx"], told["qy"], told["qz"]])
+    assert_allclose(r, frames.matrix_of(RIDING.pose_in_env, "opencv", "camera_to_world")[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "json"])
+def test_what_opencv_wrote_is_read(tmp_path: Path, suffix: str) -> None:
+    extrinsic = frames.matrix_of(POSE, "opencv", "world_to_camera")
+    rvec, _ = cv2.Rodrigues(extrinsic[:3, :3])
+    path = tmp_path / f"calibration.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.eye(3))
+    storage.write("rvec", rvec)
+    storage.write("tvec", extrinsic[:3, 3:] * 1000)
+    storage.write("T_cam_base", np.linalg.inv(extrinsic))
+    storage.write("small", extrinsic[:3].astype(np.float32))
+    storage.release()
+    found = {pose.label: pose for pose in find_poses(path.read_text())}
+    assert set(found) == {"rotation and translation", "T_cam_base", "small"}
+    pair = camera_pose(found["rotation and translation"], "opencv", "world_to_camera", metres_per_unit=0.001)
+    assert_same_pose(pair, POSE, atol=1e-7)
+    assert_same_pose(camera_pose(found["T_cam_base"], "opencv", "camera_to_world"), POSE, atol=1e-7)
+    assert_same_pose(camera_pose(found["small"], "opencv", "world_to_camera"), POSE, atol=1e-5)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize(
+    "write", [str, repr, lambda m: json.dumps(m.tolist()), lambda m: repr(m[:3].tolist())]
+)
+def test_a_pasted_matrix_is_read_as_the_person_says(convention: Any, direction: Any, write: Any) -> None:
+    matrix = frames.matrix_of(POSE, convention, direction)
+    (found,) = find_poses(write(matrix))
+    assert found.said is None
+    assert_same_pose(camera_pose(found, convention, direction), POSE, atol=1e-6)
+    with pytest.raises(ValueError, match="say which way"):
+        camera_pose(found, convention)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 0 0 0\n0 1 0 0\n0 0 1 2\n0 0 0 1",
+        "1, 0, 0, 0; 0, 1, 0, 0; 0, 0, 1, 2e0",
+        "np.array([[1.,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]], dtype=np.float32)",
+        "tensor([[1.,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]])",
+        '{"calib": [{"R": [[1,0,0],[0,1,0],[0,0,1]], "t": [0, 0, 2]}]}',
+        "rotation_matrix: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ntranslation: [0, 0, 2]",
+        "rvec: [0, 0, 0]\ntvec: [[0], [0], [2]]",
+        "%YAML:1.0\nT: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [1.,0,0,0, 0,1.,0,0, 0,1e-12,1.,2.]",
+    ],
+)
+def test_many_ways_to_write_one_pose_are_read(text: str) -> None:
+    (found,) = find_poses(text)
+    assert_same_pose(camera_pose(found, "maniskill", "camera_to_world"), (0, 0, 2, 1, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "nothing to read"),
+        ("1 2 3", "here are 3"),
+        ('{"a": ', "begins like JSON"),
+        ("hello", "no matrix of bare numbers"),
+        ("!!python/object/apply:os.system ['true']", "no YAML"),
+        ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "no pose is in it"),
+        ("projection_matrix:\n  rows: 3\n  cols: 4\n  data: [1,0,0,0,0,1,0,0,0,0,1,0]", "no pose is in it"),
+        ("a: " + "[" * 5000, "no YAML"),
+        ("a: &a [*a]", "alias"),
+        ('{"a": ' + "[" * 900 + "]" * 900 + "}", "no pose|nested too deeply|none"),
+        ("9" * 300_000, "characters"),
+    ],
+)
+def test_a_text_without_a_pose_is_refused_in_words(text: str, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        find_poses(text)
+
+
+def test_a_matrix_that_is_no_rotation_is_refused_in_words() -> None:
+    (mirrored,) = find_poses("1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1")
+    with pytest.raises(ValueError, match="mirror image"):
+        camera_pose(mirrored, "opencv", "world_to_camera")
+    with pytest.raises(ValueError, match="positive number of metres"):
+        camera_pose(mirrored, "opencv", "world_to_camera", metres_per_unit=0)
+
+
+def test_a_mounted_camera_says_where_it_is_only_when_its_mount_does() -> None:
+    with pytest.raises(ValueError, match="rides on panda/panda_hand"):
+        cameras_as_json([CameraToExport(("sensor", "hand"), PLAIN, mount="panda/panda_hand")])
+
+
+@unhurried
+@given(st.text(max_size=300) | st.text('0123456789.,:-[]{}!%&*\n eE"RtvecTrows', max_size=300))
+def test_any_text_gives_poses_or_a_sentence(text: str) -> None:
+    try:
+        for found in find_poses(text):
+            assert found.matrix.shape == (4, 4)
+    except ValueError as error:
+        assert str(error)

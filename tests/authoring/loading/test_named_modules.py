@@ -1,0 +1,175 @@
+"""``package.module:ClassName`` and ``--import``: found without running anything, opened and followed like a file."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from tests.authoring.conftest import Write
+from tests.authoring.refusal import refused
+from workbench.authoring.loading import library_names
+from workbench.authoring.loading.load import class_of_module, import_modules, load_task, take_back
+from workbench.authoring.loading.reference import (
+    RecordedTask,
+    class_beside,
+    find_module,
+    followed_folder,
+    named_file,
+    why_not_there,
+)
+from workbench.authoring.problem import TaskError
+
+TASK = """
+from lab_of_mine.robots.arm import REACH
+
+@register_env("LabOfMine-v1", max_episode_steps=7)
+class MinimalEnv(BaseEnv):
+    reach = REACH
+
+class OtherEnv(BaseEnv):
+    pass
+"""
+REFERENCE = "lab_of_mine.tasks:MinimalEnv"
+
+
+@pytest.fixture(autouse=True)
+def nothing_for_good(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An import is for the rest of the process: not of this one."""
+    monkeypatch.setattr(library_names, "_guarded_for_good", False)
+    names = set(sys.modules)
+    yield
+    for name in set(sys.modules) - names:
+        if name.startswith("lab_of_mine"):
+            del sys.modules[name]
+
+
+@pytest.fixture(params=["package", "no __init__.py"])
+def lab(request: pytest.FixtureRequest, write: Write, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package in the folder where the command is started."""
+    if request.param == "package":
+        for name in ("", "tasks/", "robots/"):
+            write(f"lab_of_mine/{name}__init__.py", "")
+    write("lab_of_mine/robots/arm.py", "REACH = 1\n")
+    write("lab_of_mine/tasks/minimal.py", TASK, task=True)
+    write("lab_of_mine/tasks/__init__.py", "from lab_of_mine.tasks.minimal import MinimalEnv\n")
+    monkeypatch.chdir(folder)
+    return folder / "lab_of_mine"
+
+
+def test_it_is_found_without_being_imported(lab: Path) -> None:
+    for file in lab.rglob("*.py"):
+        file.write_text("raise SystemExit('it ran')\n")
+    assert named_file(REFERENCE) == lab / "tasks" / "__init__.py"
+    assert named_file("lab_of_mine.robots.arm:Arm") == lab / "robots" / "arm.py"
+    assert followed_folder(REFERENCE) == lab
+    assert why_not_there(REFERENCE) is None
+    assert not [name for name in sys.modules if name.startswith("lab_of_mine")]
+    why = why_not_there("lab_of_yours.tasks:MinimalEnv")
+    assert why is not None and "there is no module lab_of_yours.tasks" in why and str(lab.parent) in why
+    assert named_file("lab_of_mine.tasks.nowhere:MinimalEnv") is None
+
+
+def test_a_path_is_never_taken_for_a_module(lab: Path) -> None:
+    """A recording names its file by an absolute path."""
+    assert find_module("lab_of_mine.tasks") is not None
+    for reference in (
+        f"{lab.parent}/lab_of_mine.tasks:MinimalEnv",
+        "./lab_of_mine.tasks:MinimalEnv",
+        "lab_of_mine.py:A",
+    ):
+        assert followed_folder(reference) is None or reference.endswith(".py:A")
+        assert refused(reference).stage == "import"
+    assert not [name for name in sys.modules if name.startswith("lab_of_mine")]
+
+
+def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> None:
+    task = load_task(REFERENCE)
+    minimal, arm = lab / "tasks" / "minimal.py", lab / "robots" / "arm.py"
+    assert (task.env_id, task.class_name, task.max_episode_steps) == ("LabOfMine-v1", "MinimalEnv", 7)
+    assert (task.file, task.followed, task.others) == (minimal, True, ("OtherEnv",))
+    assert task.cls.__module__ == "lab_of_mine.tasks.minimal"
+    assert {minimal, arm, lab / "tasks" / "__init__.py"} <= set(task.source_files)
+    assert set(task.source_files) <= set(lab.rglob("*.py"))
+    assert class_beside(REFERENCE, minimal, "OtherEnv") == "lab_of_mine.tasks.minimal:OtherEnv"
+
+    arm.write_text("REACH = 2\n")
+    again = load_task(REFERENCE)
+    assert vars(again.cls)["reach"] == 2 and REGISTERED_ENVS["LabOfMine-v1"].cls is again.cls
+    arm.write_text("REACH = \n")
+    problem = refused(REFERENCE)
+    assert (problem.stage, problem.file, problem.line) == ("syntax", str(arm), 1)
+    assert REGISTERED_ENVS["LabOfMine-v1"].cls is again.cls
+    assert sys.modules["lab_of_mine.tasks.minimal"] is sys.modules[again.cls.__module__]
+    assert take_back(again)
+
+
+def test_a_librarys_module_is_imported_as_it_is() -> None:
+    task = load_task("mani_skill.envs.tasks.tabletop.pick_cube:PickCubeEnv")
+    assert task.cls is REGISTERED_ENVS["PickCube-v1"].cls
+    assert (task.env_id, task.max_episode_steps, task.followed) == ("PickCube-v1", 50, False)
+    assert "PickCubeEnv" in refused("mani_skill.envs.tasks.tabletop.pick_cube:PickCubEnv").message
+    assert "not a class that inherits BaseEnv" in refused("json.decoder:JSONDecoder").message
+
+
+def test_the_current_folder_goes_ahead_of_no_library(
+    write: Write, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("json", "torch", "colorsys"):
+        write(f"{name}.py", "raise SystemExit('it ran')\n")
+    write("mani_skill/envs/mine.py", TASK, task=True)
+    write("lab_of_mine/__init__.py", "")
+    write("lab_of_mine/robots/arm.py", "import colorsys\nREACH = 1\n")
+    write("lab_of_mine/tasks.py", TASK, task=True)
+    monkeypatch.chdir(folder)
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    assert named_file("torch:MinimalEnv") != folder / "torch.py"
+    assert why_not_there("mani_skill.envs.mine:MinimalEnv") is not None
+    import_modules(("lab_of_mine.tasks",))
+    assert load_task("LabOfMine-v1").cls is class_of_module("lab_of_mine.tasks", "MinimalEnv")
+    assert not str(sys.modules["colorsys"].__file__).startswith(str(folder))
+
+
+def test_an_import_gives_the_ids_that_the_package_registers(lab: Path) -> None:
+    problem = refused("LabOfMine-v1")
+    assert "--import" in problem.message
+    import_modules(("lab_of_mine.tasks",))
+    task = load_task("LabOfMine-v1")
+    assert (task.class_name, task.file, task.followed) == ("MinimalEnv", lab / "tasks" / "minimal.py", False)
+
+
+def test_what_is_wrong_with_an_import_is_said_at_its_line(lab: Path) -> None:
+    with pytest.raises(TaskError, match="there is no module lab_of_yours"):
+        import_modules(("lab_of_yours",))
+    arm = lab / "robots" / "arm.py"
+    for text, words, line in (
+        ("\nREACH = 1 / 0\n", "ZeroDivisionError", 2),
+        ("\n\nREACH = (\n", "never closed", 3),
+        ("raise SystemExit(3)\n", "SystemExit", 1),
+    ):
+        arm.write_text(text)
+        with pytest.raises(TaskError) as caught:
+            import_modules(("lab_of_mine.tasks",))
+        problem = caught.value.problem
+        assert words in problem.message
+        assert (problem.file, problem.line) == (str(arm), line)
+
+
+def test_a_module_without_a_class_says_what_is_missing(lab: Path) -> None:
+    message = refused("lab_of_mine.tasks").message
+    assert "lab_of_mine.tasks is a module" in message and "lab_of_mine.tasks:" in message
+
+
+def test_a_recording_brings_no_import(lab: Path) -> None:
+    for named in (
+        RecordedTask(REFERENCE),
+        RecordedTask("LabOfMine-v1", REFERENCE),
+        RecordedTask("LabOfMine-v1"),
+    ):
+        with pytest.raises(TaskError) as caught:
+            load_task(named)
+        assert "--import" in caught.value.problem.message
+    assert not [name for name in sys.modules if name.startswith("lab_of_mine")]

@@ -1,0 +1,71 @@
+"""A file that has a robot and no task: the robot is shown in an empty scene, and its author is told so."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.authoring.conftest import Write
+from tests.authoring.refusal import refused
+from workbench.authoring.loading.load import load_task, take_back
+
+ROBOTS = """
+from mani_skill.agents.registration import register_agent
+from mani_skill.agents.robots import Panda, PandaWristCam
+
+@register_agent()
+class TallPanda(Panda):
+    uid = "tall_panda"
+
+@register_agent()
+class SmallPanda(Panda):
+    uid = "small_panda"
+    size = 1
+"""
+
+
+def test_it_opens_in_an_empty_scene_and_says_so(write: Write) -> None:
+    file = write("arms.py", ROBOTS)
+    task = load_task(str(file))
+    assert (task.env_id, task.chosen, task.others) == ("Empty-v1", "SmallPanda", ("TallPanda",))
+    assert task.default_kwargs == {"robot_uids": "small_panda"}
+    assert (task.file, task.followed) == (file, True)
+    (notice,) = task.notices
+    assert "an agent, SmallPanda with the uid 'small_panda'" in notice
+    assert (
+        f"type in {file.parent}: workbench open PickCube-v1 --import arms --env robot_uids=small_panda"
+        in notice
+    )
+    other = load_task(f"{file}:TallPanda")
+    assert (other.chosen, other.default_kwargs) == ("TallPanda", {"robot_uids": "tall_panda"})
+    assert not take_back(task) and take_back(other)
+
+
+def test_an_agent_that_is_not_registered_is_named(write: Write) -> None:
+    file = write("arms.py", ROBOTS.replace("@register_agent()", ""))
+    assert "SmallPanda is an agent that is not registered: put @register_agent()" in refused(file).message
+    assert (
+        "there is no class Smallpanda in arms.py; did you mean SmallPanda?"
+        in refused(f"{write('arms.py', ROBOTS)}:Smallpanda").message
+    )
+
+
+def test_a_task_goes_before_the_robots_of_its_file(write: Write) -> None:
+    file = write("arms.py", ROBOTS + "\nclass PushEnv(BaseEnv):\n    pass\n", task=True)
+    task = load_task(str(file))
+    assert (task.class_name, task.robot, task.others, task.notices) == ("PushEnv", None, (), ())
+    assert load_task(f"{file}:TallPanda").env_id == "Empty-v1"
+
+
+@pytest.mark.parametrize("text", ["raise SystemExit\n", "1 / 0\n"])
+def test_a_version_that_fails_leaves_the_robot_that_was(write: Write, text: str) -> None:
+    from mani_skill.agents.registration import REGISTERED_AGENTS
+
+    file = write("arms.py", ROBOTS)
+    load_task(str(file))
+    before = REGISTERED_AGENTS["small_panda"].agent_cls
+    file.write_text(ROBOTS + text)
+    refused(file)
+    assert REGISTERED_AGENTS["small_panda"].agent_cls is before
+    file.write_text(ROBOTS.replace("size = 1", "size = 2"))
+    load_task(str(file))
+    assert vars(REGISTERED_AGENTS["small_panda"].agent_cls)["size"] == 2

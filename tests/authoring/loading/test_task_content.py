@@ -1,0 +1,182 @@
+"""What opening a task file would run is found without running it, and only that runs where a recording named the file."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.loading.load import load_task
+from workbench.authoring.loading.reference import RecordedTask
+from workbench.authoring.loading.task_content import CannotRead, read_content
+from workbench.authoring.problem import TaskError
+
+TASK = "from mani_skill.envs.sapien_env import BaseEnv\nclass Lift(BaseEnv):\n    pass\n"
+
+
+def lay(folder: Path, **texts: str) -> Path:
+    """These modules, ``a__b`` for ``a/b.py``; every one but task.py leaves a mark when it runs. Returns task.py."""
+    for name, text in texts.items():
+        path = folder / f"{name.replace('__', '/')}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + f"\nopen({str(folder / f'{path.stem}.ran')!r}, 'w').close()\n")
+    return folder / "task.py"
+
+
+def ran(folder: Path) -> set[str]:
+    return {path.stem for path in folder.glob("*.ran")}
+
+
+def recorded(file: Path) -> RecordedTask:
+    content = read_content(file)
+    return RecordedTask("Lift-v1", content.main, "Lift", content.texts)
+
+
+@pytest.mark.parametrize(
+    ("imports", "found"),
+    [
+        ("import alone", {"alone.py"}),
+        ("import alone, far.near", {"alone.py", "far/near.py"}),
+        ("from far import near", {"far/near.py"}),
+        ("def hook():\n    from alone import *", {"alone.py"}),
+        (
+            "try:\n    import alone\nexcept ImportError:\n    import pack.one",
+            {"alone.py", "pack/__init__.py", "pack/one.py"},
+        ),
+        ("from pack import *", {"pack/__init__.py", "pack/one.py"}),
+        ("import chain", {"chain.py", "alone.py"}),
+        ("import numpy, json", set()),
+    ],
+)
+def test_modules_are_found_by_their_imports(tmp_path: Path, imports: str, found: set[str]) -> None:
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("from . import one\n")
+    (tmp_path / "pack" / "one.py").write_text("")
+    file = lay(tmp_path, task=imports, alone="", chain="import alone", far__near="", other="")
+    assert set(read_content(file).modules) == found
+    assert ran(tmp_path) == set()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import importlib\nimportlib.import_module('oth' + 'er')",
+        "from importlib import import_module as get\nget('oth' + 'er')",
+        "__import__('other')",
+        "import sys\nsys.path.insert(0, 'x')",
+        "exec(open('other.py').read())",
+    ],
+)
+def test_where_names_are_computed_all_that_lies_beside_counts_and_that_is_said(
+    tmp_path: Path, text: str
+) -> None:
+    (tmp_path / ".venv").mkdir()
+    (tmp_path / ".venv" / "hidden.py").write_text("")
+    content = read_content(lay(tmp_path, task=text, other="", deep__er=""))
+    assert content.modules == ("deep/er.py", "other.py")
+    assert any("task.py:" in what and "further code" in what for what in content.unseen)
+
+
+def test_a_compiled_module_is_said_and_is_not_loaded(tmp_path: Path) -> None:
+    file = lay(tmp_path, task=f"{TASK}import fast")
+    (tmp_path / "fast.cpython-311-x86_64-linux-gnu.so").write_bytes(b"\x7fELF")
+    assert read_content(file).unseen == (
+        "fast.cpython-311-x86_64-linux-gnu.so is compiled and is not loaded.",
+    )
+    with pytest.raises(TaskError, match="No module named 'fast'"):
+        load_task(recorded(file))
+
+
+def test_the_hash_is_of_what_the_texts_say_wherever_they_lie(tmp_path: Path) -> None:
+    here = lay(tmp_path / "here", task="import alone")
+    (tmp_path / "here" / "alone.py").write_text("A = 1\n")
+    there = tmp_path / "there" / "task.py"
+    there.parent.mkdir()
+    for name in ("task.py", "alone.py"):
+        (there.parent / name).write_bytes((here.parent / name).read_bytes())
+    assert read_content(here).hash == read_content(there).hash
+    (there.parent / "unused.py").write_text("A = 3\n")
+    assert read_content(here).hash == read_content(there).hash
+    (there.parent / "alone.py").write_text("A = 2\n")
+    assert read_content(here).hash != read_content(there).hash
+
+
+def test_what_is_no_ordinary_file_of_text_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.py")
+    (tmp_path / "zero.py").symlink_to("/dev/zero")
+    (tmp_path / "long.py").write_bytes(b"#" * (17 << 20))
+    (tmp_path / "bytes.py").write_bytes(b"\xff\xfe\x00")
+    for name in ("pipe", "zero", "long", "bytes", "gone"):
+        with pytest.raises(CannotRead, match="/dev/zero" if name == "zero" else f"{name}.py"):
+            read_content(tmp_path / f"{name}.py")
+    (tmp_path / "task.py").write_text("import pipe")
+    assert read_content(tmp_path / "task.py").modules == (), "a pipe is no module"
+    (tmp_path / "deep.py").write_text("-" * 100_000 + "1")
+    assert "no Python that can be read" in read_content(tmp_path / "deep.py").unseen[0]
+
+
+def test_what_was_agreed_to_is_what_runs(tmp_path: Path) -> None:
+    file = lay(tmp_path, task=f"import alone, far.near\n{TASK}", alone="A = 1", far__near="", json="")
+    agreed = recorded(file)
+    evil = f"open({str(tmp_path / 'evil.ran')!r}, 'w').close()"
+    for path in (file, tmp_path / "alone.py", tmp_path / "far" / "near.py"):
+        path.write_text(evil)
+    (tmp_path / "far" / "__init__.py").write_text(evil)
+    before = list(sys.path)
+    loaded = load_task(agreed)
+    assert ran(tmp_path) == {"task", "alone", "near"} and loaded.class_name == "Lift"
+    assert sys.path == before, "what else lies in that folder could be imported"
+
+
+def test_what_nobody_agreed_to_does_not_run_however_it_is_imported(tmp_path: Path) -> None:
+    hidden = "get = globals()['__builtins__']; get = get if isinstance(get, dict) else vars(get)\nget['__imp' + 'ort__']('other')"
+    file = lay(tmp_path, task=f"{TASK}{hidden}", other="")
+    with pytest.raises(TaskError, match="was not among what you were asked about"):
+        load_task(recorded(file))
+    # Also where an earlier task has put the folder on the path.
+    sys.path.insert(0, str(tmp_path))
+    try:
+        with pytest.raises(TaskError, match="other"):
+            load_task(recorded(file))
+    finally:
+        sys.path.remove(str(tmp_path))
+    assert "other" not in ran(tmp_path)
+
+
+def test_a_file_in_a_package_runs_with_the_packages_above_it(tmp_path: Path) -> None:
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("FROM_PACKAGE = 1\n")
+    (tmp_path / "pack" / "size.py").write_text("SIZE = 2\n")
+    file = tmp_path / "pack" / "task.py"
+    file.write_text(f"from . import FROM_PACKAGE\nfrom .size import SIZE\n{TASK}")
+    assert read_content(file).modules == ("__init__.py", "size.py")
+    assert load_task(recorded(file)).class_name == "Lift"
+
+
+@pytest.mark.parametrize(
+    "name", ["{file}", "{file}:Lift", "task.py", "../task.py", "no.such.module:Lift-v0", ""]
+)
+def test_without_an_agreement_only_a_registered_id_is_opened(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = lay(tmp_path, task=TASK)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(TaskError, match="no installed package registers"):
+        load_task(RecordedTask(name.format(file=file)))
+    with pytest.raises(TaskError, match="no installed package registers"):
+        load_task(RecordedTask("Lift-v1", str(file), "Lift"))
+    assert ran(tmp_path) == set()
+    assert load_task(RecordedTask("PickCube-v1")).class_name == "PickCubeEnv"
+
+
+def test_what_is_refused_for_a_recording_is_found_for_a_task_that_a_person_opens_after_it(
+    tmp_path: Path,
+) -> None:
+    hidden = "__builtins__['__imp' + 'ort__']('other')"
+    file = lay(tmp_path, task=TASK, other="")
+    load_task(recorded(file))
+    mine = tmp_path / "mine.py"
+    mine.write_text(f"{TASK}{hidden}")
+    assert load_task(str(mine)).class_name == "Lift" and "other" in ran(tmp_path)

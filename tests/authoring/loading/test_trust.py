@@ -1,0 +1,129 @@
+"""What a user has said may run: kept across programs, and lost neither to a full disk nor to an unreadable store."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.loading import trust
+from workbench.authoring.loading.task_content import TaskContent
+from workbench.authoring.loading.trust import STORE_FILE, TrustStore
+
+
+def content(text: str = "a", file: str = "/author/push.py") -> TaskContent:
+    return TaskContent(file, {file: text})
+
+
+@pytest.fixture(autouse=True)
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    return tmp_path / "workbench" / STORE_FILE
+
+
+def test_what_is_trusted_is_known_to_the_next_program_and_nothing_else_is() -> None:
+    TrustStore().trust(content("one"))
+    TrustStore().trust(content("two"), followed=True)
+    later = TrustStore()
+    assert later.trusts(content("one")) and not later.follows(content("one"))
+    assert later.trusts(content("two")) and later.follows(content("two"))
+    # The same text elsewhere may run; its saves there were not agreed to.
+    elsewhere = content("two", "/other/push.py")
+    assert later.trusts(elsewhere) and not later.follows(elsewhere)
+    assert not later.trusts(content("three"))
+
+
+def test_once_is_until_the_program_ends(store: Path) -> None:
+    kept = TrustStore()
+    kept.trust_once(content("one"))
+    kept.trust_once(content("two"), followed=True)
+    assert kept.trusts(content("one")) and not kept.follows(content("one"))
+    assert kept.follows(content("two")) and not kept.follows(content("two", "/other/push.py"))
+    assert not TrustStore().trusts(content("one")) and not store.exists()
+
+
+def test_the_text_that_was_trusted_last_is_compared_with(store: Path) -> None:
+    for text in ("one", "two", "one"):  # the one that was said again is the last
+        TrustStore().trust(content(text))
+    assert len(json.loads(store.read_text())["trusted"]) == 2
+    assert TrustStore().trusted_before(content("three")) == content("one").file_sums
+    assert TrustStore().trusted_before(content("one")) == content("two").file_sums
+    assert TrustStore().trusted_before(content("one", "/other/push.py")) is None
+
+
+def test_the_oldest_answers_go_first_and_only_the_newest_name_their_files(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trust, "MOST_KEPT", 4)
+    monkeypatch.setattr(trust, "MOST_WITH_FILES", 2)
+    texts = [str(number) for number in range(6)]
+    for text in texts:
+        TrustStore().trust(content(text))
+    assert [TrustStore().trusts(content(text)) for text in texts] == [False, False, True, True, True, True]
+    kept = json.loads(store.read_text())["trusted"]
+    assert [one["files"] for one in kept] == [{}, {}, *(content(text).file_sums for text in "45")]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_an_answer_that_cannot_be_kept_counts_in_this_run_and_takes_no_other_away(
+    store: Path, call: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    TrustStore().trust(content("one"))
+    before = store.read_bytes()
+    kept = TrustStore()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, full)
+        for text in ("two", "three"):
+            kept.trust(content(text))
+    assert all(kept.trusts(content(text)) for text in ("one", "two", "three"))
+    (told,) = [record.message for record in caplog.records]  # once
+    assert "asked again in the next run" in told and "No space left" in told
+    assert store.read_bytes() == before and not TrustStore().trusts(content("two"))
+    assert sorted(path.name for path in store.parent.iterdir()) == [STORE_FILE, f"{STORE_FILE}.lock"]
+    kept.trust(content("four"))
+    assert TrustStore().trusts(content("four")) and TrustStore().trusts(content("one"))
+
+
+def test_a_store_that_cannot_be_read_just_now_is_not_written_over(
+    store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    TrustStore().trust(content("one"))
+    before = store.read_bytes()
+    kept = TrustStore()
+
+    def fail(name: str) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trust, "read_private", fail)
+        assert not kept.trusts(content("one"))
+        kept.trust(content("two"))
+        assert kept.trusts(content("two"))
+    assert store.read_bytes() == before and TrustStore().trusts(content("one"))
+    assert "not known" in caplog.text and "cannot be kept" in caplog.text
+
+
+def test_a_broken_store_that_cannot_be_set_aside_stays(
+    store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store.parent.mkdir()
+    store.write_text("{")
+    kept = TrustStore()
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        kept.trust(content("one"))
+    assert store.read_text() == "{" and kept.trusts(content("one"))
+    assert "cannot be kept" in caplog.text
+    kept.trust(content("two"))
+    assert TrustStore().trusts(content("two")) and not TrustStore().trusts(content("one"))

@@ -1,0 +1,310 @@
+"""Saves, as editors make them, become one call each with the last content on disk."""
+
+from __future__ import annotations
+
+import os
+import queue
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.loading import watch
+from workbench.authoring.loading.watch import SourceWatcher
+
+PATIENCE = 20.0
+"""Seconds to wait for what must come. Nothing is asserted of how soon it does."""
+
+
+class Calls:
+    """What a watcher said, with the content of the files at that moment."""
+
+    def __init__(self) -> None:
+        self.queue: queue.Queue[dict[str, str | None]] = queue.Queue()
+
+    def __call__(self, paths: set[Path]) -> None:
+        self.queue.put({path.name: path.read_text() if path.exists() else None for path in paths})
+
+    def next(self) -> dict[str, str | None]:
+        return self.queue.get(timeout=PATIENCE)
+
+    def until(self, expected: dict[str, str | None]) -> int:
+        """Take calls until one is `expected`; how many it took."""
+        for number in range(1, 100):
+            if self.next() == expected:
+                return number
+        raise AssertionError("too many calls")
+
+    def nothing_before(self, last: Path) -> bool:
+        """Whether a save of another followed file is the next that is told."""
+        last.write_text(f"{last.read_text()}# again\n")
+        return self.next() == {last.name: last.read_text()}
+
+
+@pytest.fixture
+def calls() -> Calls:
+    return Calls()
+
+
+@pytest.fixture
+def watcher(calls: Calls) -> Iterator[SourceWatcher]:
+    started = SourceWatcher(calls)
+    yield started
+    started.stop()
+
+
+@pytest.fixture
+def last(tmp_path: Path) -> Path:
+    """A followed file in a folder of its own, whose save is told after all that is told of the others."""
+    path = tmp_path / "beside" / "last.py"
+    path.parent.mkdir()
+    path.write_text("")
+    return path
+
+
+@pytest.fixture
+def file(watcher: SourceWatcher, tmp_path: Path, last: Path) -> Path:
+    path = tmp_path / "task.py"
+    path.write_text("a = 0\n")
+    watcher.follow([path, last])
+    return path
+
+
+def write(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def rename_over(path: Path, text: str) -> None:
+    path.with_suffix(".tmp").write_text(text)
+    os.replace(path.with_suffix(".tmp"), path)
+
+
+def backup_and_create(path: Path, text: str) -> None:
+    path.rename(path.with_suffix(".py~"))
+    path.write_text(text)
+
+
+def delete_and_create(path: Path, text: str) -> None:
+    path.unlink()
+    time.sleep(0.05)  # an editor takes its time, and the file is seen to be gone
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("save", [write, rename_over, backup_and_create, delete_and_create])
+def test_every_way_of_saving_is_seen_again_and_again(
+    save: Callable[[Path, str], None], file: Path, last: Path, calls: Calls
+) -> None:
+    for number in (1, 2, 3):
+        save(file, f"a = {number}\n")
+        assert calls.next() == {"task.py": f"a = {number}\n"}
+    assert calls.nothing_before(last)
+
+
+def test_a_burst_of_saves_is_few_calls_and_the_last_content_wins(
+    file: Path, last: Path, calls: Calls
+) -> None:
+    for number in range(1, 11):
+        file.write_text(f"a = {number}\n")
+        time.sleep(0.005)  # as a burst comes
+    assert calls.until({"task.py": "a = 10\n"}) <= 3
+    assert calls.nothing_before(last)
+
+
+def test_only_new_content_of_followed_files_counts(file: Path, last: Path, calls: Calls) -> None:
+    os.utime(file)
+    file.with_name("other.py").write_text("b = 1\n")
+    file.write_text(file.read_text())
+    assert calls.nothing_before(last)
+
+
+def test_line_ends_alone_are_no_change_and_a_crlf_file_is_followed(
+    file: Path, last: Path, calls: Calls
+) -> None:
+    file.write_bytes(b"a = 0\r\n")
+    assert calls.nothing_before(last)
+    file.write_bytes(b"a = 1\r\n")
+    assert calls.next() == {"task.py": "a = 1\n"}
+
+
+def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(
+    file: Path, last: Path, calls: Calls
+) -> None:
+    file.unlink()
+    assert calls.next() == {"task.py": None}
+    assert calls.nothing_before(last)
+    file.write_text("a = 0\n")
+    assert calls.next() == {"task.py": "a = 0\n"}
+
+
+def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, last: Path, calls: Calls) -> None:
+    with open(file, "w") as opened:
+        opened.flush()
+        time.sleep(0.12)  # so that it is seen empty
+        opened.write("a = 1\n")
+    assert calls.next() == {"task.py": "a = 1\n"}
+    assert calls.nothing_before(last)
+
+
+def test_a_file_emptied_for_good_is_told(file: Path, last: Path, calls: Calls) -> None:
+    file.write_text("")
+    assert calls.next() == {"task.py": ""}
+
+
+def test_a_folder_deleted_and_made_again_is_watched_again(
+    watcher: SourceWatcher, calls: Calls, tmp_path: Path
+) -> None:
+    path = tmp_path / "project" / "task.py"
+    for number in (1, 2):
+        path.parent.mkdir()
+        path.write_text(f"a = {number}\n")
+        watcher.follow([path], {str(path): "a = 0\n"})
+        calls.until({"task.py": f"a = {number}\n"})
+        path.write_text(f"a = {number}{number}\n")
+        calls.until({"task.py": f"a = {number}{number}\n"})
+        shutil.rmtree(path.parent)
+        calls.until({"task.py": None})
+
+
+def test_what_was_saved_between_the_reading_and_the_following_is_not_lost(
+    watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text("a = 1\n")
+    watcher.follow([path], {str(path): "a = 0\n"})
+    assert calls.next() == {"task.py": "a = 1\n"}
+    watcher.follow([path, last], {str(path): "a = 1\n"})
+    assert calls.nothing_before(last)
+
+
+def test_files_in_several_folders_are_followed_and_left(
+    watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
+) -> None:
+    one, two = tmp_path / "one.py", tmp_path / "below" / "two.py"
+    two.parent.mkdir()
+    for path in (one, two):
+        path.write_text("a = 0\n")
+    watcher.follow([one])
+    watcher.follow([one, two])
+    two.write_text("a = 1\n")
+    assert calls.next() == {"two.py": "a = 1\n"}
+    watcher.follow([one, last])
+    two.write_text("a = 2\n")
+    one.write_text("a = 2\n")
+    assert calls.next() == {"one.py": "a = 2\n"}
+    assert calls.nothing_before(last)
+
+
+def test_a_save_that_a_file_system_says_nothing_of_is_seen_by_reading(
+    file: Path, last: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As a network mount that answers with what it was told some seconds ago.
+    monkeypatch.setattr(watch, "_status", lambda path: ())
+    for number in (1, 2):
+        file.write_text(f"a = {number}\n")
+        assert calls.next() == {"task.py": f"a = {number}\n"}
+    assert calls.nothing_before(last)
+
+
+Many = Callable[[int, int], list[Path]]
+
+
+@pytest.fixture
+def many(watcher: SourceWatcher, tmp_path: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch) -> Many:
+    """Follow files in several folders, the first one saved last, of which so many are looked at each time. None is read
+    unless a look says so."""
+
+    def follow(newest: int, turn: int) -> list[Path]:
+        for name, value in (("READ_S", 1e6), ("NEWEST", newest), ("TURN", turn)):
+            monkeypatch.setattr(watch, name, value)
+        files = [tmp_path / f"folder_{number % 3}" / f"file_{number}.py" for number in range(12)]
+        for number, file in enumerate(files):
+            file.parent.mkdir(exist_ok=True)
+            file.write_text("a = 0\n")
+            os.utime(file, (100 - number, 100 - number))
+        watcher.follow(files, {str(files[0]): "a = 1\n"})
+        assert calls.next() == {files[0].name: "a = 0\n"}
+        return files
+
+    return follow
+
+
+def test_of_many_files_each_comes_to_its_turn(many: Many, calls: Calls) -> None:
+    for number, file in enumerate(many(0, 5)):
+        file.write_text(f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}
+
+
+def test_of_many_files_those_saved_last_are_looked_at_each_time(many: Many, calls: Calls) -> None:
+    first, second, *_ = many(2, 0)
+    for number, file in enumerate([first, second, first, second, second]):
+        file.write_text(f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}
+
+
+@pytest.mark.parametrize("save", [rename_over, backup_and_create, delete_and_create])
+def test_of_many_files_one_that_was_renamed_or_made_is_seen_by_its_folder(
+    save: Callable[[Path, str], None], many: Many, calls: Calls
+) -> None:
+    for number, file in enumerate(many(0, 0)):
+        save(file, f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}
+
+
+def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text("a = 0\n")
+    calls = Calls()
+
+    def on_change(paths: set[Path]) -> None:
+        calls(paths)
+        raise ValueError("of the listener's")
+
+    watcher = SourceWatcher(on_change)
+    watcher.follow([path])
+    for number in (1, 2):
+        path.write_text(f"a = {number}\n")
+        assert calls.next() == {"task.py": f"a = {number}\n"}
+    watcher.stop()
+    assert "of the listener's" in caplog.text
+
+
+def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    path.write_text("a = 0\n")
+    calls = Calls()
+    watcher = SourceWatcher(lambda paths: (watcher.stop(), calls(paths))[1])
+    watcher.follow([path])
+    path.write_text("a = 1\n")
+    assert calls.next() == {"task.py": "a = 1\n"}
+    watcher.stop()
+    path.write_text("a = 2\n")
+    assert calls.queue.empty()
+    idle = SourceWatcher(calls)
+    idle.stop()
+    idle.stop()
+
+
+@pytest.mark.parametrize("what", ["pipe", "device", "large"])
+def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Path, what: str) -> None:
+    file, other = tmp_path / "task.py", tmp_path / "other"
+    file.write_text("x = 1\n")
+    seen: queue.Queue[set[Path]] = queue.Queue()
+    watcher = SourceWatcher(seen.put)
+    watcher.follow([file])
+    if what == "pipe":
+        os.mkfifo(other)
+    elif what == "device":
+        other.symlink_to("/dev/zero")
+    else:
+        with other.open("wb") as large:
+            large.truncate(2**40)
+    other.replace(file)
+    assert seen.get(timeout=PATIENCE) == {file}
+    other.write_text("x = 2\n")
+    other.replace(file)
+    assert seen.get(timeout=PATIENCE) == {file}
+    watcher.stop()

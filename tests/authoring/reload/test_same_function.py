@@ -1,0 +1,68 @@
+"""Where a line of one version of a file is in the next."""
+
+from __future__ import annotations
+
+import pytest
+
+from workbench.authoring.reload.call_graph import line_in
+
+OLD = '''
+LIMIT = 3
+
+
+class Task:
+    def lift(self):
+        """Lift it."""
+        self.up = 1
+        self.up = 2  # twice
+
+    @property
+    def goal(self):
+        def draw():
+            return 1
+        return draw()
+'''
+
+
+def at(text: str, words: str) -> int:
+    (line,) = [i for i, one in enumerate(text.splitlines(), 1) if words in one]
+    return line
+
+
+@pytest.mark.parametrize("words", ["LIMIT = 3", "self.up = 2", "return 1", "return draw()"])
+@pytest.mark.parametrize(
+    "new",
+    [
+        OLD,
+        "import torch\n\n\n" + OLD,
+        OLD.replace("Lift it.", "Lift it,\n        and say so."),
+        OLD.replace("self.up = 1", "# first\n        self.up = 1\n"),
+        OLD.replace("LIMIT = 3\n", "OTHER = 5\n# three\nLIMIT = 3\n"),
+    ],
+)
+def test_a_line_is_followed_where_only_what_is_around_it_changed(words: str, new: str) -> None:
+    assert line_in(OLD, new, at(OLD, words)) == at(new, words)
+
+
+@pytest.mark.parametrize(
+    ("words", "new"),
+    [
+        ("self.up = 2", OLD.replace("self.up = 1", "self.up = 5")),
+        ("self.up = 2", OLD.replace("def lift(self)", "def lift(self, more=1)")),
+        ("self.up = 2", OLD.replace("def lift", "def raises")),
+        ("self.up = 2", OLD.replace("class Task", "class Other")),
+        ("return 1", OLD.replace("return 1", "return 2")),
+        ("LIMIT = 3", OLD.replace("LIMIT = 3", "LIMIT = 4")),
+        ("self.up = 2", "class Task:\n    def lift(self"),
+        ("self.up = 2", "\0"),
+        ("self.up = 2", ""),
+    ],
+)
+def test_a_function_that_says_something_else_has_no_such_line(words: str, new: str) -> None:
+    assert line_in(OLD, new, at(OLD, words)) is None
+
+
+def test_a_line_of_nothing_is_nowhere() -> None:
+    assert line_in(OLD, OLD, 1) is None
+    assert line_in("def (", OLD, 1) is None
+    assert line_in(OLD, OLD, 99) is None

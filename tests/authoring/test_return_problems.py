@@ -1,0 +1,160 @@
+"""What a step's hooks may return, and what is said when they return something else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.authoring.loading.load import LoadedTask, load_task
+from workbench.authoring.problem import Problem
+from workbench.authoring.return_problems import check_step_returns
+from workbench.core.env.evaluate_entries import wrong_reward
+
+Write = Callable[..., Path]
+N = 4
+YES = torch.ones(N, dtype=torch.bool)
+
+
+class Mute:
+    def __repr__(self) -> str:
+        raise ValueError("nothing to be said")
+
+
+TASK = """
+def noted(function):
+    return function
+
+class PushEnv(BaseEnv):
+    @noted
+    def evaluate(self):
+        pass
+
+    def compute_dense_reward(self, obs, action, info):
+        pass
+"""
+
+
+@pytest.fixture
+def task(write: Write) -> LoadedTask:
+    return load_task(str(write("push.py", TASK, task=True)))
+
+
+def check(task: LoadedTask, evaluate: object, reward: object = None, num_envs: int = N) -> Problem | None:
+    return check_step_returns(task.cls, num_envs, evaluate, reward, task.source_files)
+
+
+@pytest.mark.parametrize(
+    ("evaluate", "reward"),
+    [
+        ({}, None),
+        ({}, torch.zeros(N)),
+        ({"success": YES}, torch.zeros(N, dtype=torch.float64)),
+        ({"success": YES, "fail": ~YES, "distance": torch.rand(N, 3)}, torch.ones(N)),
+        ({"success": YES}, YES.clone()),  # ManiSkill's own sparse reward
+        # Told by a rule, and no reason not to show it.
+        ({"success": YES}, ~YES),
+        ({}, torch.ones(N, dtype=torch.int64)),
+        ({"parts": {"arm": torch.zeros(N, 2)}, "instruction": "push"}, None),
+        # Only success and fail are asked for a row for each env.
+        ({"best": None, "stage": 2, "distance": 0.5, "progress": torch.tensor(0.5)}, None),
+        ({"goal": torch.zeros(3, N), "parts": {"arm": torch.zeros(1), 7: object()}, 1: YES}, torch.zeros(N)),
+        ({"reward_terms": {"reach": torch.tensor(0.5), "push": None}}, torch.zeros(N)),
+    ],
+)
+def test_what_upstream_takes_is_let_through(evaluate: dict, reward: object, task: LoadedTask) -> None:
+    assert check(task, evaluate, reward) is None
+
+
+@pytest.mark.parametrize(
+    ("evaluate", "words"),
+    [
+        (None, "returned None; it must return a dict"),
+        (YES, "bool tensor of shape (4,); it must return a dict"),
+        ([("success", YES)], "list"),
+        ({"success": True}, "'success' as bool (True)"),
+        ({"success": np.ones(N, dtype=bool)}, "numpy bool array of shape (4,)"),
+        ({"success": torch.tensor(True)}, "shape ()"),
+        ({"success": YES[:, None]}, "shape (4, 1)"),
+        ({"success": YES.float()}, "float32 tensor"),
+        ({"success": YES[:3]}, "shape (3,); expected a bool tensor of shape (4,)"),
+        ({"fail": YES.int()}, "'fail' as a int32"),
+        ({"success": [True] * N}, "list"),
+        ({"success": {"all": YES}}, "'success' as dict"),
+        ({"note": "x", "fail": None}, "'fail' as None"),
+        ({"fail": Mute()}, "'fail' as Mute (<Mute, whose repr raises ValueError>)"),
+    ],
+)
+def test_a_wrong_evaluate_is_told_at_its_def(evaluate: object, words: str, task: LoadedTask) -> None:
+    problem = check(task, evaluate, torch.zeros(N))
+    assert problem is not None
+    assert problem.message.startswith("evaluate() returned ") and words in problem.message
+    assert (problem.stage, problem.file, problem.code) == ("returns", str(task.file), "def evaluate(self):")
+
+
+@pytest.mark.parametrize(
+    ("reward", "words"),
+    [
+        (0.5, "float (0.5)"),
+        (torch.tensor(0.5), "shape ()"),
+        (torch.zeros(N, 1), "shape (4, 1)"),
+        (torch.zeros(N, N), "shape (4, 4)"),
+        (np.zeros(N), "numpy float64 array"),
+        (torch.zeros(N, dtype=torch.complex64), "complex64"),
+    ],
+)
+def test_a_wrong_reward_is_told_at_its_def(reward: object, words: str, task: LoadedTask) -> None:
+    problem = check(task, {"success": YES}, reward)
+    assert problem is not None
+    assert words in problem.message
+    assert problem.code == "def compute_dense_reward(self, obs, action, info):"
+    assert problem.message.startswith("compute_dense_reward() returned ")
+
+
+def test_a_number_that_is_none_is_a_value_and_no_wrong_shape(task: LoadedTask) -> None:
+    assert check(task, {"success": YES}, torch.tensor([0, float("nan"), float("inf"), 0])) is None
+
+
+def test_a_hook_that_is_inherited_has_no_place_of_the_authors(task: LoadedTask) -> None:
+    cls = load_task("PickCube-v1").cls
+    problem = check_step_returns(cls, N, None, None, task.source_files)
+    assert problem is not None and (problem.file, problem.line, problem.code) == (None, None, None)
+
+
+def test_a_class_put_in_front_of_the_tasks_hides_nothing(task: LoadedTask) -> None:
+    batched = type("Batched", (task.cls,), {})
+    problem = check_step_returns(batched, N, None, None, task.source_files)
+    assert problem is not None and problem.code == "def evaluate(self):"
+
+
+def test_other_devices_are_only_asked(task: LoadedTask) -> None:
+    device = torch.device("meta")
+    evaluate = {"success": torch.zeros(N, dtype=torch.bool, device=device)}
+    assert check(task, evaluate) is None
+    problem = check(task, evaluate, torch.zeros(N, 1, device=device))
+    assert problem is not None and "shape (4, 1)" in problem.message
+
+
+shapes = st.lists(st.integers(0, 5), max_size=3).map(tuple)
+dtypes = st.sampled_from([torch.bool, torch.int32, torch.float32, torch.float64])
+
+
+@given(shape=shapes, dtype=dtypes, num_envs=st.integers(1, 5))
+def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dtype, num_envs: int) -> None:
+    value = torch.zeros(shape, dtype=dtype)
+    # One truth is a row of one env, as in ManiSkill.
+    a_row_each = shape == (num_envs,) or (shape == () and num_envs == 1)
+    passes = {
+        key: check_step_returns(object, num_envs, {key: value}, None, ()) is None
+        for key in ("success", "other")
+    }
+    assert passes == {"success": a_row_each and dtype == torch.bool, "other": True}
+    reward = check_step_returns(object, num_envs, {}, value, ()) is None
+    assert reward == a_row_each
+    told = wrong_reward(value, num_envs, {}) is not None
+    assert told == (not a_row_each or not dtype.is_floating_point)

@@ -1,0 +1,59 @@
+"""Arguments that the command line turns into something else."""
+
+from __future__ import annotations
+
+import pytest
+
+from workbench.cli.arguments import EnvArguments, Rules, history_bytes
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("256MB", 2**28), ("2gb", 2**31), (" 1.5 G ", 3 * 2**29), ("1048576", 2**20)]
+)
+def test_a_size_is_read_as_people_write_it(text: str, size: int) -> None:
+    assert history_bytes(text) == size
+
+
+@pytest.mark.parametrize("rules", ["stop", "warn", "off", None])
+def test_the_degree_of_the_rules_is_an_option_of_the_task(rules: Rules) -> None:
+    assert EnvArguments(4, "cpu", rules).options().rules == rules
+
+
+@pytest.mark.parametrize("text", ["", "0", "many", "-3MB", "12XB", "1e9MB", "10", "nan GB", "9" * 400 + "GB"])
+def test_a_size_that_is_none_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(ValueError, match="such as 256MB or 2GB"):
+        history_bytes(text)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "seed", "named"),
+    [(1, 0, None), (4096, 2**31 - 1, None), (1, -1, "--seed"), (1, 2**31, "--seed")]
+    + [(0, 0, "--num-envs"), (4097, 0, "--num-envs")],
+)
+def test_the_limits_themselves_are_taken_and_what_is_past_them_is_not(
+    num_envs: int, seed: int, named: str | None
+) -> None:
+    if named is None:
+        options = EnvArguments(num_envs, seed=seed).options()
+        assert (options.num_envs, options.seed) == (num_envs, seed)
+    else:
+        with pytest.raises(ValueError, match=named):
+            EnvArguments(num_envs, seed=seed).options()
+
+
+def test_the_smallest_and_the_largest_history_are_taken() -> None:
+    assert (history_bytes("1MB"), history_bytes("1048576MB")) == (2**20, 2**40)
+    for text in (str(2**20 - 1), str(2**40 + 2**20)):
+        with pytest.raises(ValueError, match="--history"):
+            history_bytes(text)
+
+
+def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
+    given = ("robot_uids=fetch", "flag=true", "size=0.5", "pair=[1, 2]", "text=a=b")
+    options = EnvArguments(env=given).options()
+    assert options.env_kwargs == {
+        "robot_uids": "fetch", "flag": True, "size": 0.5, "pair": [1, 2], "text": "a=b",
+    }  # fmt: skip
+    for wrong in ("robot_uids", "=1", "a-b=1", "1a=1"):
+        with pytest.raises(ValueError, match="--env takes name=value"):
+            EnvArguments(env=(wrong,)).options()

@@ -1,0 +1,245 @@
+"""Poses and lenses said in every way: against ManiSkill's and SAPIEN's own matrices, and there and back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import sapien
+import sapien.render
+import transforms3d
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from numpy.testing import assert_allclose
+
+from tests.core.single_env_judge import Bare, batch_of
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras import conventions as frames
+from workbench.core.cameras.conventions import LookAt
+
+unhurried = settings(deadline=None, max_examples=50)  # a busy machine is no failure
+numbers = st.floats(-10, 10, allow_subnormal=False)
+positions = st.tuples(numbers, numbers, numbers)
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: float(np.linalg.norm(q)) > 1e-3)
+poses = st.builds(frames.make_pose, positions, quaternions)
+sizes = st.integers(1, 4096)
+fovs = st.floats(0.02, 3.0)
+DOWN, UP = (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)
+
+
+def assert_same_pose(a: Any, b: Any, atol: float = 1e-9) -> None:
+    assert_allclose(a[:3], b[:3], atol=atol)
+    # q and -q are one rotation, also where the sign hangs on the last digit of a zero.
+    assert abs(float(np.dot(a[3:], b[3:]))) == pytest.approx(1, abs=atol)
+
+
+class Posed(Bare):
+    """Cameras at four poses, one with an intrinsic matrix of unlike focal lengths off the middle."""
+
+    EYES = ((0.3, 0.0, 0.6), (1.0, -2.0, 0.1), (-0.5, 0.5, 3.0), (0.2, 0.1, 0.05))
+    TARGET = (-0.1, 0.0, 0.1)
+    K = np.array([[70.0, 0, 30], [0, 90, 26], [0, 0, 1]])
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        lens: list[dict[str, Any]] = [{"fov": 0.7}, {"fov": 1.5}, {"fov": 2.4}, {"intrinsic": self.K}]
+        return [
+            CameraConfig(
+                f"c{i}", sapien_utils.look_at(eye, self.TARGET), 64, 48, near=0.01, far=10, **lens[i]
+            )
+            for i, eye in enumerate(self.EYES)
+        ]
+
+
+def test_matrices_are_those_of_maniskills_cameras(renderer: None) -> None:
+    env: Any = batch_of(Posed, 2, obs_mode="rgb", render_backend="cpu")
+    for i, eye in enumerate(Posed.EYES):
+        camera = env._sensors[f"c{i}"]
+        theirs = {key: value[0].numpy() for key, value in camera.get_params().items()}
+        pose = frames.pose_from_look_at(LookAt(eye, Posed.TARGET))
+        config = camera.config.pose.raw_pose[0].numpy()
+        assert_same_pose(pose, config, atol=1e-6)
+        assert_allclose(frames.opencv_extrinsic(pose), theirs["extrinsic_cv"], atol=2e-6)
+        assert_allclose(frames.opengl_model_matrix(pose), theirs["cam2world_gl"], atol=2e-6)
+        intrinsic = Posed.K if i == 3 else frames.intrinsic_from_fov(camera.config.fov, 64, 48)
+        assert_allclose(intrinsic, theirs["intrinsic_cv"], rtol=1e-6, atol=1e-5)
+        component = camera.camera._render_cameras[0]
+        if i < 3:
+            assert frames.vertical_fov(intrinsic, 48) == pytest.approx(component.fovy, abs=1e-6)
+            assert frames.horizontal_fov(intrinsic, 64) == pytest.approx(component.fovx, abs=1e-6)
+        # SAPIEN's own component, whose matrices are computed apart from ManiSkill's.
+        assert_allclose(frames.opencv_extrinsic(pose), component.get_extrinsic_matrix(), atol=2e-6)
+    env.close()
+
+
+@unhurried
+@given(positions, positions)
+def test_look_at_is_maniskills_wherever_that_one_is_right(eye: Any, target: Any) -> None:
+    away = np.subtract(target, eye)
+    # In float32, near the vertical and very near the eye, upstream's has no digits left.
+    assume(np.linalg.norm(away) > 0.1 and math.hypot(*away[:2]) > 0.02 * np.linalg.norm(away))
+    theirs = sapien_utils.look_at(eye, target).raw_pose[0].numpy()
+    assert_same_pose(frames.pose_from_look_at(LookAt(eye, target)), theirs, atol=2e-4)
+
+
+@pytest.mark.parametrize(("forward", "top"), [(DOWN, (1, 0, 0)), (UP, (-1, 0, 0))])
+def test_straight_down_and_up_are_right_where_upstream_is_not(forward: Any, top: Any) -> None:
+    eye = (0.2, -0.1, 0.5)
+    target = tuple(np.add(eye, forward))
+    upstream = sapien_utils.look_at(eye, target).raw_pose[0, 3:].numpy()
+    assert np.linalg.norm(upstream) < 0.9, "upstream mended it: the page need no longer warn"
+    pose = frames.pose_from_look_at(LookAt(eye, target))
+    assert np.linalg.norm(pose[3:]) == pytest.approx(1)
+    ahead, left, up = frames.axes_of(pose[3:])
+    assert_allclose([ahead, left, up], [forward, (0, 1, 0), top], atol=1e-12)
+    # It is where an upright camera ends that is tilted: no jump on the way.
+    nearly = frames.pose_from_look_at(LookAt(eye, tuple(np.add(target, (0.001, 0, 0)))))
+    assert_same_pose(pose, nearly, atol=2e-3)
+
+
+@unhurried
+@given(poses, st.floats(0.05, 20))
+def test_look_at_and_back(pose: Any, distance: float) -> None:
+    looking = frames.look_at_of(pose, distance)
+    assert np.linalg.norm(np.subtract(looking.target, looking.eye)) == pytest.approx(distance)
+    assert_same_pose(frames.pose_from_look_at(looking), pose, atol=1e-8)
+
+
+@unhurried
+@given(positions, st.sampled_from([DOWN, UP]), st.floats(-3.1, 3.1))
+def test_a_roll_straight_down_or_up_is_kept(eye: Any, forward: Any, roll: float) -> None:
+    pose = frames.pose_from_look_at(LookAt(eye, tuple(np.add(eye, forward)), roll))
+    assert frames.look_at_of(pose).roll == pytest.approx(roll, abs=1e-6)
+
+
+def test_a_positive_roll_turns_the_camera_clockwise_seen_from_behind() -> None:
+    level, rolled = (frames.pose_from_look_at(LookAt((0, 0, 1), (1, 0, 1), roll)) for roll in (0.0, 0.3))
+    assert_allclose(frames.axes_of(level[3:])[1], (0, 1, 0), atol=1e-12)
+    assert frames.axes_of(rolled[3:])[1][2] > 0.2, "its left side goes up"
+    assert frames.rpy_of(rolled[3:])[0] == pytest.approx(math.degrees(0.3))
+
+
+@unhurried
+@given(quaternions)
+def test_quaternion_matrix_axes_and_rpy_are_one_rotation(quaternion: Any) -> None:
+    q = frames.normalised(quaternion)
+    r = frames.rotation_matrix(q)
+    assert_allclose(r, transforms3d.quaternions.quat2mat(q), atol=1e-9)
+    assert_allclose(r @ r.T, np.eye(3), atol=1e-12)
+    assert abs(frames.quaternion_of(r) @ q) == pytest.approx(1)
+    forward, left, up = frames.axes_of(q)
+    assert_allclose(np.cross(forward, left), up, atol=1e-9)
+    assert abs(frames.quaternion_from_axes(forward, up) @ q) == pytest.approx(1)
+    rpy = frames.rpy_of(q)
+    assert_allclose(frames.rotation_matrix(frames.quaternion_from_rpy(*rpy)), r, atol=3e-6)
+
+
+@unhurried
+@given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
+def test_rpy_is_that_of_urdf_and_ros(roll: float, pitch: float, yaw: float) -> None:
+    theirs = transforms3d.euler.euler2mat(*np.radians([roll, pitch, yaw]), axes="sxyz")
+    assert_allclose(frames.rotation_matrix(frames.quaternion_from_rpy(roll, pitch, yaw)), theirs, atol=1e-9)
+
+
+def test_at_the_vertical_all_of_the_turn_is_said_as_yaw() -> None:
+    for yaw in (-170.0, -30.0, 0.0, 100.0):
+        for pitch in (90.0, -90.0):
+            assert_allclose(
+                frames.rpy_of(frames.quaternion_from_rpy(0, pitch, yaw)), (0, pitch, yaw), atol=1e-6
+            )
+
+
+@unhurried
+@given(poses)
+@pytest.mark.parametrize("convention", ["maniskill", "opencv", "opengl"])
+@pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
+def test_matrices_and_back(convention: Any, direction: Any, pose: Any) -> None:
+    matrix = frames.matrix_of(pose, convention, direction)
+    assert_same_pose(frames.pose_from_matrix(matrix, convention, direction), pose, atol=1e-8)
+    assert_same_pose(frames.pose_from_matrix(matrix[:3], convention, direction), pose, atol=1e-8)
+    other: Any = "world_to_camera" if direction == "camera_to_world" else "camera_to_world"
+    assert_allclose(matrix @ frames.matrix_of(pose, convention, other), np.eye(4), atol=1e-8)
+
+
+@unhurried
+@given(poses, poses)
+def test_a_mounts_frame_and_back_as_sapien_has_it(mount: Any, local: Any) -> None:
+    world = frames.compose(mount, local)
+    theirs = sapien.Pose(mount[:3], mount[3:]) * sapien.Pose(local[:3], local[3:])
+    assert_same_pose(world, np.concatenate([theirs.p, theirs.q]), atol=1e-4)
+    assert_same_pose(frames.relative_to(mount, world), local, atol=1e-8)
+    assert_same_pose(frames.compose(mount, frames.inverse(mount)), (0, 0, 0, 1, 0, 0, 0), atol=1e-8)
+
+
+@unhurried
+@given(fovs, sizes, sizes)
+def test_fov_and_intrinsic_are_one_lens(fov: float, width: int, height: int) -> None:
+    k = frames.intrinsic_from_fov(fov, width, height)
+    assert frames.vertical_fov(k, height) == pytest.approx(fov)
+    larger = frames.scaled_intrinsic(k, (width, height), (2 * width, 3 * height))
+    assert frames.vertical_fov(larger, 3 * height) == pytest.approx(fov)
+    assert frames.horizontal_fov(larger, 2 * width) == pytest.approx(frames.horizontal_fov(k, width))
+    assert frames.matrix3(k) == tuple(map(tuple, k.tolist()))
+
+
+def test_settings_keep_a_matrix_and_can_be_put_at_a_pose() -> None:
+    off = frames.intrinsic_from_fov(1.0, 64, 48)
+    off[0, 2] += 0.5
+    settings = CameraSettings((0, 0, 0), (1, 0, 0, 0), None, frames.matrix3(off), 64, 48, 0.01, 10, "minimal")
+    assert_allclose(frames.intrinsic_of(settings), off)
+    moved = frames.with_pose(settings, (1, 2, 3, -2, 0, 0, 0))
+    assert moved.position == (1, 2, 3) and moved.quaternion == (1, 0, 0, 0)
+    assert_allclose(frames.pose_of(moved), (1, 2, 3, 1, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "says"),
+    [
+        (np.diag([1, 1, -1, 1]), "mirror image"),
+        (np.diag([2, 2, 2, 1]), "scales by 2"),
+        (np.diag([0.001, 0.001, 0.001, 1]), "scales by 0.001"),
+        (np.diag([1, 1, 0, 1]), "flattens"),
+        ([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "right angles"),
+        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]], "transposed"),
+        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]], "last row"),
+        (np.eye(3), "4 x 4 or 3 x 4"),
+        (np.full((4, 4), np.nan), "not finite"),
+    ],
+)
+def test_a_matrix_that_is_no_pose_is_refused_in_words(matrix: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        frames.pose_from_matrix(matrix, "opencv", "camera_to_world")
+
+
+@unhurried
+@given(quaternions)
+def test_a_rotation_printed_with_four_digits_is_taken(quaternion: Any) -> None:
+    r = frames.rotation_matrix(quaternion)
+    assert_allclose(frames.rotation_matrix(frames.quaternion_of(np.round(r, 4))), r, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: frames.normalised((0, 0, 0, 0)), "zeros"),
+        (lambda: frames.normalised((1, 0, 0, math.inf)), "not finite"),
+        (lambda: frames.pose_from_look_at(LookAt((1, 2, 3), (1, 2, 3))), "same point"),
+        (lambda: frames.quaternion_from_axes((1, 0, 0), (2, 0, 0)), "up must not"),
+        (lambda: frames.quaternion_from_axes((0, 0, 0), (0, 0, 1)), "no length"),
+        (lambda: frames.look_at_of((0, 0, 0, 1, 0, 0, 0), 0), "in front"),
+        (lambda: frames.intrinsic_from_fov(math.pi, 4, 4), "between 0 and pi"),
+        (lambda: frames.intrinsic_from_fov(1, 0, 4), "at least one pixel"),
+        (lambda: frames.checked_intrinsic([[1, 5, 0], [0, 1, 0], [0, 0, 1]]), "skew"),
+        (lambda: frames.checked_intrinsic([[1, 0, 0], [0, -1, 0], [0, 0, 1]]), "positive"),
+        (lambda: frames.checked_intrinsic(np.eye(4)), "3 x 3"),
+        (lambda: frames.checked_intrinsic(np.ones((3, 3))), "three rows"),
+        (lambda: frames.make_pose((1, 2), (1, 0, 0, 0)), "3 numbers"),
+    ],
+)
+def test_what_says_nothing_is_refused_in_words(call: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        call()

@@ -1,0 +1,211 @@
+"""What is made of measured pixels and depths, by numbers that can be checked by hand; `test_visibility` measures real ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras.report import (
+    DEPTH_EDGES,
+    CameraReport,
+    DepthReport,
+    ObjectSeen,
+    SearchSpace,
+    in_words,
+    join_reports,
+)
+
+NAN = float("nan")
+
+
+def thing(name: str = "cube", **given: Any) -> ObjectSeen:
+    """In one env, whole and in the open, of a hundred pixels; or as many envs as numbers are given."""
+    values: dict[str, Any] = {"pixels": 100, "unhindered": None, "alone": None, "cut": False, "margin": 0.25}
+    values |= {"present": True, "never_drawn": False, "scenery": False, **given}
+    for less, more in (("pixels", "unhindered"), ("unhindered", "alone")):
+        values[more] = values[less] if values[more] is None else values[more]
+    never_drawn, scenery = values.pop("never_drawn"), values.pop("scenery")
+    count = max(np.size(value) for value in values.values())
+    kinds = {"present": bool, "cut": bool}
+    arrays: Any = {
+        name: np.broadcast_to(np.array(value, kinds.get(name, np.float32)), count)
+        for name, value in values.items()
+    }
+    return ObjectSeen(name, never_drawn, scenery, **arrays)
+
+
+def depth(nearest: Any = 1.0, farthest: Any = 2.0) -> DepthReport:
+    ones = np.ones(np.size(nearest), np.float32)
+    near, far = (np.atleast_1d(np.array(value, np.float32)) for value in (nearest, farthest))
+    return DepthReport(np.ones((len(ones), 40), np.int64), ones * 0.5, ones * 0.25, near, far)
+
+
+def report(*objects: ObjectSeen, envs: tuple[int, ...] = (0,), **given: Any) -> CameraReport:
+    plain = CameraReport(("sensor", "eye"), (8, 6), (4, 3), envs, objects, depth(), 3, 1.5)
+    return replace(plain, **given)
+
+
+def test_depth_is_counted_in_ten_bins_a_decade_from_a_centimetre_to_a_hundred_metres() -> None:
+    assert len(DEPTH_EDGES) == 41
+    assert_allclose(DEPTH_EDGES[::10], [0.01, 0.1, 1.0, 10.0, 100.0])
+
+
+def test_a_mark_is_what_is_left_to_see() -> None:
+    marks = thing(
+        pixels=[100, 400, 25, 50, 50, 0, 100, 100],
+        alone=[100, 400, 25, 100, 50, 0, 100, 100],
+        cut=[False, False, False, False, True, False, True, False],
+        present=[True] * 7 + [False],
+    ).marks()
+    assert marks.dtype == np.float32
+    assert_allclose(marks, [1, 1, 0.5, 0.5, 0.5 * 0.5**0.5, 0, 0.5, NAN], rtol=1e-6)
+    # More is never left than the whole of it, and what is drawn only beside others is no division by zero.
+    assert_allclose(thing(pixels=[200, 1], alone=[100, 0]).marks(), [1, 0])
+
+
+def test_who_covers_it_is_told_by_what_each_takes_away() -> None:
+    seen = thing(pixels=[25, 0, 0, 60], unhindered=[50, 0, 40, 50], alone=[100, 100, 40, 0])
+    assert seen.hidden_share.dtype == np.float32
+    assert_allclose(seen.hidden_share, [0.5, NAN, 1, 0])
+    assert_allclose(seen.covered_share, [0.5, 1, 0, NAN])
+
+
+def test_a_summary_is_of_the_envs_that_have_it() -> None:
+    seen = thing(
+        pixels=[25, 0, 0, 70, 999],
+        unhindered=[50, 0, 40, 70, 999],
+        alone=[100, 100, 40, 70, 999],
+        cut=[True, False, False, False, True],
+        present=[True, True, True, True, False],
+    )
+    assert seen.summary().__dict__ == {
+        "present": 4,
+        "seen": 0.5,
+        "median_pixels": 12.5,
+        "cut": 0.25,
+        "hidden": 0.5,  # a half, and a whole, and nothing: of the three that are in sight without the robot
+        "wholly_hidden": 0.25,
+        "covered": 0.375,
+    }
+    gone = thing(present=False).summary()
+    assert gone.present == 0
+    assert_array_equal([value for name, value in gone.__dict__.items() if name != "present"], [NAN] * 6)
+    away = thing(pixels=0).summary()
+    assert (away.seen, away.wholly_hidden) == (0, 0) and np.isnan([away.hidden, away.covered]).all()
+
+
+def test_the_mark_of_an_env_is_that_of_its_worst_object_that_is_to_be_seen() -> None:
+    envs = (4, 0, 2, 1)
+    cube = thing("cube", pixels=[100, 25, 100, 0], present=[True, True, False, True])
+    ball = thing("ball", pixels=[25, 100, 100, 100], present=[True, True, False, True])
+    table = thing("table", pixels=[0] * 4, scenery=True)
+    goal = thing("goal", pixels=[0] * 4, never_drawn=True)
+    found = report(cube, ball, table, goal, envs=envs)
+    assert [one.name for one in found.wanted_objects()] == ["cube", "ball"]
+    assert_array_equal(found.env_marks(), np.array([0.5, 0.5, NAN, 0], np.float32))
+    assert found.worst_first() == (3, 0, 1, 2)
+    assert_array_equal(found.env_marks(["ball"]), np.array([0.5, 1, NAN, 1], np.float32))
+    assert found.worst_first(["ball"]) == (0, 1, 3, 2)
+    assert_array_equal(found.env_marks(["table", "cube"]), np.array([0, 0, 0, 0], np.float32))
+    empty = report(table, goal, envs=envs)
+    assert_array_equal(empty.env_marks(), [NAN] * 4)
+    assert empty.worst_first() == (0, 1, 2, 3)
+    with pytest.raises(ValueError, match="no object dragon, fox; there are: cube, ball, table, goal$"):
+        found.env_marks(["fox", "cube", "dragon"])
+    with pytest.raises(ValueError, match="no object fox; there are: none$"):
+        report().wanted_objects(["fox"])
+
+
+@pytest.mark.parametrize(
+    ("nearest", "near"),
+    [([0.5, 0.9], 0.25), ([0.129, NAN], 0.064), ([3.99], 1.9), ([0.2], 0.1), ([NAN], None), ([np.inf], None)],
+)
+def test_the_near_plane_keeps_half_way_to_the_nearest(nearest: list[float], near: float | None) -> None:
+    assert depth(nearest).suggested_near == near
+
+
+@pytest.mark.parametrize(
+    ("farthest", "far"),
+    [([1.0, 2.0], 3.0), ([0.67, NAN], 1.1), ([67.0], 110.0), ([2.01], 3.1), ([NAN], None)],
+)
+def test_the_far_plane_leaves_half_as_much_again(farthest: list[float], far: float | None) -> None:
+    assert depth([1.0], farthest).suggested_far == far
+
+
+def test_joined_reports_are_end_to_end() -> None:
+    one = report(thing(pixels=[1, 2]), envs=(0, 3), depth=depth([1.0, 2.0], [3.0, 4.0]))
+    other = report(thing(pixels=[5], cut=True), envs=(0,), depth=depth([7.0], [8.0]), pictures=4)
+    both = join_reports([one, other])
+    assert (both.envs, both.pictures, both.milliseconds) == ((0, 3, 0), 7, 3.0)
+    assert (both.camera, both.size, both.judged_size) == (("sensor", "eye"), (8, 6), (4, 3))
+    assert both.objects[0].pixels.tolist() == [1, 2, 5] and both.objects[0].cut.tolist() == [
+        False,
+        False,
+        True,
+    ]
+    assert both.depth.nearest.tolist() == [1, 2, 7] and both.depth.counts.shape == (3, 40)
+    assert join_reports([one]).objects[0].pixels.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"camera": ("human", "eye")}, "different cameras"),
+        ({"size": (8, 8)}, "different sizes"),
+        ({"judged_size": (8, 6)}, "different sizes"),
+        ({"objects": (thing("ball"),)}, "different scenes"),
+    ],
+)
+def test_what_is_not_of_one_camera_and_one_scene_is_not_joined(changes: Any, says: str) -> None:
+    first = report(thing())
+    with pytest.raises(ValueError, match=says):
+        join_reports([first, first, replace(first, **changes)])
+
+
+def test_without_a_report_there_is_nothing_to_join() -> None:
+    with pytest.raises(ValueError, match="no report"):
+        join_reports([])
+
+
+def test_what_was_measured_is_said_of_what_is_there() -> None:
+    whole = thing("cube", pixels=[200, 221])
+    half = thing("ball", pixels=[3, 0, 6], unhindered=[4, 0, 6], alone=[4, 0, 6], cut=[True, False, False])
+    hardly = thing("peg", pixels=[995, 995], unhindered=[1000, 998])
+    found = report(whole, half, hardly, thing("gone", present=False))
+    assert in_words(found, ("cube", "gone")) == "cube: in 2 of 2 envs, about 210 pixels"
+    assert in_words(found, ("ball", "peg")) == (
+        "ball: in 2 of 3 envs, about 3 pixels, cut by the border in 33%, 12% behind the robot; "
+        "peg: in 2 of 2 envs, about 995 pixels"
+    )
+
+
+LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 96, 64, 0.01, 100, "minimal")
+SPACE = SearchSpace(("cube",), (0.0, 0.0, 0.5), (1.0, 1.0, 0.5), LENS, candidates=1, best=1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"low": (0.0, 1.5, 0.5)}, "each low must be below its high"),
+        ({"high": (1.0, NAN, 1.0)}, "each low must be below its high"),
+        ({"low": (0.0, -np.inf, 0.5)}, "each low must be below its high"),
+        ({"objects": ()}, "at least one object"),
+        ({"candidates": 0}, "draws at least one placement"),
+        ({"best": 0}, "offers at least one"),
+        ({"lens": replace(LENS, fov=None)}, "field of view or an intrinsic"),
+    ],
+)
+def test_what_cannot_be_looked_for_is_refused(changes: Any, says: str) -> None:
+    SPACE.check()
+    with pytest.raises(ValueError, match=says):
+        replace(SPACE, **changes).check()
+
+
+def test_a_search_that_says_no_more_draws_a_hundred_and_offers_five() -> None:
+    space = SearchSpace(("cube",), SPACE.low, SPACE.high, LENS)
+    assert (space.kind, space.candidates, space.best, space.mount) == ("sensor", 100, 5, None)

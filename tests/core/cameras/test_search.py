@@ -1,0 +1,160 @@
+"""Placements that are suggested see what was asked for, wherever it was in the envs, and the same ones every time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.drive.envs import batched
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras.conventions import axes_of
+from workbench.core.cameras.render import segmentation_names
+from workbench.core.cameras.report import CameraReport, SearchSpace, join_reports
+from workbench.core.cameras.search import score_of, suggest_cameras
+from workbench.core.cameras.visibility import Placement, judge_placement, objects_to_see
+
+N = 2
+LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 96, 64, 0.01, 100, "minimal")
+LOW, HIGH = (-0.8, -0.8, 0.1), (0.8, 0.8, 1.0)
+
+
+@pytest.fixture(scope="module")
+def env(renderer: None) -> Iterator[Any]:
+    made = batched("PushCube-v1", N, render=True)
+    made.reset(seed=3)
+    yield made
+    made.close()
+
+
+def judged(env: Any, placement: Placement, size: tuple[int, int]) -> CameraReport:
+    return join_reports([judge_placement(env, e, placement, size=size) for e in range(N)])
+
+
+def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
+    space = SearchSpace(("cube", "goal_region"), LOW, HIGH, LENS, candidates=12, best=2, apart=0.2)
+    told: list[tuple[int, int]] = []
+    before = [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes]
+    found = suggest_cameras(env, space, range(N), progress=lambda done, total: told.append((done, total)))
+    assert [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes] == before
+    assert 1 <= len(found) <= 2 and [s.score for s in found] == sorted((s.score for s in found), reverse=True)
+    for suggestion in found:
+        eye = np.array(suggestion.settings.position)
+        assert (eye >= LOW).all() and (eye <= HIGH).all()
+        away = np.subtract(suggestion.target, eye)
+        np.testing.assert_allclose(
+            axes_of(suggestion.settings.quaternion)[0], away / np.linalg.norm(away), atol=1e-9
+        )
+        # Judged again from nothing but its settings, it is as good as was said.
+        again = judged(env, Placement(suggestion.settings), suggestion.report.judged_size)
+        assert score_of(again, space.objects) == pytest.approx(suggestion.score, abs=1e-6)
+        assert all(thing.summary().seen == 1 for thing in again.wanted_objects(space.objects))
+        assert suggestion.picture.rgb is not None and suggestion.picture.rgb.shape == (64, 96, 3)
+    assert found[0].score > 0.6
+    eyes = np.array([s.settings.position for s in found])
+    assert all(np.linalg.norm(a - b) >= 0.2 for i, a in enumerate(eyes) for b in eyes[:i])
+    done = [looks for looks, _ in told]
+    assert done == sorted(done) and done[-1] == told[-1][1]
+
+
+def test_a_seed_gives_the_same_search_again(env: Any) -> None:
+    def first(seed: int) -> CameraSettings:
+        space = SearchSpace(("cube",), LOW, HIGH, LENS, candidates=4, best=1, seed=seed)
+        return suggest_cameras(env, space, [0])[0].settings
+
+    assert first(1) == first(1) != first(2)
+
+
+def test_a_search_that_is_cancelled_ends_at_once_with_what_it_has(env: Any) -> None:
+    looks: list[int] = []
+    space = SearchSpace(("cube",), LOW, HIGH, LENS, candidates=1000)
+    assert (
+        suggest_cameras(
+            env, space, [0], progress=lambda done, total: looks.append(done), cancelled=lambda: len(looks) > 4
+        )
+        == ()
+    )
+    assert len(looks) == 6, "five looks, and the last word"
+
+
+def test_a_placement_that_sees_nothing_is_not_offered(env: Any) -> None:
+    under_the_table = SearchSpace(("cube",), (0, 0, -0.5), (0, 0, -0.5), LENS, candidates=4)
+    assert suggest_cameras(env, under_the_table, [0]) == ()
+
+
+@pytest.mark.parametrize(
+    ("objects", "says"),
+    [
+        (("dragon",), "no object 'dragon'.*cube"),
+        (("panda",), "is the robot"),
+        (("ground",), "no object 'ground'"),
+    ],
+)
+def test_what_cannot_be_searched_for_is_refused_by_name(env: Any, objects: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        suggest_cameras(env, SearchSpace(objects, LOW, HIGH, LENS), [0])
+
+
+def test_a_space_that_says_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="below its high"):
+        SearchSpace(("cube",), HIGH, LOW, LENS).check()
+    with pytest.raises(ValueError, match="at least one object"):
+        SearchSpace((), LOW, HIGH, LENS).check()
+
+
+def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_its_picture_upright(
+    env: Any,
+) -> None:
+    mount, low, high = "panda/panda_hand", (-0.12, -0.12, -0.05), (0.12, 0.12, 0.1)
+    # Its picture's top is towards the hand's x.
+    lens = replace(LENS, quaternion=(math.sqrt(0.5), 0, -math.sqrt(0.5), 0), fov=1.4)
+    assert np.allclose(axes_of(lens.quaternion)[0], [0, 0, 1])
+    space = SearchSpace(("cube",), low, high, lens, candidates=12, best=1, mount=mount)
+    (found,) = suggest_cameras(env, space, range(N))
+    eye = np.array(found.settings.position)
+    assert (eye >= low).all() and (eye <= high).all()
+    forward, left, up = axes_of(found.settings.quaternion)
+    assert abs(left @ axes_of(lens.quaternion)[2]) < 1e-6 and up @ axes_of(lens.quaternion)[2] > 0
+    assert np.allclose(np.cross(np.subtract(found.target, eye), forward), 0, atol=1e-6)
+    placement = Placement(found.settings, mount=mount)
+    again = judged(env, placement, found.report.judged_size)
+    assert score_of(again, ("cube",)) == pytest.approx(found.score, abs=1e-6) and found.score > 0.1
+    with pytest.raises(ValueError, match="no body 'panda/tail'"):
+        suggest_cameras(env, replace(space, mount="panda/tail"), [0])
+
+
+def test_one_link_of_an_articulation_can_be_what_must_be_seen(env: Any) -> None:
+    assert {t.name: t.links for t in objects_to_see(env) if not t.robot} == {"cube": (), "goal_region": ()}
+    valves = batched("RotateValveLevel0-v1", 1, render=True)
+    try:
+        valves.reset(seed=1)
+        (valve,) = (thing for thing in objects_to_see(valves) if not thing.robot)
+        assert valve.links == ("valve_station/mount", "valve_station/valve")
+        space = SearchSpace(valve.links[1:], (-0.5, -0.5, 0.1), (0.5, 0.5, 0.6), LENS, candidates=6, best=1)
+        (found,) = suggest_cameras(valves, space, [0])
+        assert [thing.name for thing in found.report.wanted_objects(space.objects)] == ["valve_station/valve"]
+    finally:
+        valves.close()
+
+
+def test_the_robots_hand_can_be_what_must_be_seen_and_the_rest_of_the_robot_hides_it(env: Any) -> None:
+    (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
+    assert set(robot.links[:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger", "panda/panda_hand"}
+    assert "panda/panda_hand_tcp" not in robot.links, "it has nothing to be seen"
+    hand = "panda/panda_hand"
+    space = SearchSpace((hand, "cube"), LOW, HIGH, LENS, candidates=16, best=1)
+    (found,) = suggest_cameras(env, space, range(N))
+    seen = {thing.name: thing for thing in found.report.wanted_objects(space.objects)}
+    assert set(seen) == {hand, "cube"} and found.picture.segmentation is not None
+    number = next(n for n, name in segmentation_names(env).items() if name == hand)
+    e = found.report.envs.index(found.picture.env)
+    # Counted in a smaller picture, of which each pixel stands for some of the camera's own.
+    assert (found.picture.segmentation == number).sum() == pytest.approx(seen[hand].pixels[e], rel=0.4)
+    # From behind the arm's base less of the hand is left to see than if the arm were not there.
+    behind = SearchSpace((hand,), (-1.2, 0.0, 0.2), (-1.2, 0.0, 0.2), LENS, candidates=1, best=1)
+    for thing in suggest_cameras(env, behind, range(N))[0].report.wanted_objects((hand,)):
+        assert (thing.pixels < thing.alone).all() and (thing.hidden_share > 0).all()

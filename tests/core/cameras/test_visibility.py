@@ -1,0 +1,280 @@
+"""What a camera sees of the task's objects: against ManiSkill's own segmentation, and without a trace."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import sapien
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from tests.drive.envs import batched
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.core.cameras.conventions import LookAt, compose, pose_from_look_at, relative_to, with_pose
+from workbench.core.cameras.render import cameras_of, list_cameras, segmentation_names, take_pictures
+from workbench.core.cameras.report import CameraReport, ObjectSeen, join_reports
+from workbench.core.cameras.visibility import (
+    Placement,
+    judge_placement,
+    list_objects,
+    objects_to_see,
+    placement_of,
+    settings_of,
+    small_size,
+)
+from workbench.core.scene.scene_index import read_poses, scene_index
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+N = 3
+SENSOR: CameraKey = ("sensor", "base_camera")
+PEOPLE: CameraKey = ("human", "render_camera")
+FAR_FLOOR = LookAt((-1.5, 0.0, 0.5), (0.0, 0.0, 0.3))
+
+
+def judge_camera(
+    env: Any, camera: CameraKey, e: int, settings: CameraSettings | None = None, **how: Any
+) -> CameraReport:
+    return judge_placement(env, e, placement_of(env, camera, e, settings), **how)
+
+
+def built(task: str, **kwargs: Any) -> Any:
+    env = batched(task, N, render=True, **{"obs_mode": "rgb+depth+segmentation", **kwargs})
+    env.reset(seed=3)
+    shape: Any = env.action_space.shape
+    env.step(torch.zeros(shape))
+    return env
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    """The cube to push; sensors with a shader that is not the one that is used to judge."""
+    made = built("PushCube-v1", sensor_configs={"shader_pack": "default"})
+    yield made
+    made.close()
+
+
+def looking(look_at: LookAt, **others: Any) -> CameraSettings:
+    plain = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 64, 64, 0.01, 100, "minimal")
+    return with_pose(replace(plain, **others), pose_from_look_at(look_at))
+
+
+def in_all_envs(env: Any, placement: Placement) -> CameraReport:
+    return join_reports([judge_placement(env, e, placement) for e in range(N)])
+
+
+def cube_at(env: Any, e: int) -> Any:
+    return env.obj.pose.p[e].tolist()
+
+
+def seen(report: CameraReport, name: str) -> ObjectSeen:
+    return next(thing for thing in report.objects if thing.name == name)
+
+
+def test_objects_are_told_from_robot_and_room(env: Any) -> None:
+    objects = {thing.name: thing for thing in list_objects(env)}
+    assert set(objects) == {"cube", "goal_region", "table-workspace", "ground", "panda"}
+    assert [name for name, thing in objects.items() if thing.robot] == ["panda"]
+    assert {name for name, thing in objects.items() if thing.scenery} == {"table-workspace", "ground"}
+    assert len(objects["panda"].bodies) > 10 and len(objects["cube"].bodies) == 1
+
+
+def test_of_a_robot_its_hand_comes_first_and_what_is_near_its_tool_before_the_rest(env: Any) -> None:
+    (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
+    hand, *fingers, wrist = (name.removeprefix("panda/panda_") for name in robot.links[:4])
+    assert hand == "hand" and {*fingers} == {"leftfinger", "rightfinger"} and wrist == "link7"
+
+
+def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:
+    report = join_reports([judge_camera(env, SENSOR, e) for e in range(N)])
+    images = env.get_obs(env.get_info())["sensor_data"]["base_camera"]
+    cube = segmentation_names(env)
+    number = next(number for number, name in cube.items() if name == "cube")
+    for e in range(N):
+        segmentation = images["segmentation"][e, ..., 0].numpy()
+        assert seen(report, "cube").pixels[e] == (segmentation == number).sum() > 10
+        depth = images["depth"][e, ..., 0].numpy() / 1000
+        assert report.depth.background[e] == pytest.approx((segmentation == 0).mean(), abs=1e-6)
+        assert report.depth.counts[e].sum() == (segmentation != 0).sum()
+        assert report.depth.nearest[e] == pytest.approx(depth[segmentation != 0].min(), abs=0.002)
+    summary = seen(report, "cube").summary()
+    assert (summary.present, summary.seen, summary.cut) == (N, 1.0, 0.0)
+    assert summary.median_pixels == np.median(seen(report, "cube").pixels)
+    assert report.size == report.judged_size == (128, 128) and report.envs == (0, 1, 2)
+
+
+def test_judging_leaves_no_trace(env: Any) -> None:
+    def state() -> list[Any]:
+        scenes = env.scene.sub_scenes
+        bodies = [b for s in scenes for b in s.render_system.render_bodies]
+        return [
+            [(s.physx_system.pack(), s.pack_poses(), [e.per_scene_id for e in s.entities]) for s in scenes],
+            [(b.visibility, len(s.render_system.cameras)) for s in scenes for b in bodies],
+            [settings_of(camera, e) for camera in cameras_of(env).values() for e in range(N)],
+            sapien.render.get_camera_shader_dir(),
+            [
+                (p.rgb.tobytes(), p.depth.tobytes(), p.segmentation.tobytes())  # type: ignore[union-attr]
+                for e in range(N)
+                for p in take_pictures(
+                    env,
+                    e,
+                    [(name, kind, ("rgb", "depth", "segmentation")) for kind, name in (SENSOR, PEOPLE)],
+                )
+            ],
+        ]
+
+    before = state()
+    poses = read_poses(env)
+    poses[..., 2] += 0.1
+    for e in range(N):
+        judge_camera(env, SENSOR, e, settings=looking(FAR_FLOOR), poses=poses[e])
+    judge_camera(env, PEOPLE, 1, size=(32, 32))
+    judge_placement(env, 0, Placement(looking(FAR_FLOOR), mount="panda/panda_hand"))
+    with pytest.raises(ValueError, match="no body 'nothing'"):
+        judge_placement(env, 0, Placement(looking(FAR_FLOOR), mount="nothing"))
+    assert state() == before
+
+
+def test_what_the_robot_stands_before_is_said(env: Any) -> None:
+    # From behind the robot's base, at the height of the cube: the base is in the way.
+    x, y, z = cube_at(env, 0)
+    behind = looking(LookAt((-1.2, 0.0, z + 0.05), (x, y, z)), fov=0.6)
+    above = looking(LookAt((x, y, 0.5), (x, y, 0.0)), fov=0.6)
+    report = judge_placement(env, 0, Placement(behind))
+    cube = seen(report, "cube")
+    assert cube.pixels[0] == 0 and cube.unhindered[0] > 5 and cube.hidden_share[0] == 1
+    assert cube.summary().wholly_hidden == 1 and report.env_marks(["cube"])[0] == 0
+    free = judge_placement(env, 0, Placement(above))
+    cube = seen(free, "cube")
+    assert cube.pixels[0] == cube.unhindered[0] > 50 and cube.hidden_share[0] == 0 and not cube.cut[0]
+    assert free.env_marks(["cube"])[0] > 0.7 and 0.3 < cube.margin[0] < 0.5
+
+
+def test_what_stands_behind_another_object_is_said(env: Any) -> None:
+    # From under the table: the table is in the way, and the robot is not.
+    x, y, z = cube_at(env, 0)
+    report = judge_placement(env, 0, Placement(looking(LookAt((x + 0.02, y, -0.3), (x, y, z)))))
+    cube = seen(report, "cube")
+    assert cube.unhindered[0] == cube.pixels[0] == 0 and cube.alone[0] > 20 and cube.covered_share[0] == 1
+    assert cube.summary().covered == 1 and cube.summary().wholly_hidden == 0
+
+
+def test_a_cut_object_and_one_out_of_view_are_told_apart(env: Any) -> None:
+    x, y, z = cube_at(env, 1)
+    beside = judge_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 0.2, 0)), fov=0.9)))
+    away = judge_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 2, 0)), fov=0.9)))
+    assert seen(beside, "cube").cut[0] and seen(beside, "cube").pixels[0] > 0
+    assert not seen(away, "cube").cut[0] and seen(away, "cube").pixels[0] == 0
+    assert np.isnan(seen(away, "cube").hidden_share[0]) and seen(away, "cube").summary().seen == 0
+
+
+def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stops_short_of_it_is_not(
+    env: Any,
+) -> None:
+    x, y, _ = cube_at(env, 1)
+    # Straight down from 0.4 m a pixel is 5 mm wide, and the picture is not square.
+    down = looking(LookAt((x, y, 0.4), (x, y, 0.0)), width=48, height=40, fov=0.5)
+
+    def from_there(axis: int, by: float) -> ObjectSeen:
+        at = np.array([x, y, 0.4])
+        at[axis] += by
+        position: Any = tuple(map(float, at))
+        return seen(judge_placement(env, 1, Placement(replace(down, position=position))), "cube")
+
+    for axis in (0, 1):
+        for side in (-1, 1):
+            assert not from_there(axis, 0).cut[0] and from_there(axis, side * 0.2).alone[0] == 0
+            whole, cut = 0.0, 0.13
+            while cut - whole > 0.002:
+                middle = (whole + cut) / 2
+                thing = from_there(axis, side * middle)
+                whole, cut = (whole, middle) if thing.cut[0] or thing.alone[0] == 0 else (middle, cut)
+            # Just before it is cut there is one row of pixels between it and the border.
+            near, over = from_there(axis, side * whole), from_there(axis, side * cut)
+            assert near.margin[0] == pytest.approx(1 / 40) and over.margin[0] == 0, (axis, side)
+            assert over.alone[0] > 0.5 * near.alone[0] > 10
+
+
+def test_a_smaller_picture_has_the_same_view_and_counts_the_cameras_own_pixels(env: Any) -> None:
+    x, y, _ = cube_at(env, 0)
+    settings = looking(LookAt((x - 0.3, y, 0.5), (x, y, 0)), width=320, height=200, fov=0.8)
+    whole = judge_placement(env, 0, Placement(settings))
+    for size in [(160, 100), (64, 64), small_size(320, 200)]:
+        small = judge_placement(env, 0, Placement(settings), size=size)
+        assert (small.size, small.judged_size) == ((320, 200), size)
+        assert seen(small, "cube").pixels[0] == pytest.approx(seen(whole, "cube").pixels[0], rel=0.15)
+        assert_allclose(small.depth.background, whole.depth.background, atol=0.03)
+    assert small_size(320, 200) == (102, 64) and small_size(20, 40) == (20, 40)
+
+
+def test_depth_says_background_far_floor_and_where_the_planes_may_stand(env: Any) -> None:
+    report = in_all_envs(env, Placement(looking(FAR_FLOOR)))
+    depth = report.depth
+    assert (depth.background > 0.2).all() and (depth.beyond > 0.05).all()
+    assert (depth.farthest_object < 3).all()
+    near, far = depth.suggested_near, depth.suggested_far
+    assert near is not None and far is not None
+    assert near <= depth.nearest.min() and depth.farthest_object.max() < far < 5
+    tighter = in_all_envs(env, Placement(looking(FAR_FLOOR, near=near, far=far)))
+    assert_array_equal(seen(tighter, "cube").pixels, seen(report, "cube").pixels)
+    assert (tighter.depth.background > depth.background).all()
+
+
+def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
+    hand = scene_index(env).names.index("panda/panda_hand")
+    poses = read_poses(env)
+    x, y, _ = cube_at(env, 0)
+    world = pose_from_look_at(LookAt((x, y - 0.1, 0.4), (x, y, 0.0)))
+    local = relative_to(poses[0, hand], world)
+    mounted = Placement(with_pose(looking(FAR_FLOOR), local), mount="panda/panda_hand")
+    for e in range(N):
+        there = Placement(with_pose(looking(FAR_FLOOR), compose(poses[e, hand], local)))
+        ridden, still = judge_placement(env, e, mounted), judge_placement(env, e, there)
+        assert_array_equal(seen(ridden, "cube").pixels, seen(still, "cube").pixels)
+
+
+def test_a_moment_of_the_past_is_judged_where_its_bodies_were(env: Any) -> None:
+    cube = scene_index(env).names.index("cube")
+    past = read_poses(env)
+    past[:, cube, :3] += [0.0, 5.0, 0.0]
+    assert (seen(judge_camera(env, SENSOR, 0, poses=past[0]), "cube").pixels == 0).all()
+    assert (seen(judge_camera(env, SENSOR, 0), "cube").pixels > 0).all()
+
+
+def test_reports_are_joined_and_the_worst_env_comes_first(env: Any) -> None:
+    past = read_poses(env)
+    past[:, scene_index(env).names.index("cube"), :3] += [0.0, 5.0, 0.0]
+    now, last = judge_camera(env, SENSOR, 0), judge_camera(env, SENSOR, 2)
+    then = judge_camera(env, SENSOR, 1, poses=past[1])
+    both = join_reports([now, last, then])
+    assert both.envs == (0, 2, 1) and both.worst_first()[0] == 2
+    assert both.pictures == now.pictures + last.pictures + then.pictures
+    assert seen(both, "cube").summary().seen == pytest.approx(2 / 3)
+    with pytest.raises(ValueError, match="different"):
+        join_reports([now, judge_camera(env, PEOPLE, 0, size=(32, 32))])
+    with pytest.raises(ValueError, match="no object dragon"):
+        both.env_marks(["dragon"])
+
+
+def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> None:
+    env = built("PickCube-v1")
+    sensor, people = judge_camera(env, SENSOR, 0), judge_camera(env, PEOPLE, 0, size=(128, 128))
+    assert seen(sensor, "goal_site").never_drawn and seen(sensor, "goal_site").pixels[0] == 0
+    assert not seen(people, "goal_site").never_drawn and seen(people, "goal_site").pixels[0] > 0
+    assert [thing.name for thing in sensor.wanted_objects()] == ["cube"]
+    assert {thing.name for thing in people.wanted_objects()} == {"cube", "goal_site"}
+    env.close()
+
+
+def test_what_cannot_be_judged_is_refused_by_name(env: Any) -> None:
+    with pytest.raises(ValueError, match=r"base_camera \(sensor\)"):
+        judge_camera(env, ("sensor", "nothing"), 0)
+    with pytest.raises(IndexError, match="out of range for 3"):
+        judge_camera(env, SENSOR, N)
+    with pytest.raises(ValueError, match="near plane"):
+        judge_placement(env, 0, Placement(looking(FAR_FLOOR, near=2.0, far=1.0)))
+    assert {c.name for c in list_cameras(env)} == {"base_camera", "render_camera"}

@@ -1,0 +1,189 @@
+"""What the inspectors read, against SAPIEN's own objects and ManiSkill's own tensors."""
+
+# ManiSkill annotates an env's members as the widest thing they may be.
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
+# pyright: reportOptionalIterable=false, reportOptionalSubscript=false, reportGeneralTypeIssues=false
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import mani_skill.envs  # noqa: F401 (registers the tasks)
+import numpy as np
+import pytest
+import torch
+
+from tests.drive.envs import PICK_CUBE, batched
+from workbench.core import maniskill_private
+from workbench.core.capture.inspect_env import MOST_VALUES, inspect_env
+from workbench.core.capture.inspection import SECTIONS, Inspection
+from workbench.core.env import actions
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.scene.scene_index import scene_index
+from workbench.core.simulation.cpu_system import batched_system
+
+
+def opened(task: str | type, num_envs: int = 3, steps: int = 4, **kwargs: Any) -> TaskEnv:
+    env = TaskEnv(batched(task, num_envs, **kwargs))
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        env.step(actions.random_action(env.parts, num_envs, rng))
+    return env
+
+
+def by_name(leaves: Any) -> dict[str, np.ndarray]:
+    return {leaf.name: leaf.values.reshape(leaf.shape) for leaf in leaves}
+
+
+@pytest.fixture(scope="module")
+def pick() -> TaskEnv:
+    return opened("PickCube-v1")
+
+
+def test_joints_are_those_of_sapien(pick: TaskEnv) -> None:
+    robots = pick.env.agent.robot
+    for env in range(3):
+        own = maniskill_private.objects_of(robots)[env]
+        [read] = inspect_env(pick, env, ["joints"]).joints
+        assert read.articulation == "panda" and read.names[0] == "panda_joint1" and len(read.names) == 9
+        np.testing.assert_array_equal(read.position, own.qpos)
+        np.testing.assert_array_equal(read.velocity, own.qvel)
+        np.testing.assert_allclose(np.stack([read.low, read.high], 1), own.qlimits, rtol=1e-6)
+        np.testing.assert_array_equal(read.target, [joint.drive_target[0] for joint in own.active_joints])
+    assert not np.array_equal(
+        inspect_env(pick, 0, ["joints"]).joints[0].position,
+        inspect_env(pick, 1, ["joints"]).joints[0].position,
+    )
+
+
+def test_a_joint_without_a_drive_has_no_target() -> None:
+    cartpole = opened("MS-CartpoleBalance-v1")
+    [read] = inspect_env(cartpole, 1, ["joints"]).joints
+    own = maniskill_private.objects_of(cartpole.env.agent.robot)[1].active_joints
+    for i, joint in enumerate(own):
+        assert np.isnan(read.target[i]) == (joint.stiffness == 0)
+    assert "prismatic" in read.kinds and any("revolute" in kind for kind in read.kinds)
+
+
+def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
+    for env in range(3):
+        own: dict[frozenset[str], np.ndarray] = {}
+        for contact in batched_system(pick.env.scene).systems[env].get_contacts():
+            first, second = (str(scene_index(pick.env).name_of(body)) for body in contact.bodies)
+            impulse = sum((np.array(point.impulse) for point in contact.points), np.zeros(3))
+            sign = 1 if first <= second else -1
+            pair = frozenset((first, second))
+            own[pair] = own.get(pair, np.zeros(3)) + sign * impulse
+        touching = {pair: impulse for pair, impulse in own.items() if np.any(impulse)}
+        read = inspect_env(pick, env, ["contacts"]).contacts
+        assert touching.keys() <= {frozenset(pair.bodies) for pair in read}
+        for pair in read:
+            np.testing.assert_allclose(pair.impulse, own[frozenset(pair.bodies)], atol=1e-6)
+            np.testing.assert_allclose(pair.forces.sum(axis=0), pair.force, rtol=1e-4, atol=1e-5)
+            assert pair.points.shape == pair.forces.shape
+    cube = next(pair for pair in inspect_env(pick, 0, ["contacts"]).contacts if "cube" in pair.bodies)
+    # The table holds the cube up.
+    weight = 9.81 * float(pick.env.cube.mass[0])
+    sign = 1 if cube.bodies[0] == "cube" else -1
+    assert sign * cube.force[2] == pytest.approx(weight, rel=0.05)
+
+
+def test_a_flat_observation_is_taken_apart_under_the_names_it_was_made_of(pick: TaskEnv) -> None:
+    for env in (0, 2):
+        read = by_name(inspect_env(pick, env, ["observation"]).observation)
+        assert (
+            np.concatenate([values.reshape(-1) for values in read.values()]).tolist()
+            == pick.obs[env].tolist()
+        )
+        np.testing.assert_array_equal(read["agent/qpos"], pick.env.agent.robot.get_qpos()[env])
+        np.testing.assert_array_equal(read["extra/obj_pose"], pick.env.cube.pose.raw_pose[env])
+        assert read["extra/is_grasped"].shape == (1,)
+
+
+def test_a_dict_of_observations_is_shown_as_it_is() -> None:
+    nested = opened("PickCube-v1", num_envs=2, obs_mode="state_dict")
+    leaves = inspect_env(nested, 1, ["observation"]).observation
+    assert by_name(leaves)["extra/goal_pos"].tolist() == nested.obs["extra"]["goal_pos"][1].tolist()
+    assert {leaf.name: leaf.dtype for leaf in leaves}["extra/is_grasped"] == "bool"
+
+
+def test_the_state_dict_is_taken_apart_by_what_its_numbers_are(pick: TaskEnv) -> None:
+    state = pick.env.get_state_dict()
+    read = by_name(inspect_env(pick, 1, ["state"]).state)
+    np.testing.assert_array_equal(read["actors/cube/p"], state["actors"]["cube"][1, :3])
+    np.testing.assert_array_equal(read["actors/cube/w"], state["actors"]["cube"][1, 10:13])
+    np.testing.assert_array_equal(read["articulations/panda/qvel"], state["articulations"]["panda"][1, -9:])
+
+
+def test_looking_does_not_change_how_the_episode_goes_on() -> None:
+    class Counting(PICK_CUBE):
+        """Its hooks draw random numbers and count, as some tasks' do."""
+
+        asked = 0
+
+        def evaluate(self) -> dict:
+            self.asked += 1
+            return super().evaluate()
+
+        def _get_obs_extra(self, info: dict) -> dict:
+            noise = torch.rand(self.num_envs, 1)
+            count = torch.full((self.num_envs, 1), float(self.asked))
+            return {**super()._get_obs_extra(info), "noise": noise, "count": count}
+
+    ends = []
+    for looks in (False, True):
+        env = opened(Counting, steps=0)
+        torch.manual_seed(0)
+        rng = np.random.default_rng(1)
+        for _ in range(5):
+            step = env.step(actions.random_action(env.parts, 3, rng))
+            if looks:
+                read = by_name(inspect_env(env, 1, SECTIONS).observation)
+                assert read["extra/noise"] == env.obs[1, -2]
+        ends.append((step.poses, env.obs))
+    for plain, looked in zip(*ends, strict=True):
+        np.testing.assert_array_equal(plain, looked)
+
+
+def test_only_what_is_asked_is_read_and_it_crosses_a_pipe_without_torch(pick: TaskEnv) -> None:
+    read = inspect_env(pick, 2, ["joints"])
+    assert read.joints and read.observation is read.state is read.contacts is None
+    assert (read.env, read.elapsed_steps) == (2, 4)
+    whole = pickle.dumps(inspect_env(pick, 0, SECTIONS))
+    assert b"torch" not in whole and b"sapien" not in whole and b"mani_skill" not in whole
+    assert isinstance(pickle.loads(whole), Inspection)
+    assert len(whole) < 20_000
+
+
+def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> None:
+    class Broken(PICK_CUBE):
+        def get_state_dict(self) -> Any:
+            if getattr(self, "broken", False):
+                raise KeyError("goal")
+            return super().get_state_dict()
+
+    task = opened(Broken, num_envs=1)
+    task.env.broken = True
+    read = inspect_env(task, 0, SECTIONS)
+    assert read.state is None and dict(read.refused) == {"state": "reading it raised KeyError: 'goal'"}
+    assert read.joints and read.observation
+
+
+def test_large_arrays_are_told_by_their_range() -> None:
+    class Wide(PICK_CUBE):
+        def _get_obs_extra(self, info: dict) -> dict:
+            grid = self.cube.pose.p.new_zeros(self.num_envs, 10 * MOST_VALUES)
+            grid[:, -1] = 7
+            return {"grid": grid}
+
+    leaves = inspect_env(opened(Wide, num_envs=2), 1, ["observation"]).observation
+    grid = next(leaf for leaf in leaves if leaf.name == "extra/grid")
+    assert grid.shape == (10 * MOST_VALUES,) and len(grid.values) == MOST_VALUES
+    assert (grid.low, grid.high) == (0, 7)
+
+
+def test_there_is_no_such_env(pick: TaskEnv) -> None:
+    with pytest.raises(IndexError, match="out of range for 3 envs"):
+        inspect_env(pick, 3, SECTIONS)

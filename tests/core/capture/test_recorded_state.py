@@ -1,0 +1,26 @@
+"""How far one recorded state is from another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from workbench.core.capture.recorded_state import apart
+
+
+def test_a_state_is_as_far_as_its_furthest_body_and_joint() -> None:
+    cube, arm = np.zeros(13, np.float32), np.zeros(13 + 4, np.float32)
+    cube[3] = arm[3] = 1
+    was = {"actors/cube": cube, "articulations/arm": arm}
+    now = {name: state.copy() for name, state in was.items()}
+    assert apart(now, was) == (0, 0)
+    now["actors/cube"][1] = 0.25
+    now["articulations/arm"][14] = -0.5
+    now["articulations/arm"][16] = 9  # a velocity
+    assert apart(now, was) == pytest.approx((0.25, 0.5))
+
+
+@pytest.mark.parametrize("count", [12, 13, 20])
+def test_the_state_of_a_controller_is_no_pose(count: int) -> None:
+    name = "controller/arm"
+    assert apart({name: np.ones(count)}, {name: np.zeros(count)}) == (0, 0)

@@ -1,0 +1,126 @@
+"""What must be downloaded is named with its command; nothing is asked and nothing fetched."""
+
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import pytest
+from mani_skill import ASSET_DIR
+from mani_skill.agents.robots import Panda
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import assets, download_asset
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from tests.drive.envs import batched
+from workbench.core.env.assets import MissingAssets, assets_at, refuse_downloads, require_assets, robots_of
+
+NOT_HERE = "anymal_c"
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for source in assets.DATA_SOURCES.values():
+        monkeypatch.setattr(source, "output_dir", tmp_path)
+        # Some keep an absolute path, which wins over any folder.
+        if source.target_path is not None and Path(source.target_path).is_absolute():
+            monkeypatch.setattr(source, "target_path", Path(source.target_path).relative_to(ASSET_DIR))
+
+
+def test_declared_assets_are_named_with_the_command_for_each() -> None:
+    with pytest.raises(MissingAssets) as caught:
+        require_assets("PickClutter", ["ycb", "pick_clutter_ycb_configs"])
+    assert caught.value.names == ("ycb", "pick_clutter_ycb_configs")
+    for name in caught.value.names:
+        assert f"\n  python -m mani_skill.utils.download_asset {name}" in str(caught.value)
+
+
+def test_a_group_of_many_is_one_name_that_the_command_takes() -> None:
+    with pytest.raises(MissingAssets) as caught:
+        require_assets("OpenCabinet", ["partnet_mobility_cabinet"])
+    assert caught.value.names == ("partnet_mobility_cabinet",)
+    assert caught.value.names[0] in assets.DATA_GROUPS, "download_asset takes groups and single assets"
+
+
+def test_what_is_there_is_not_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(MissingAssets):
+        require_assets("PickSingleYCB", ["ycb"], "panda")
+    (tmp_path / "assets" / "mani_skill2_ycb").mkdir(parents=True)
+    require_assets("PickSingleYCB", ["ycb"], "panda")
+    require_assets("Nothing", [])
+
+
+def test_a_robot_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from mani_skill.agents.robots import ANYmalC
+
+    monkeypatch.setattr(ANYmalC, "urdf_path", str(tmp_path / "robots" / "anymal_c" / "urdf" / "anymal.urdf"))
+    for robots in (NOT_HERE, ("panda", NOT_HERE), ANYmalC):
+        with pytest.raises(MissingAssets) as caught:
+            require_assets("AnymalReach", [], robots)
+        assert caught.value.names == (NOT_HERE,)
+
+
+def test_a_path_is_looked_up_the_outermost_download_first(tmp_path: Path) -> None:
+    scenes = tmp_path / "scene_datasets" / "replica_cad_dataset"
+    assert assets_at(scenes / "configs" / "x.json") == ["ReplicaCAD"]
+    # Fetching ReplicaCAD empties its folder, so the other must be fetched after it.
+    assert assets_at(scenes / "rearrange" / "x.json") == ["ReplicaCAD", "ReplicaCADRearrange"]
+    assert assets_at(tmp_path / "scene_datasets") == []
+
+
+@pytest.mark.parametrize("answer", ["0", "1"])
+def test_a_question_and_a_download_become_errors_and_are_given_back(
+    answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MS_SKIP_ASSET_DOWNLOAD_PROMPT", answer)
+    before = download_asset.prompt_yes_no, download_asset.download
+    with pytest.raises(MissingAssets, match="download_asset ycb"), refuse_downloads("Some"):
+        download_asset.download(assets.DATA_SOURCES["ycb"])
+    with pytest.raises(MissingAssets, match="Some needs some scene"), refuse_downloads("Some"):
+        download_asset.prompt_yes_no("Some needs some scene. Would you like to download it now?")
+    assert (download_asset.prompt_yes_no, download_asset.download) == before
+
+
+def test_a_file_that_a_download_would_bring_is_looked_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.core.env.assets.ASSET_DIR", tmp_path)
+    missing = tmp_path / "scene_datasets" / "ai2thor" / "some.json"
+    with pytest.raises(MissingAssets, match="download_asset AI2THOR") as caught, refuse_downloads("Some"):
+        missing.read_text()
+    assert isinstance(caught.value.__cause__, FileNotFoundError)
+    with pytest.raises(MissingAssets, match="AI2THOR"), refuse_downloads("Some"):
+        raise RuntimeError(f"failed to load mesh {missing}.")
+
+
+def test_other_errors_pass(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), refuse_downloads("Some"):
+        (tmp_path / "of_the_author.obj").read_text()
+    with pytest.raises(ZeroDivisionError), refuse_downloads("Some"):
+        raise ZeroDivisionError
+
+
+def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path) -> None:
+    class Arm(Panda):
+        uid = "arm_that_is_not_registered"
+        urdf_path = str(tmp_path / "arm.urdf")
+
+    class Task(BaseEnv):
+        SUPPORTED_ROBOTS = None  # type: ignore[assignment]  # any
+
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            robot: Any = Arm
+            super().__init__(*args, robot_uids=robot, **kwargs)
+
+    with pytest.raises(MissingAssets, match=r"arm\.urdf does not exist.*urdf_path"):
+        batched(Task)
+
+
+def test_robots_are_those_asked_for_or_the_constructors_default() -> None:
+    push, door = REGISTERED_ENVS["PushCube-v1"].cls, REGISTERED_ENVS["PickCubeWidowXAI-v1"].cls
+    assert robots_of(push, {}) == "panda"
+    assert robots_of(push, {"robot_uids": "fetch"}) == "fetch"
+    assert robots_of(door, {}) is None, "it hands on another one than the constructor that it overrides"

@@ -1,0 +1,231 @@
+"""Poses of all bodies as one array, against what ManiSkill's own structs say."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from typing import Any
+
+import mani_skill.envs  # noqa: F401 (registers the tasks)
+import numpy as np
+import pytest
+import sapien
+import torch
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+from mani_skill.utils.structs import Actor, Pose
+
+from tests.drive.envs import batched, stock
+from workbench.core.scene.scene_index import hidden_poses, read_poses, scene_index
+
+TASKS = ["PickCube-v1", "PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"]
+
+
+def begun(env: Any) -> Any:
+    env.reset(seed=1)
+    return env
+
+
+def assert_poses_are_those_of_the_structs(env: Any) -> None:
+    table, poses = scene_index(env), read_poses(env)
+    assert poses.shape == (env.num_envs, len(table.names), 7) and poses.dtype == np.float32
+    checked = np.zeros(poses.shape[:2], bool)
+    named = {**env.scene.actors, **env.scene.actor_views}
+    for name, articulation in env.scene.articulations.items():
+        named.update({f"{name}/{link.name}": link for link in articulation.links})
+    for body, name in enumerate(table.names):
+        struct = named[name]
+        envs = struct._scene_idxs.numpy()
+        np.testing.assert_array_equal(poses[envs, body], struct.pose.raw_pose.numpy(), err_msg=name)
+        checked[envs, body] = True
+    np.testing.assert_array_equal(checked, ~np.isnan(poses).any(axis=-1))
+
+
+@pytest.mark.parametrize("make", [stock, batched])
+@pytest.mark.parametrize("task", TASKS)
+def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
+    env = make(task)
+    table = scene_index(env)
+    assert len(set(table.names)) == len(table.names)
+    for _ in range(3):
+        env.step(torch.from_numpy(np.atleast_2d(env.action_space.sample())))
+        assert_poses_are_those_of_the_structs(env)
+    env.reset(seed=2)
+    # PegInsertionSide makes new pegs for every episode of a single env.
+    assert_poses_are_those_of_the_structs(env)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_poses_are_those_of_the_physics(task: str) -> None:
+    """Against the entities themselves, which know nothing of ManiSkill's tensors."""
+    env = begun(batched(task, 4))
+    table = scene_index(env)
+    env.step(torch.from_numpy(env.action_space.sample()))
+    env.reset(options={"env_idx": torch.tensor([1, 3])})
+    poses = read_poses(env)
+    for e in range(env.num_envs):
+        for b in range(len(table.names)):
+            pose = table.entities[e, b].pose
+            np.testing.assert_allclose(poses[e, b], [*pose.p, *pose.q], atol=1e-6, err_msg=table.names[b])
+    env.close()
+
+
+def test_names_are_readable_and_kinds_are_right() -> None:
+    env = begun(stock("PickCube-v1"))
+    table = scene_index(env)
+    kind = dict(zip(table.names, table.kinds, strict=True))
+    assert kind["cube"] == "dynamic" and kind["ground"] == "static" and kind["goal_site"] == "kinematic"
+    assert kind["panda/panda_hand"] == "link"
+    assert [n for n, h in zip(table.names, table.hidden, strict=True) if h] == ["goal_site"]
+    env.close()
+
+
+def test_objects_that_differ_between_envs_are_one_body() -> None:
+    env = begun(batched("PegInsertionSide-v1", 4))
+    table = scene_index(env)
+    assert "peg" in table.names and "box_with_hole" in table.names
+    assert not [name for name in table.names if name.startswith("peg_")]
+    assert not np.isnan(read_poses(env)).any()
+    env.close()
+
+
+def test_a_hidden_body_is_where_it_would_be_seen() -> None:
+    env: Any = begun(batched("PickCube-v1", 4))
+    table = scene_index(env)
+    goal = table.names.index("goal_site")
+    shown = read_poses(env)
+    env.goal_site.hide_visual()
+    np.testing.assert_array_equal(read_poses(env), shown)
+    env.reset(seed=5)
+    moved = read_poses(env)
+    assert np.abs(moved[:, goal, :3]).max() < 2.0
+    assert (moved[:, goal, :3] != shown[:, goal, :3]).any()
+    env.goal_site.show_visual()
+    np.testing.assert_array_equal(read_poses(env), moved)
+    env.close()
+
+
+class MarkerFirst(PushCubeEnv):
+    """Nothing stands before its marker among the bodies."""
+
+    def _load_scene(self, options: dict) -> None:
+        builder = self.scene.create_actor_builder()
+        builder.add_sphere_visual(radius=0.02)
+        builder.initial_pose = Pose.create(sapien.Pose([0.3, 0.3, 1.0]))
+        self.marker = builder.build_kinematic(name="marker")
+        super()._load_scene(options)
+
+
+def test_the_first_body_of_all_may_be_hidden_too() -> None:
+    env: Any = begun(batched(MarkerFirst, 3))
+    assert scene_index(env).names[0] == "marker"
+    shown = read_poses(env)
+    env.marker.hide_visual()
+    np.testing.assert_array_equal(read_poses(env), shown)
+    env.close()
+
+
+class SparseBodiesEnv(PushCubeEnv):
+    """A body that only envs 0 and 2 have, and a view over two bodies of the same env."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+
+        def ball(name: str, scene_idxs: list[int] | None = None) -> Actor:
+            builder = self.scene.create_actor_builder()
+            builder.add_sphere_collision(radius=0.02)
+            builder.initial_pose = Pose.create(sapien.Pose([0.3, 0.3, 1.0 + 0.1 * len(name)]))
+            builder.set_scene_idxs(scene_idxs)
+            return builder.build_dynamic(name=name)
+
+        self.rare = ball("rare", list(range(0, self.num_envs, 2)))
+        self.pair = Actor.merge([ball("left"), ball("right")], name="pair")
+
+
+def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
+    env = begun(batched(SparseBodiesEnv, 4))
+    table = scene_index(env)
+    missing = np.isnan(read_poses(env)).all(axis=-1)
+    assert np.argwhere(missing).tolist() == [[1, table.names.index("rare")], [3, table.names.index("rare")]]
+    assert_poses_are_those_of_the_structs(env)
+    env.close()
+
+
+def test_a_view_over_two_bodies_of_one_env_leaves_them_their_names() -> None:
+    env = begun(batched(SparseBodiesEnv, 2))
+    table = scene_index(env)
+    assert {"left", "right"} < set(table.names) and "pair" not in table.names
+    env.close()
+
+
+def test_a_stock_env_may_gain_an_entity() -> None:
+    env = begun(stock("PushCube-v1"))
+    before = read_poses(env)
+    env.scene.sub_scenes[0].add_entity(sapien.Entity())
+    np.testing.assert_array_equal(read_poses(env), before)
+    env.close()
+
+
+def test_a_scene_is_looked_over_once_and_a_new_one_anew() -> None:
+    env = begun(batched("PickCube-v1", 2))
+    before = scene_index(env)
+    env.step(torch.from_numpy(env.action_space.sample()))
+    assert scene_index(env) is before
+    env.reset(seed=0, options={"reconfigure": True})
+    after = scene_index(env)
+    assert after is not before and after.names == before.names
+    assert not {id(e) for e in after.entities.ravel()} & {id(e) for e in before.entities.ravel()}
+    assert_poses_are_those_of_the_structs(env)
+    env.close()
+
+
+def test_what_is_known_of_a_scene_goes_with_it() -> None:
+    env = begun(batched("PickCube-v1", 2))
+    scene, index = weakref.ref(env.scene), weakref.ref(scene_index(env))
+    env.close()
+    del env
+    gc.collect()
+    assert scene() is None and index() is None
+
+
+def test_what_is_hidden_is_told_where_it_is_and_can_be_moved_there() -> None:
+    env: Any = begun(batched("PickCube-v1", 3))
+    index, goal = scene_index(env), scene_index(env).names.index("goal_site")
+    env.goal_site.show_visual()
+    assert list(hidden_poses(env)) == []
+    shown = read_poses(env)[:, goal]
+    env.goal_site.hide_visual()
+    ((slots, poses),) = hidden_poses(env)
+    assert (slots // len(index.names)).tolist() == [0, 1, 2] and (slots % len(index.names) == goal).all()
+    np.testing.assert_array_equal(poses, shown)
+    poses[1, 2] += 0.5
+    assert (env.goal_site.pose.p[:, 2].numpy() - shown[:, 2]).tolist() == pytest.approx([0, 0.5, 0], abs=1e-6)
+    env.close()
+
+
+@pytest.mark.parametrize("make", [stock, batched])
+def test_names_of_states_are_those_of_the_state_dict(make: Any) -> None:
+    env = begun(make("PegInsertionSide-v1"))
+    said = env.get_state_dict()
+    names = [f"{group}/{name}" for group in ("actors", "articulations") for name in said[group]]
+    assert list(scene_index(env).states) == names
+    env.close()
+
+
+def test_a_body_knows_its_actor_or_articulation() -> None:
+    env = begun(stock("RotateValveLevel0-v1"))
+    index = scene_index(env)
+    of = dict(zip(index.names, index.owners, strict=True))
+    assert of["valve_station/valve"] == "valve_station" and of["ground"] == "ground"
+    (link,) = env.valve_link._objs
+    assert index.name_of(link) == index.name_of(link.entity) == "valve_station/valve"
+    assert index.name_of(sapien.Entity()) is None
+    env.close()
+
+
+def test_all_envs_in_one_sub_scene_are_refused() -> None:
+    env = begun(stock("PushCube-v1"))
+    env.scene.parallel_in_single_scene = True  # ManiSkill itself allows it only with a GPU
+    with pytest.raises(NotImplementedError, match="parallel_in_single_scene"):
+        scene_index(env)
+    env.close()

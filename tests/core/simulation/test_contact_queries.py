@@ -1,0 +1,203 @@
+"""What queries of contact impulses answer, over bare systems of boxes; `test_contacts` has stock ManiSkill as the judge."""
+
+# SAPIEN annotates vectors as arrays, and its objects by what they are in C++.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import gc
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import sapien
+import sapien.physx as physx
+import torch
+
+from workbench.core.simulation.contact_queries import ContactReader
+
+
+@dataclass(frozen=True)
+class Pile:
+    """A box lies on the ground and another on it."""
+
+    scene: sapien.Scene
+    system: physx.PhysxCpuSystem
+    ground: physx.PhysxRigidBaseComponent
+    low: physx.PhysxRigidBaseComponent
+    high: physx.PhysxRigidBaseComponent
+
+
+def pile(overhang: float) -> Pile:
+    scene = sapien.Scene([physx.PhysxCpuSystem()])
+    bodies = []
+    for half_size, at in (
+        ([1, 1, 0.1], [0, 0, -0.1]),
+        ([0.1] * 3, [0, 0, 0.1]),
+        ([0.1] * 3, [overhang, 0, 0.3]),
+    ):
+        builder = scene.create_actor_builder()
+        builder.add_box_collision(half_size=half_size)
+        builder.set_initial_pose(sapien.Pose(at))
+        entity = builder.build() if len(bodies) else builder.build_static()
+        bodies.append(entity.find_component_by_type(physx.PhysxRigidBaseComponent))
+    system = scene.physx_system
+    assert isinstance(system, physx.PhysxCpuSystem)
+    for _ in range(5):
+        system.step()
+    return Pile(scene, system, *bodies)
+
+
+@pytest.fixture
+def piles() -> list[Pile]:
+    return [pile(0.03), pile(0.06)]
+
+
+def reader_of(piles: list[Pile]) -> ContactReader:
+    return ContactReader([one.system for one in piles])
+
+
+def impulse_on(pile: Pile, body: object, by: object = None) -> np.ndarray:
+    """What stock ManiSkill sums: of every contact of the body, with the sign of an impulse on it."""
+    total = np.zeros(3)
+    for contact in pile.system.get_contacts():
+        first, second = contact.bodies
+        if body in (first, second) and (by is None or by in (first, second)):
+            total += np.sum([point.impulse for point in contact.points], axis=0) * (
+                1 if body is first else -1
+            )
+    return total
+
+
+def net(reader: ContactReader, *bodies: physx.PhysxRigidBaseComponent) -> np.ndarray:
+    query = reader.create_body_query(bodies)
+    assert query.cuda_impulses.shape == (len(bodies), 3)
+    reader.answer(query)
+    return query.cuda_impulses.torch().numpy().copy()
+
+
+def between(reader: ContactReader, *pairs: tuple) -> np.ndarray:
+    query = reader.create_pair_query(pairs)
+    assert query.cuda_impulses.shape == (len(pairs), 3)
+    reader.answer(query)
+    return query.cuda_impulses.torch().numpy().copy()
+
+
+def test_each_body_is_answered_with_the_sum_of_its_contacts_in_whichever_system_it_is(
+    piles: list[Pile],
+) -> None:
+    first, second = piles
+    bodies = [first.high, second.low, first.low, first.ground, second.high, first.high]
+    owners = [first, second, first, first, second, first]
+    found = net(reader_of(piles), *bodies)
+    expected = [impulse_on(owner, body) for owner, body in zip(owners, bodies)]
+    assert np.array_equal(found, np.float32(expected))
+    assert found[0, 2] > 0 > found[3, 2], "the upper box is held up, and the ground is pressed"
+
+
+def test_each_pair_is_answered_for_its_first_body(piles: list[Pile]) -> None:
+    first, second = piles
+    pairs = [
+        (first.low, first.high),
+        (first.high, first.low),
+        (second.low, second.ground),
+        (first.high, first.ground),
+        (first.low, first.high),
+        (first.low, second.high),
+    ]
+    found = between(reader_of(piles), *pairs)
+    assert np.array_equal(found[0], np.float32(impulse_on(first, first.low, first.high)))
+    assert np.array_equal(found[1], -found[0]) and np.array_equal(found[4], found[0]) and found[0, 2] < 0
+    assert np.array_equal(found[2], np.float32(impulse_on(second, second.low, second.ground)))
+    assert not found[3].any() and not found[5].any()
+
+
+def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
+    reader = reader_of(piles)
+    query, pairs = (
+        reader.create_body_query([piles[0].high]),
+        reader.create_pair_query([(piles[0].high, piles[0].low)]),
+    )
+    for _ in range(3):
+        piles[0].system.step()
+        reader.stepped()
+        for _ in range(2):
+            reader.answer(query)
+            reader.answer(pairs)
+        expected = np.float32(impulse_on(piles[0], piles[0].high))
+        assert np.array_equal(query.cuda_impulses.torch()[0].numpy(), expected)
+        assert np.array_equal(pairs.cuda_impulses.torch()[0].numpy(), expected)
+
+
+def test_only_contacts_that_a_query_counts_are_read(piles: list[Pile]) -> None:
+    reader, first = reader_of(piles), piles[0]
+    assert reader.counted() == []
+    query = reader.create_pair_query([(first.high, first.low)])
+    assert [set(pair) for pair, _ in reader.counted()] == [{id(first.high), id(first.low)}]
+    of_body = reader.create_body_query([first.ground])
+    assert len(reader.counted()) == 2
+    assert query.rows and of_body.rows
+    del of_body
+    gc.collect()
+    again = reader.create_body_query([first.high])
+    assert len(reader.counted()) == 1, "what a dropped query asked for costs nothing any more"
+    assert again.rows
+
+
+def test_a_new_query_counts_what_was_not_read_before_it(piles: list[Pile]) -> None:
+    reader, first = reader_of(piles), piles[0]
+    lower = reader.create_pair_query([(first.low, first.ground)])
+    reader.answer(lower)
+    assert np.array_equal(net(reader, first.high)[0], np.float32(impulse_on(first, first.high)))
+
+
+def test_a_step_is_noticed_once_it_is_told(piles: list[Pile]) -> None:
+    for tell in (ContactReader.invalidate, ContactReader.stepped):
+        reader, first = reader_of(piles), piles[0]
+        query = reader.create_body_query([first.high])
+        reader.answer(query)
+        first.high.set_linear_velocity([0, 0, 5])
+        first.system.step()
+        tell(reader)
+        reader.answer(query)
+        assert not query.cuda_impulses.torch().any(), "nothing holds it up any more"
+
+
+def test_what_is_carried_stands_for_one_systems_list_until_its_next_step(piles: list[Pile]) -> None:
+    first, second = piles
+    reader = reader_of(piles)
+    own = net(reader, first.high, second.high)
+    touch = np.float32([1, 2, 3])
+    query = reader.create_body_query([first.high, first.low, second.high])
+
+    def asked() -> list[list[float]]:
+        reader.answer(query)
+        return query.cuda_impulses.torch().tolist()
+
+    held = own[1].tolist()
+    reader.carry(0, [((id(first.high), id(first.low)), touch)])
+    assert asked() == [[1, 2, 3], [-1, -2, -3], held], "the other system's own list goes on to count"
+    reader.invalidate()
+    assert asked()[0] == [1, 2, 3], "that a pose was written is no step"
+    reader.stepped(but=[0])
+    assert asked()[0] == [1, 2, 3], "this system stood still"
+    reader.carry(1, [])
+    assert asked() == [[1, 2, 3], [-1, -2, -3], [0, 0, 0]]
+    reader.stepped(but=[1])
+    assert asked()[0] == own[0].tolist() and asked()[2] == [0, 0, 0]
+    reader.stepped()
+    assert asked()[2] == held
+
+
+def test_a_contact_of_a_body_with_itself_counts_once(piles: list[Pile]) -> None:
+    reader, body = reader_of(piles), piles[0].high
+    reader.carry(0, [((id(body), id(body)), np.float32([1, 2, 3]))])
+    assert net(reader, body).tolist() == [[1, 2, 3]]
+
+
+def test_an_answer_stays_where_the_task_keeps_it(piles: list[Pile]) -> None:
+    reader = reader_of(piles)
+    query = reader.create_body_query([piles[0].high])
+    kept = query.cuda_impulses.torch()
+    reader.answer(query)
+    assert kept is query.cuda_impulses.torch() and bool(kept.any()) and kept.dtype == torch.float32

@@ -1,0 +1,117 @@
+"""Drive targets that an author sets: where they may be set, and ManiSkill's own fault with those of one joint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import sapien
+import torch
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+
+from tests.drive.envs import batched
+from workbench.core.env.task_env import TaskEnv
+
+N = 4
+
+
+class Door(PushCubeEnv):
+    """With a hinge that is driven."""
+
+    where = ""
+    one_joint = False
+    velocity = False
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        builder = self.scene.create_articulation_builder()
+        root = builder.create_link_builder()
+        root.set_name("frame")
+        root.add_box_collision(half_size=(0.02, 0.02, 0.02))
+        leaf = builder.create_link_builder(root)
+        leaf.set_name("leaf")
+        leaf.add_box_collision(pose=sapien.Pose([0.1, 0, 0]), half_size=(0.02, 0.02, 0.02))
+        leaf.set_joint_name("hinge")
+        leaf.set_joint_properties("revolute", [[-2, 2]], sapien.Pose(), sapien.Pose())
+        builder.initial_pose = sapien.Pose([0, 1, 1])
+        self.door = builder.build("door", fix_root_link=True)
+        self.hinge = self.door.active_joints[0]
+        self.hinge.set_drive_properties(100, 10)
+        self.drive("_load_scene", self.num_envs)
+
+    def _after_reconfigure(self, options: dict) -> None:
+        super()._after_reconfigure(options)
+        self.drive("_after_reconfigure", self.num_envs)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        self.drive("_initialize_episode", len(env_idx))
+
+    def drive(self, where: str, rows: int) -> None:
+        if where != self.where:
+            return
+        door: Any = self.door
+        if self.one_joint and self.velocity:
+            self.hinge.set_drive_velocity_target(torch.full((rows,), 0.5))
+        elif self.one_joint:
+            self.hinge.set_drive_target(torch.full((rows,), 0.5))
+        elif self.velocity:
+            door.set_joint_drive_velocity_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
+        else:
+            door.set_joint_drive_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
+
+
+def made(**attributes: Any) -> TaskEnv:
+    task = type("Door", (Door,), attributes)
+    return TaskEnv(batched(task, N))
+
+
+@pytest.mark.parametrize("one_joint", [True, False])
+@pytest.mark.parametrize("velocity", [True, False])
+def test_a_target_that_is_set_too_early_is_told_with_the_hooks_to_set_it_in(
+    one_joint: bool, velocity: bool
+) -> None:
+    with pytest.raises(RuntimeError, match="drive target of 'door' was set before .* in _after_reconfigure"):
+        made(where="_load_scene", one_joint=one_joint, velocity=velocity)
+
+
+@pytest.mark.parametrize("where", ["_after_reconfigure", "_initialize_episode"])
+def test_set_where_the_message_says_it_drives(where: str) -> None:
+    task = made(where=where)
+    env: Any = task.env
+    task.reset(seed=0)
+    task.reset(env_idx=[1, 2])
+    for _ in range(30):
+        task.step(None)
+    assert torch.allclose(env.door.qpos, torch.full((N, 1), 0.5), atol=0.05)
+    task.close()
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+def test_maniskills_own_fault_in_a_partial_reset_is_named_with_the_way_round(velocity: bool) -> None:
+    task = made(where="_initialize_episode", one_joint=True, velocity=velocity)
+    task.reset(seed=0)
+    task.reset(env_idx=[2])
+    with pytest.raises(RuntimeError) as caught:
+        task.reset(env_idx=[1, 2])
+    said = str(caught.value)
+    assert said.startswith("ManiSkill's own fault, not yours") and "2 of 4 envs" in said
+    assert ("set_joint_drive_velocity_targets(" in said) == velocity
+    assert not getattr(caught.value, "__notes__", []), "and nothing says that it is the author's"
+    task.close()
+    task = made(where="_initialize_episode", velocity=velocity)
+    task.reset(seed=0)
+    task.reset(env_idx=[1, 2])
+    task.close()
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+def test_a_target_that_is_no_number_is_refused_with_the_name_and_the_env(velocity: bool) -> None:
+    task: Any = made()
+    task.reset(0)
+    set_targets = (
+        task.env.door.set_joint_drive_velocity_targets if velocity else task.env.door.set_joint_drive_targets
+    )
+    set_targets(torch.tensor([[0.1], [0.1], [torch.nan], [0.1]]), joints=[task.env.hinge])
+    with pytest.raises(ValueError, match="^door of env 2: .* NaN"):
+        task.env.scene._gpu_apply_all()

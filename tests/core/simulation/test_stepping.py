@@ -1,0 +1,151 @@
+"""Threads and merged substeps: the same bits as env after env, and no hook that can tell."""
+
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportOptionalIterable=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
+from mani_skill.agents.robots.panda import Panda
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from workbench.core.env.cpu_scene import batched_class
+from workbench.core.maniskill_private import substeps_are_unwatched
+
+pytestmark = pytest.mark.thorough
+
+STATE_ONLY: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
+PICK_CUBE = REGISTERED_ENVS["PickCube-v1"].cls
+
+
+def trajectory(task: type[BaseEnv], threads: int, steps: int = 30, num_envs: int = 5) -> list[bytes]:
+    env = batched_class(task)(num_envs=num_envs, **STATE_ONLY)
+    env.scene.px.stepper.threads = threads
+    env.reset(seed=list(range(num_envs)))
+    rng = np.random.default_rng(0)
+    packs = []
+    for _ in range(steps):
+        # Downwards, so that fingers, cube and table meet.
+        action = rng.uniform(-1, 0.2, (num_envs, *env.single_action_space.shape)).astype(np.float32)
+        env.step(action)
+        packs.append(b"".join(system.pack() for system in env.scene.px.systems))
+    env.close()
+    return packs
+
+
+def watching(task: type[BaseEnv]) -> type[BaseEnv]:
+    """The task with a hook between substeps that counts them and reads a pose there."""
+
+    class Watches(task):
+        seen = 0
+
+        def _after_simulation_step(self) -> None:
+            type(self).seen += 1
+
+    return Watches
+
+
+@pytest.mark.parametrize("env_id", ["PickCube-v1", "StackCube-v1", "MS-CartpoleBalance-v1"])
+def test_threads_and_merged_substeps_change_no_bit(env_id: str) -> None:
+    task = REGISTERED_ENVS[env_id].cls
+    alone = trajectory(watching(task), threads=1)
+    assert trajectory(task, threads=1) == alone, "merged substeps, one thread"
+    assert trajectory(task, threads=2) == alone, "merged substeps, two threads"
+    assert trajectory(task, threads=5) == alone, "merged substeps, five threads"
+    assert trajectory(watching(task), threads=3) == alone, "single substeps, three threads"
+
+
+def test_a_hook_between_substeps_sees_every_one_of_them() -> None:
+    heights: list[float] = []
+
+    class Looks(PICK_CUBE):
+        def _after_simulation_step(self) -> None:
+            heights.append(float(self.cube._objs[0].pose.p[2]))
+
+    env = batched_class(Looks)(num_envs=2, **STATE_ONLY)
+    env.reset(seed=[0, 1])
+    pose = env.cube.pose.raw_pose.clone()
+    pose[:, 2] = 1.5  # clear of the gripper
+    env.cube.set_pose(pose)
+    env.scene._gpu_apply_all()
+    heights.clear()
+    env.step(np.zeros((2, 8), np.float32))
+    env.close()
+    assert len(heights) == 5
+    assert all(later < earlier for earlier, later in zip(heights, heights[1:], strict=False)), heights
+
+
+def test_state_asked_for_in_the_middle_is_that_moment() -> None:
+    env = batched_class(PICK_CUBE)(num_envs=2, **STATE_ONLY)
+    env.reset(seed=[0, 1])
+    px = env.scene.px
+    start = px._version
+    with px.merging(5):
+        px.step()
+        px.step()
+        assert px._version == start, "put off"
+        env.scene._gpu_fetch_all()
+        after_two = px.systems[0].pack()
+        assert px._version > start
+        px.step()
+    after_three = px.systems[0].pack()
+    assert after_three != after_two
+    env.close()
+
+
+def test_who_watches_substeps_is_known() -> None:
+    class Controller(PDJointPosController):
+        def before_simulation_step(self) -> None:
+            super().before_simulation_step()
+
+    class Robot(Panda):
+        def before_simulation_step(self) -> None:
+            super().before_simulation_step()
+
+    class OwnControlStep(PICK_CUBE):
+        def _step_action(self, action: Any) -> Any:
+            return super()._step_action(action)
+
+    def unwatched(task: type[BaseEnv], change: Any = None) -> bool:
+        env = batched_class(task)(num_envs=1, **STATE_ONLY)
+        if change is not None:
+            change(env)
+        answer = substeps_are_unwatched(env, task)
+        env.close()
+        return answer
+
+    def bring_controller(env: BaseEnv) -> None:
+        env.agent.controller.controllers["arm"].__class__ = Controller
+
+    def bring_robot(env: BaseEnv) -> None:
+        env.agent.__class__ = Robot
+
+    def hang_on_the_instance(env: BaseEnv) -> None:
+        env._after_simulation_step = lambda: None
+
+    assert unwatched(PICK_CUBE)
+    assert unwatched(REGISTERED_ENVS["TwoRobotPickCube-v1"].cls)
+    assert not unwatched(watching(PICK_CUBE))
+    assert not unwatched(OwnControlStep)
+    assert not unwatched(PICK_CUBE, bring_controller)
+    assert not unwatched(PICK_CUBE, bring_robot)
+    assert not unwatched(PICK_CUBE, hang_on_the_instance)
+
+
+def test_an_error_in_a_control_step_leaves_no_substep_owed() -> None:
+    class Fails(PICK_CUBE):
+        def _after_control_step(self) -> None:
+            raise KeyError("the author's")
+
+    env = batched_class(Fails)(num_envs=2, **STATE_ONLY)
+    env.reset(seed=[0, 1])
+    with pytest.raises(KeyError):
+        env.step(np.zeros((2, 8), np.float32))
+    assert not env.scene.px.stepper.owes
+    env.close()

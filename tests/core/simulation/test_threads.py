@@ -1,0 +1,80 @@
+"""The threads that step envs: each env once, errors given back, nothing left behind after a fork."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from workbench.core.simulation.stepping import EnvThreads, env_threads, usable_cores
+
+shared = EnvThreads()
+
+
+@settings(deadline=None, max_examples=50)
+@given(count=st.integers(0, 40), threads=st.integers(1, 6))
+def test_every_env_is_done_once(count: int, threads: int) -> None:
+    done: list[int] = []
+    shared.run(done.append, count, threads)
+    assert Counter(done) == Counter(range(count))
+
+
+def test_the_work_is_spread_over_threads() -> None:
+    meeting = threading.Barrier(3, timeout=10)
+    names: set[str] = set()
+
+    def job(_: int) -> None:
+        names.add(threading.current_thread().name + str(threading.get_ident()))
+        meeting.wait()  # passes only if three threads are in it at once
+
+    shared.run(job, 3, 3)
+    assert len(names) == 3
+
+
+@pytest.mark.parametrize("failing", range(6))
+def test_an_error_in_any_env_reaches_the_caller(failing: int) -> None:
+    def job(index: int) -> None:
+        if index == failing:
+            raise ValueError(f"env {index}")
+
+    with pytest.raises(ValueError, match=f"env {failing}"):
+        shared.run(job, 6, 3)
+    done: list[int] = []
+    shared.run(done.append, 6, 3)
+    assert sorted(done) == list(range(6)), "the threads must be usable after an error"
+
+
+def test_two_callers_at_once_wait_for_each_other() -> None:
+    sums = [0, 0]
+
+    def caller(which: int) -> None:
+        for _ in range(200):
+            done: list[int] = []
+            shared.run(done.append, 5, 3)
+            sums[which] += sum(done)
+
+    callers = [threading.Thread(target=caller, args=(i,)) for i in range(2)]
+    for thread in callers:
+        thread.start()
+    for thread in callers:
+        thread.join(timeout=30)
+    assert sums == [2000, 2000]
+
+
+def test_a_forked_child_gets_threads_of_its_own(child_process: None) -> None:
+    env_threads().run(lambda _: None, 4, 2)
+    child = os.fork()
+    if child == 0:
+        done: list[int] = []
+        env_threads().run(done.append, 4, 2)
+        os._exit(0 if sorted(done) == [0, 1, 2, 3] else 1)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 0
+
+
+def test_cores_are_those_this_process_may_use() -> None:
+    assert 1 <= usable_cores() <= (os.cpu_count() or 1)

@@ -1,0 +1,170 @@
+"""An env gets a PhysX scene without a past, and everything that knew its bodies still knows them."""
+
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import gc
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import sapien
+import sapien.physx as physx
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.building import actors
+from mani_skill.utils.structs.pose import Pose
+
+from tests.drive.envs import PICK_CUBE, batched
+from workbench.core.snapshots.cpu_state import renew_physics
+from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+
+
+def packs(env: BaseEnv) -> list[bytes]:
+    return [system.pack() for system in env.scene.px.systems]
+
+
+def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
+    env = batched(PICK_CUBE, 6)
+    env.reset(seed=list(range(6)))
+    state = env.get_state_dict()
+    state["actors"]["cube"][:, :3] = env.agent.tcp.pose.p
+    env.set_state_dict(state)
+    rng = np.random.default_rng(0)
+
+    def action(gripper: float) -> np.ndarray:
+        values = rng.uniform(-1, 1, (6, 8)).astype(np.float32)
+        values[:, -1] = gripper
+        return values
+
+    for _ in range(10):
+        env.step(action(-1.0))
+    snapshot, actions = take_snapshot(env), [action(-1.0) for _ in range(12)]
+
+    def run(source: list[int]) -> list[list[bytes]]:
+        restore_snapshot(env, snapshot, range(6), source)
+        states = []
+        for values in actions:
+            env.step(values[source])
+            states.append(packs(env))
+        return states
+
+    reference = run(list(range(6)))
+    assert env.agent.is_grasping(env.cube).any(), "nothing is held: the test would prove nothing"
+    for trial in range(6):
+        for _ in range(trial):
+            env.step(action(1.0 if trial % 2 else -1.0))
+        source = rng.permutation(6).tolist()
+        assert run(source) == [[states[i] for i in source] for states in reference], trial
+    env.close()
+
+
+def test_nothing_but_the_systems_is_new() -> None:
+    env = batched(PICK_CUBE, 3)
+    env.reset(seed=[0, 1, 2])
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    px: Any = env.scene.px
+    before, poses = packs(env), [scene.pack_poses() for scene in env.scene.sub_scenes]
+    state, systems, timestep = env.get_state(), list(px.systems), px.timestep
+    numbers = [[e.per_scene_id for e in scene.entities] for scene in env.scene.sub_scenes]
+    assert renew_physics(env.scene, [0, 2]) == []
+    assert [new is old for new, old in zip(px.systems, systems, strict=True)] == [False, True, False]
+    assert packs(env) == before and [scene.pack_poses() for scene in env.scene.sub_scenes] == poses
+    assert [[e.per_scene_id for e in scene.entities] for scene in env.scene.sub_scenes] == numbers
+    env.scene._gpu_fetch_all()
+    assert torch.equal(env.get_state(), state) and px.timestep == timestep
+    assert [system.timestep for system in px.systems] == [timestep] * 3
+    cube = env.cube._bodies[2]
+    assert cube.entity.scene is env.scene.sub_scenes[2] is px.scenes[2]
+    env.step(env.action_space.sample())
+    env.close()
+
+
+def test_a_step_is_as_long_as_before() -> None:
+    slow = batched(PICK_CUBE, 2, sim_config={"sim_freq": 60, "control_freq": 20})
+    renew_physics(slow.scene, [1])
+    assert [system.timestep for system in slow.scene.px.systems] == [pytest.approx(1 / 60)] * 2
+    slow.close()
+
+
+def test_gravity_is_that_of_the_env_and_the_processs_default_stays() -> None:
+    light = batched(PICK_CUBE, 1, sim_config={"scene_config": {"gravity": np.array([0.0, 0.0, -1.0])}})
+    other = batched(PICK_CUBE, 1)
+    renew_physics(light.scene, [0])
+    assert light.scene.px.systems[0].config.gravity.tolist() == [0.0, 0.0, -1.0]
+    assert np.allclose(physx.get_scene_config().gravity, other.scene.px.systems[0].config.gravity)
+    light.close()
+    other.close()
+
+
+class Leash(PICK_CUBE):
+    """A ball that a drive pulls to the middle of the air."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        pose = Pose.create_from_pq([0.0, 0.5, 0.4])
+        self.ball = actors.build_sphere(self.scene, 0.02, [1, 0, 0, 1], "ball", initial_pose=pose)
+        self.post = actors.build_sphere(
+            self.scene,
+            0.01,
+            [0, 1, 0, 1],
+            "post",
+            body_type="kinematic",
+            add_collision=False,
+            initial_pose=pose,
+        )
+        drive = self.scene.create_drive(self.post, sapien.Pose(), self.ball, sapien.Pose())
+        drive.set_limit_x(0, 0)
+        drive.set_limit_y(0, 0)
+        drive.set_limit_z(0, 0)
+
+
+def test_a_drive_between_two_bodies_still_holds() -> None:
+    env: Any = batched(Leash, 2)
+    env.reset(seed=[0, 1])
+    for _ in range(3):
+        env.step(None)
+    restore_snapshot(env, take_snapshot(env))
+    for _ in range(10):
+        env.step(None)
+    heights = env.ball.pose.p[:, 2]
+    assert torch.allclose(heights, torch.tensor(0.4), atol=0.02), heights
+    env.close()
+
+
+def test_pictures_and_segmentation_are_the_same_after_it(renderer: None) -> None:
+    env: Any = batched(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
+    env.reset(seed=[0, 1])
+    env.step(env.action_space.sample())
+    restore_snapshot(env, take_snapshot(env))
+    pictures = {k: v.clone() for k, v in env.get_obs()["sensor_data"]["base_camera"].items()}
+    renew_physics(env.scene, [0, 1])
+    env.scene._gpu_fetch_all()
+    again = env.get_obs()["sensor_data"]["base_camera"]
+    assert len(torch.unique(pictures["segmentation"])) > 3
+    for name, picture in pictures.items():
+        assert torch.equal(again[name], picture), name
+    env.close()
+
+
+@pytest.mark.slow
+def test_memory_is_flat_over_a_thousand_renewals() -> None:
+    import psutil
+
+    env = batched(PICK_CUBE, 4)
+    env.reset(seed=[0, 1, 2, 3])
+    snapshot = take_snapshot(env)
+
+    def used(rounds: int) -> int:
+        for _ in range(rounds):
+            restore_snapshot(env, snapshot)
+            env.step(None)
+        gc.collect()
+        return psutil.Process().memory_info().rss
+
+    first = used(50)
+    assert used(250) - first < 20 * 2**20
+    env.close()

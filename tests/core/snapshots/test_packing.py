@@ -1,0 +1,196 @@
+"""A snapshot cut in parts is the snapshot, and what did not change is said once."""
+
+# A task's own attributes are not known to the checker.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.drive.envs import batched
+from workbench.core.env import actions
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.snapshots.cpu_state import CpuState
+from workbench.core.snapshots.packing import PackedSnapshot, SnapshotPacker, WholeSnapshot, unpack_snapshot
+from workbench.core.snapshots.snapshot import Snapshot
+
+N = 4
+
+
+@pytest.fixture(scope="module")
+def task() -> Iterator[TaskEnv]:
+    task = TaskEnv(batched("PickCube-v1", N), 50)
+    yield task
+    task.close()
+
+
+class Receiver:
+    """What a server does with the parts."""
+
+    def __init__(self) -> None:
+        self.parts: dict[int, bytes] = {}
+        self.keys: tuple[int, ...] = ()
+
+    def take(self, packed: PackedSnapshot) -> list[bytes]:
+        self.parts.update(packed.new_parts)
+        self.keys = self.keys if packed.keys is None else packed.keys
+        return [self.parts[key] for key in self.keys]
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if type(a) is not type(b):
+        return False
+    if hasattr(a, "__dataclass_fields__"):
+        return all(same(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)  # type: ignore[union-attr]
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))  # type: ignore[arg-type]
+    return a == b
+
+
+def step(task: TaskEnv, rng: np.random.Generator) -> None:
+    task.step(actions.random_action(task.parts, N, rng))
+
+
+def test_every_snapshot_comes_back_as_it_was_whatever_happened_between(task: TaskEnv) -> None:
+    rng, packer, receiver = np.random.default_rng(0), SnapshotPacker(), Receiver()
+    task.reset(seed=0)
+    for number in range(30):
+        step(task, rng)
+        if number == 7:
+            task.reset(seed=[3], env_idx=[2])
+        if number == 12:
+            task.env.best = torch.arange(N, dtype=torch.float32)
+        if number == 15:
+            task.env.best += 1
+        if number == 18:
+            del task.env.best
+        if number == 21:
+            task.env.best = torch.zeros(N)
+        if number in (22, 26):  # the same bytes, of another type
+            task.env.count = np.zeros(N, np.float32 if number == 22 else np.int32)
+        if number == 24:
+            torch.rand(1)
+            np.random.rand()
+        snapshot = task.snapshot()
+        packed = packer.pack(snapshot)
+        assert same(unpack_snapshot(packed.body, receiver.take(packed)), snapshot), f"after step {number}"
+        # A receiver that keeps only what the newest snapshot needs must always have enough.
+        receiver.parts = {key: receiver.parts[key] for key in receiver.keys}
+    del task.env.best, task.env.count
+
+
+def test_a_grasp_and_what_it_touches_come_back(task: TaskEnv) -> None:
+    task.reset(seed=0)
+    hold = actions.hold_action(task.parts, N)
+    for _ in range(3):
+        task.step(hold)
+    task.env.agent.is_grasping(task.env.cube)
+    task.step(hold)
+    snapshot = task.snapshot()
+    packed = SnapshotPacker().pack(snapshot)
+    assert same(unpack_snapshot(packed.body, Receiver().take(packed)), snapshot)
+
+
+def test_what_touches_and_sleeps_is_of_its_own_env(task: TaskEnv) -> None:
+    """As it is where envs differ: one holds, one pushes two things, and one sleeps."""
+    snapshot = task.snapshot()
+    state = snapshot.simulation
+    assert isinstance(state, CpuState)
+    asleep = [
+        tuple((part + env) % 3 == 0 for part in range(len(contents)))
+        for env, contents in enumerate(state.contents)
+    ]
+    touching = (1, "cube", "panda/panda_leftfinger"), (1, "cube", "table"), (3, "cube", "table")
+    impulses = np.arange(9, dtype=np.float32).reshape(3, 3)
+    other = snapshot._replace(
+        simulation=replace(state, asleep=tuple(asleep), touching=touching, impulses=impulses)
+    )
+    packed = SnapshotPacker().pack(other)
+    assert same(unpack_snapshot(packed.body, Receiver().take(packed)), other)
+
+
+def test_of_a_step_only_what_moved_is_sent(task: TaskEnv) -> None:
+    rng, packer = np.random.default_rng(0), SnapshotPacker()
+    task.reset(seed=0)
+    step(task, rng)
+    packer.pack(task.snapshot())
+    step(task, rng)
+    packer.pack(task.snapshot())
+    step(task, rng)
+    snapshot = task.snapshot()
+    packed = packer.pack(snapshot)
+    assert packed.keys is None and packed.new_parts == {}
+    assert len(packed.body) < 0.2 * len(pickle.dumps(snapshot))
+
+
+def test_what_a_task_keeps_and_does_not_write_is_sent_once(task: TaskEnv) -> None:
+    task.reset(seed=0)
+    task.env.table = torch.arange(N * 1000, dtype=torch.float32).reshape(N, 1000)
+    packer = SnapshotPacker()
+    first = packer.pack(task.snapshot())
+    again = packer.pack(task.snapshot())
+    third = packer.pack(task.snapshot())
+    del task.env.table
+    assert len(first.body) + sum(map(len, first.new_parts.values())) > 16_000
+    assert third.keys is None and third.new_parts == {} and again.keys is not None
+    assert len(third.body) < len(first.body) - 15_000
+
+
+def test_two_packers_give_no_number_twice(task: TaskEnv) -> None:
+    snapshot = task.snapshot()
+    one, other = (SnapshotPacker().pack(snapshot) for _ in range(2))
+    assert not one.new_parts.keys() & other.new_parts.keys()
+
+
+def test_a_reset_of_one_env_sends_that_envs_generators(task: TaskEnv) -> None:
+    packer = SnapshotPacker()
+    task.reset(seed=0)
+    packer.pack(task.snapshot())
+    task.reset(seed=[9], env_idx=[1])
+    packed = packer.pack(task.snapshot())
+    states = [pickle.loads(part) for part in packed.new_parts.values() if len(part) > 2000]
+    assert 0 < len(states) <= 2 and all(state[0] == "MT19937" for state in states)
+
+
+def test_some_envs_can_be_packed_alone(task: TaskEnv) -> None:
+    snapshot = task.snapshot([3, 1])
+    packed = SnapshotPacker().pack(snapshot)
+    assert same(unpack_snapshot(packed.body, Receiver().take(packed)), snapshot)
+
+
+def test_fewer_envs_and_more_again_come_back_as_they_were(task: TaskEnv) -> None:
+    packer, receiver = SnapshotPacker(), Receiver()
+    for chosen in ([0], [0, 1], [0, 1, 2, 3], [0, 1]):
+        snapshot = task.snapshot(chosen)
+        assert same(unpack_snapshot((packed := packer.pack(snapshot)).body, receiver.take(packed)), snapshot)
+
+
+def test_whole_bytes_unpickle_as_a_snapshot(task: TaskEnv) -> None:
+    snapshot = task.snapshot()
+    packed = SnapshotPacker().pack(snapshot)
+    whole = pickle.dumps(WholeSnapshot(packed.body, tuple(Receiver().take(packed))))
+    back = pickle.loads(whole)
+    assert isinstance(back, Snapshot) and same(back, snapshot)
+
+
+def test_whole_bytes_are_made_without_torch_or_a_simulator(child_process: None) -> None:
+    code = (
+        "import pickle, sys\n"
+        "from workbench.core.snapshots.packing import WholeSnapshot\n"
+        "assert pickle.dumps(WholeSnapshot(b'body', (b'part',)))\n"
+        "print(sorted({'torch', 'sapien', 'mani_skill'} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

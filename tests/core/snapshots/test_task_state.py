@@ -1,0 +1,284 @@
+"""What a task remembers on itself is found, carried by row, and named when it cannot be."""
+
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.structs.pose import Pose
+
+from tests.drive.envs import PUSH_CUBE, batched
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.core.snapshots.task_attributes import base_env_members
+
+N = 4
+
+
+@dataclass
+class Stage:
+    reached: torch.Tensor
+    name: str
+
+
+class Notes:
+    def __init__(self, num_envs: int) -> None:
+        self.visits = torch.zeros(num_envs)
+
+
+class Remembers(PUSH_CUBE):
+    """PushCube that keeps all sorts of things on itself."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.threshold = 0.02
+        self.reach_offset = torch.tensor([0.1, 0.2, 0.3, 0.4])  # as long as there are envs, and no buffer
+        super().__init__(*args, **kwargs)
+        self.weight = 1.5
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        self.object_heights = torch.arange(self.num_envs, dtype=torch.float32)
+        self.filled_later = torch.zeros(self.num_envs)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        if not hasattr(self, "best_distance"):
+            n = self.num_envs
+            self.best_distance = torch.full((n,), torch.inf)
+            self.phases = {"reach": torch.zeros(n, dtype=torch.bool), "steps": {"count": torch.zeros(n, 2)}}
+            self.history = [torch.zeros(n, 3), torch.zeros(n, 3)]
+            self.pair = (torch.zeros(n), torch.zeros(n, dtype=torch.int64))
+            self.goal_pose = Pose.create_from_pq(torch.zeros(n, 3))
+            self.stage = Stage(torch.zeros(n), "reach")
+            self.notes = Notes(n)
+            self.prompts = [""] * n
+            self.scores = np.zeros(n)
+            self.half = torch.zeros(n, dtype=torch.bfloat16)
+            self.recent: Any = collections.deque(maxlen=3)
+            self.total_resets = 0
+        self.best_distance[env_idx] = torch.inf
+        self.total_resets += 1
+
+    def evaluate(self) -> dict:
+        result = super().evaluate()
+        if hasattr(self, "best_distance"):
+            distance = torch.linalg.norm(self.obj.pose.p - self.agent.tcp.pose.p, dim=1)
+            self.best_distance = torch.minimum(self.best_distance, distance)
+            self.notes.visits += 1
+        return result
+
+    def write(self, value: float) -> None:
+        """Give every buffer a value of its own in every env."""
+        rows = torch.arange(self.num_envs) + value
+        self.best_distance = rows.clone()
+        self.phases["reach"] = rows > value + 1
+        self.phases["steps"]["count"][:] = rows[:, None]
+        self.history[1][:] = rows[:, None]
+        self.pair = (rows.clone(), rows.long())
+        self.goal_pose.raw_pose[:, 0] = rows
+        self.stage.reached = rows.clone()
+        self.notes.visits = rows.clone()
+        self.prompts = [f"push {row}" for row in rows.tolist()]
+        self.scores[:] = rows.numpy()
+        self.half[:] = rows.to(torch.bfloat16)
+        self.filled_later += value
+        self.recent.append(value)
+
+    def buffers(self) -> dict[str, torch.Tensor]:
+        return {
+            "best_distance": self.best_distance,
+            "reach": self.phases["reach"],
+            "count": self.phases["steps"]["count"],
+            "history": self.history[1],
+            "pair": self.pair[0],
+            "integers": self.pair[1],
+            "goal_pose": self.goal_pose.raw_pose,
+            "stage": self.stage.reached,
+            "visits": self.notes.visits,
+            "prompts": torch.tensor([float(p.split()[1]) for p in self.prompts]),
+            "scores": torch.from_numpy(self.scores),
+            "half": self.half,
+            "filled_later": self.filled_later,
+        }
+
+    def copied(self) -> dict[str, torch.Tensor]:
+        return {name: value.clone() for name, value in self.buffers().items()}
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    env = batched(Remembers, N)
+    yield env
+    env.close()
+
+
+@pytest.fixture(autouse=True)
+def fresh(env: Any) -> None:
+    env.reset(seed=[0, 1, 2, 3])
+
+
+def test_all_buffers_go_back(env: Any) -> None:
+    env.write(1.0)
+    before, snapshot = env.copied(), take_snapshot(env)
+    env.write(50.0)
+    report = restore_snapshot(env, snapshot)
+    for name, value in env.buffers().items():
+        assert torch.equal(value, before[name]), name
+    assert "best_distance" in report.carried
+    assert list(report.not_carried) == ["recent"], "a deque cannot be kept, and is named"
+    assert snapshot.omitted == {"recent": "a collections.deque"}
+
+
+def test_rows_of_chosen_envs_go_to_chosen_envs(env: Any) -> None:
+    env.write(1.0)
+    before, snapshot = env.copied(), take_snapshot(env, [1, 2])
+    env.write(50.0)
+    now = env.copied()
+    restore_snapshot(env, snapshot, [3, 0], source=[1, 2])
+    for name, value in env.buffers().items():
+        expected = now[name].clone()
+        expected[3], expected[0] = before[name][1], before[name][2]
+        assert torch.equal(value, expected), name
+
+
+def test_what_describes_the_scene_stays_with_its_env(env: Any) -> None:
+    env.write(1.0)
+    restore_snapshot(env, take_snapshot(env, [3]), range(N))
+    assert env.object_heights.tolist() == [0, 1, 2, 3]
+    torch.testing.assert_close(env.reach_offset, torch.tensor([0.1, 0.2, 0.3, 0.4]))
+    assert env.best_distance.tolist() == [4.0] * N
+
+
+def test_what_was_not_written_yet_goes_back_to_how_it_was_built() -> None:
+    env = batched(Remembers, N)
+    env.reset(seed=[0, 1, 2, 3])
+    snapshot = take_snapshot(env)
+    env.filled_later += 7
+    env.threshold = 1.0
+    restore_snapshot(env, snapshot)
+    assert env.filled_later.tolist() == [0.0] * N and env.threshold == 0.02
+    env.close()
+
+
+def test_what_holds_for_the_batch_goes_back_when_all_envs_do(env: Any) -> None:
+    snapshot, count = take_snapshot(env), env.total_resets
+    env.total_resets += 5
+    report = restore_snapshot(env, snapshot, [0, 1])
+    assert env.total_resets == count + 5
+    assert "whole batch" in report.not_carried["total_resets"]
+    report = restore_snapshot(env, snapshot, range(N), source=2)
+    assert env.total_resets == count and "total_resets" not in report.not_carried
+    env.total_resets += 5
+    restore_snapshot(env, snapshot)
+    assert env.total_resets == count
+
+
+def test_a_tensor_that_somebody_else_holds_is_not_written_to(env: Any) -> None:
+    env.write(1.0)
+    snapshot = take_snapshot(env)
+    theirs = torch.full((N,), 9.0)
+    env.best_distance = theirs
+    env.stage.reached = theirs
+    restore_snapshot(env, snapshot, [0])
+    assert theirs.tolist() == [9.0] * N
+    assert env.best_distance.tolist() == [1.0, 9.0, 9.0, 9.0]
+
+
+def test_a_view_of_the_simulations_tensors_stays_one(env: Any) -> None:
+    env.raw = env.scene.px.cuda_rigid_body_data.torch()
+    restore_snapshot(env, take_snapshot(env))
+    assert env.raw.data_ptr() == env.scene.px.cuda_rigid_body_data.torch().data_ptr()
+    del env.raw
+
+
+def test_evaluating_the_restored_moment_does_not_count_in_any_env(env: Any) -> None:
+    task = TaskEnv(env, 50)
+    task.reset(seed=0)
+    env.write(1.0)
+    snapshot, before = task.snapshot(), env.copied()
+    task.step(None)
+    later = env.copied()
+    task.restore(snapshot, [2])
+    for name, value in env.buffers().items():
+        expected = later[name].clone()
+        expected[2] = before[name][2]
+        assert torch.equal(value, expected), name
+
+
+class Edited(Remembers):
+    """The same after an edit: a constant changed, a buffer gone, one of another shape, one more."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.threshold = 0.05
+        self.weight = 2.0
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        self.half = torch.zeros(self.num_envs, 2)
+        self.velocity_bonus = torch.full((self.num_envs,), 3.0)
+        if hasattr(self, "notes"):
+            del self.notes
+
+    def evaluate(self) -> dict:
+        return PUSH_CUBE.evaluate(self)
+
+
+def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: Any) -> None:
+    env.write(1.0)
+    snapshot = take_snapshot(env)
+    edited = batched(Edited, N)
+    edited.best_distance[:] = 0
+    report = restore_snapshot(edited, snapshot)
+    assert edited.threshold == 0.05 and edited.weight == 2.0
+    assert edited.best_distance.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert edited.velocity_bonus.tolist() == [3.0] * N
+    assert edited.half.shape == (N, 2)
+    assert report.not_carried["half"].startswith("it had shape")
+    assert report.not_carried["notes.visits"] == "the task has none of this name now"
+    assert report.not_carried["velocity_bonus"].startswith("the snapshot has none")
+    edited.close()
+
+
+def test_the_shape_that_a_buffer_had_is_told(env: Any) -> None:
+    env.write(1.0)
+    snapshot, phases, best = take_snapshot(env), env.phases["steps"], env.best_distance
+    phases["count"], env.best_distance = torch.zeros(N, 3), torch.zeros(N, 1)
+    report = restore_snapshot(env, snapshot, [0])
+    phases["count"], env.best_distance = torch.zeros(N, 2), best
+    assert report.not_carried["phases['steps']['count']"] == "it had shape (N, 2) and is another thing now"
+    assert report.not_carried["best_distance"] == "it had shape (N) and is another thing now"
+
+
+class Lazy(PUSH_CUBE):
+    """What is not written yet is the class's."""
+
+    best: Any = None
+    count: Any = 0
+
+
+def test_what_is_not_set_yet_but_by_its_class_is_set_when_all_envs_go_back() -> None:
+    env: Any = batched(Lazy, N)
+    env.reset(seed=[0, 1, 2, 3])
+    env.best, env.count = torch.arange(float(N)), 3
+    snapshot = take_snapshot(env)
+    del env.best, env.count
+    report = restore_snapshot(env, snapshot, [1, 2])
+    assert env.best is None and env.count == 0
+    assert report.not_carried["best"] == report.not_carried["count"] == "the task has none of this name now"
+    report = restore_snapshot(env, snapshot)
+    assert env.best.tolist() == [0, 1, 2, 3] and env.count == 3 and {"best", "count"} <= set(report.carried)
+    env.close()
+
+
+def test_base_envs_own_members_are_known() -> None:
+    assert {"_elapsed_steps", "_last_obs", "scene", "_batched_episode_rng", "num_envs"} <= base_env_members()
+    assert "agent" not in base_env_members()

@@ -1,0 +1,25 @@
+"""The files of episodes are made one after the other, and each says for itself what came of it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from tests.drive.episodes import appended, made
+from workbench.jobs.gather import EpisodeFinisher, GatheredEpisode
+from workbench.recording.writing.episode_writer import EpisodeFiles
+
+
+def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) -> None:
+    folders = (tmp_path / "gone", tmp_path / "there")
+    episodes = [
+        GatheredEpisode(appended(folder, made(3), pictures=False), env=env, seed=0)
+        for env, folder in enumerate(folders)
+    ]
+    shutil.rmtree(folders[0])
+    finisher = EpisodeFinisher()
+    futures = [finisher.finish(episode) for episode in episodes]
+    finisher.close()
+    lost, kept = (future.result() for future in futures)
+    assert isinstance(lost, str) and "env 0" in lost and "gone" in lost
+    assert isinstance(kept, EpisodeFiles) and kept.rrd.is_file()

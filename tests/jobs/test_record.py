@@ -1,0 +1,496 @@
+"""``workbench record``: the same episodes on any number of envs and processes, from any source of actions."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.page import open_workbench
+from tests.drive.waiting import until
+from tests.recording.verify_rrd import verify_rrd
+from workbench.authoring.problem import TaskError
+from workbench.cli.main import main
+from workbench.cli.record import record_in_terminal
+from workbench.jobs.pool import Deal, Executor, Processes, Work
+from workbench.jobs.record import Progress, Recorded, RecordOptions, Written, record
+from workbench.jobs.task import TaskOptions
+from workbench.recording.episode.episode import Episode
+from workbench.recording.reader.read_episode import read_episode
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+TASKS = Path(__file__).parents[2] / "tasks"
+PUSHER = Path(__file__).parents[1] / "browser" / "pusher.py"
+PLAIN = {"render_backend": "none"}
+"""Without a renderer, for whose shaders each process takes some seconds."""
+PUSHED = {"control_mode": "pd_ee_delta_pos", **PLAIN}
+
+
+def read_all(recorded: Recorded) -> list[Episode]:
+    return [read_episode(episode.path) for episode in recorded.written]
+
+
+def assert_same(one: Episode, other: Episode) -> None:
+    """To the last bit."""
+    assert one.info.seed == other.info.seed
+    np.testing.assert_array_equal(one.action, other.action)
+    np.testing.assert_array_equal(one.reward, other.reward)
+    assert one.env_states.keys() == other.env_states.keys() and one.env_states
+    for name, values in one.env_states.items():
+        np.testing.assert_array_equal(values, other.env_states[name], err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Three short episodes of random actions on two envs, without pictures."""
+    seen: list[Progress] = []
+    out = tmp_path_factory.mktemp("recorded")
+    options = TaskOptions(num_envs=2, seed=10)
+    done = record(
+        RecordOptions("PushCube-v1", out, 3, pictures=False, max_steps=5, options=options),
+        on_progress=seen.append,
+    )
+    assert [episode.steps for episode in done.written] == [5, 5, 5]
+    assert (seen[-1].steps, done.tried, done.stopped) == (15, 3, False)
+    return done
+
+
+def test_every_episode_is_three_files_that_stand_alone(recorded: Recorded) -> None:
+    for episode in recorded.written:
+        assert verify_rrd(episode.path) is None
+        files = sorted(episode.path.parent.glob(f"{episode.path.stem}.*"))
+        assert [file.suffix for file in files] == [".h5", ".json", ".rrd"]
+    read = read_all(recorded)
+    assert read[0].info.acted_by == ((0, "random"),)
+    assert {"articulations/panda", "actors/cube"} <= read[0].env_states.keys()
+    assert read[0].obs["agent/qpos"].shape == (6, 9)
+    assert read[0].info.env_kwargs == {
+        "obs_mode": "state",
+        "reward_mode": "normalized_dense",
+        "control_mode": "pd_joint_delta_pos",
+    }
+
+
+def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recorded) -> None:
+    stock: Any = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
+    for seed, episode in zip((10, 11, 12), read_all(recorded), strict=True):
+        assert episode.info.seed == seed
+        stock.reset(seed=seed)
+        np.testing.assert_allclose(
+            episode.env_states["actors/cube"][0], stock.obj.get_state()[0].numpy(), atol=1e-6
+        )
+    stock.close()
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "workers", "executor"), [(1, 1, None), (1, 1, Processes()), (3, 3, None)]
+)
+def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
+    recorded: Recorded, num_envs: int, workers: int, executor: Executor | None, tmp_path: Path
+) -> None:
+    options = TaskOptions(num_envs=num_envs, seed=10, env_kwargs=PLAIN)
+    what = RecordOptions(
+        "PushCube-v1", tmp_path, 3, pictures=False, max_steps=5, workers=workers, options=options
+    )
+    again = record(what, executor=executor)
+    for one, other in zip(recorded.written, again.written, strict=True):
+        assert_same(read_episode(one.path), read_episode(other.path))
+        assert one.path.with_suffix(".h5").read_bytes() == other.path.with_suffix(".h5").read_bytes()
+
+
+class InAnyOrder:
+    """Episodes that end in the order that the data draws, with files that are empty."""
+
+    def __init__(self, good: list[bool], slots: int, data: st.DataObject) -> None:
+        self.good, self.slots, self.data = good, slots, data
+
+    def run(self, work: Work, deal: Deal) -> None:
+        (what, *_) = work.setups
+        running: list[int] = []
+        while True:
+            running = [number for number in running if number < deal.limit()]
+            while len(running) < self.slots and (number := deal.next()) is not None:
+                running.append(number)
+            if not running:
+                return
+            number = running.pop(self.data.draw(st.integers(0, len(running) - 1)))
+            path = what.out / f"v1.{number}.rrd"
+            if self.good[number] or what.successes is None:
+                for suffix in (".rrd", ".h5", ".json"):
+                    path.with_suffix(suffix).touch()
+                deal.tell(number, Written(number, path, number, 1, 0.0, self.good[number]))
+            else:
+                deal.tell(number, None)
+
+
+@given(
+    wanted=st.integers(1, 5),
+    tries=st.integers(1, 40),
+    good=st.lists(st.booleans(), min_size=40, max_size=40),
+    slots=st.integers(1, 8),
+    data=st.data(),
+)
+def test_the_kept_successes_are_those_with_the_lowest_numbers(
+    wanted: int, tries: int, good: list[bool], slots: int, data: st.DataObject
+) -> None:
+    first = [index for index in range(tries) if good[index]][:wanted]
+    seen: list[Progress] = []
+    with tempfile.TemporaryDirectory() as folder:
+        what = RecordOptions("PushCube-v1", Path(folder), successes=wanted, tries=tries)
+        done = record(what, on_progress=seen.append, executor=InAnyOrder(good, slots, data))
+        left = sorted(path.name for path in Path(folder).iterdir())
+    assert [episode.index for episode in done.written] == first
+    assert left == sorted(f"v1.{number}{suffix}" for number in first for suffix in (".rrd", ".h5", ".json"))
+    assert done.tried == (first[-1] + 1 if len(first) == wanted else tries)
+    assert max(progress.kept for progress in seen) <= wanted
+
+
+def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:
+    lazy = tmp_path / "lazy.py"
+    lazy.write_text(
+        f"{PUSHER.read_text()}\n\ndef lazy(obs):\n    move = act(obs)\n    move[3] = 0.0\n    return move\n"
+    )
+    options = TaskOptions(num_envs=5, env_kwargs=PUSHED)
+    what = RecordOptions(
+        str(TASKS / "push_cube.py"),
+        tmp_path / "out",
+        successes=4,
+        pictures=False,
+        actions=f"{lazy}:lazy",
+        options=options,
+    )
+    done = record(what)
+    assert [episode.index for episode in done.written] == [0, 1, 2, 4]
+    assert done.tried == 5
+    assert all(bool(episode.evaluate["success"][-1]) for episode in read_all(done))
+    assert read_all(done)[0].info.acted_by == ((0, f"policy {lazy}:lazy"),)
+    assert len(list((tmp_path / "out").iterdir())) == 12
+
+
+def test_successes_that_do_not_come_are_given_up(tmp_path: Path) -> None:
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path,
+        successes=1,
+        tries=2,
+        actions="hold",
+        pictures=False,
+        max_steps=2,
+        options=TaskOptions(num_envs=2, env_kwargs=PLAIN),
+    )
+    done = record(what)
+    assert (done.written, done.tried) == ((), 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_actions_come_from_a_file_and_are_done_to_its_end(recorded: Recorded, tmp_path: Path) -> None:
+    actions = [episode.action for episode in read_all(recorded)]
+    np.savez(tmp_path / "actions.npz", *actions)
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path / "out",
+        actions=str(tmp_path / "actions.npz"),
+        pictures=False,
+        options=TaskOptions(num_envs=2, seed=10, env_kwargs=PLAIN),
+    )
+    for index, (one, other) in enumerate(zip(read_all(recorded), read_all(record(what)), strict=True)):
+        assert_same(one, other)
+        assert other.info.acted_by == ((0, f"file actions.npz, its array {index}"),)
+
+
+@pytest.mark.parametrize("use_env_states", [False, True])
+def test_demonstrations_are_replayed_from_their_own_seeds(
+    recorded: Recorded, use_env_states: bool, tmp_path: Path
+) -> None:
+    demonstration = recorded.written[1].path.with_suffix(".h5")
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path,
+        actions=str(demonstration),
+        use_env_states=use_env_states,
+        pictures=False,
+        options=TaskOptions(num_envs=2, env_kwargs=PLAIN),
+    )
+    done = record(what)
+    (replayed,) = read_all(done)
+    assert done.put_right == 0
+    assert_same(replayed, read_all(recorded)[1])
+    assert replayed.info.acted_by == ((0, f"file {demonstration.name}, traj_0"),)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (np.zeros((4, 3), np.float32), "3 dimensions"),
+        (np.zeros(4), "shape"),
+        (np.full((4, 8), np.nan), "NaN"),
+        (b"no array", "cannot be read"),
+        (None, "there is no file"),
+    ],
+)
+def test_a_file_of_actions_that_does_not_fit_is_refused_in_a_sentence(
+    content: Any, says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "actions.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.save(path, content)
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path / "out",
+        actions=str(path),
+        pictures=False,
+        options=TaskOptions(num_envs=1, env_kwargs=PLAIN),
+    )
+    with pytest.raises((ValueError, FileNotFoundError), match=says):
+        record(what)
+    assert not list((tmp_path / "out").glob("*"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"episodes": 2, "successes": 1}, "name one"),
+        ({"workers": 0}, "--workers"),
+        ({"use_env_states": True}, "--use-env-states needs"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(asked: dict[str, Any], says: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=says):
+        record(RecordOptions("PushCube-v1", tmp_path, **asked))
+
+
+def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -> None:
+    what = RecordOptions(
+        str(TASKS / "push_cube.py"), tmp_path, 1, max_steps=2, options=TaskOptions(num_envs=1)
+    )
+    (episode,) = read_all(record(what))
+    cameras = {track.info.name: track for track in episode.cameras}
+    assert {"base_camera", "render_camera"} <= cameras.keys()
+    assert len(cameras["base_camera"].frame) == 3
+    depth = cameras["base_camera"].depth
+    assert depth is not None and depth[0].shape == (128, 128)
+
+
+def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.py"
+    text = (TASKS / "minimal.py").read_text()
+    broken.write_text(text + "\n\nraise RuntimeError('not today')\n")
+    for workers in (1, 2):
+        what = RecordOptions(
+            str(broken), tmp_path / "out", workers=workers, options=TaskOptions(num_envs=workers)
+        )
+        with pytest.raises(TaskError, match="not today"):
+            record(what)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "tires.py").write_text(
+        "asked = 0\n\n\ndef act(obs):\n    global asked\n    asked += 1\n"
+        "    if asked > 4:\n        raise RuntimeError('tired')\n    return obs.new_zeros(len(obs), 8)\n"
+    )
+    policy = f"{tmp_path}/tires.py:act"
+    options = TaskOptions(num_envs=1, env_kwargs=PLAIN)
+    what = RecordOptions(
+        "PushCube-v1", tmp_path / "out", 2, actions=policy, pictures=False, max_steps=3, options=options
+    )
+    assert record_in_terminal(what) == 1
+    said = capsys.readouterr()
+    assert "policy failed" in said.err and "tired" in said.err
+    assert "1 episode that had ended before is kept: workbench review" in said.out
+
+
+def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (TASKS / "minimal.py").read_text()
+    (tmp_path / "goes.py").write_text(f"import os\n\nos.chdir('/')\n{text}")
+    (tmp_path / "act.py").write_text("def still(obs):\n    return obs.new_zeros(len(obs), 8)\n")
+    monkeypatch.chdir(tmp_path)
+    options = TaskOptions(num_envs=1, env_kwargs=PLAIN)
+    what = RecordOptions(
+        "goes.py", Path("out"), 1, actions="act.py:still", pictures=False, max_steps=2, options=options
+    )
+    (written,) = record(what).written
+    assert written.path.parent == Path("out") and (tmp_path / written.path).is_file()
+    assert Path.cwd() == tmp_path
+
+
+DRAWS = """
+import torch
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+
+
+class Draws(PushCubeEnv):
+    def _initialize_episode(self, env_idx, options):
+        super()._initialize_episode(env_idx, options)
+        self.target = torch.rand((self.num_envs, 2))
+"""
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
+    workers: int, tmp_path: Path
+) -> None:
+    file, found = tmp_path / "draws.py", []
+    file.write_text(DRAWS)
+    # A partial reset in each process takes two envs.
+    options = TaskOptions(num_envs=2 * workers, env_kwargs=PLAIN)
+    what = RecordOptions(
+        str(file), tmp_path / "out", 4, pictures=False, max_steps=2, workers=workers, options=options
+    )
+    assert len(record(what, on_finding=found.append).written) == 4
+    assert [(finding.rule, finding.line) for finding in found] == [("rows-rewritten", 9)]
+    off = replace(what, options=replace(options, rules="off"))
+    assert len(record(off, on_finding=found.append).written) == 4 and len(found) == 1
+
+
+def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
+    options = TaskOptions(num_envs=1, env_kwargs={"colour": "red"})
+    with pytest.raises(TaskError, match="unexpected keyword argument 'colour'"):
+        record(RecordOptions("PickCube-v1", tmp_path / "out", options=options))
+
+
+def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
+    (tmp_path / "hangs.py").write_text(
+        "from pathlib import Path\n\nasked = 0\n\n\n"
+        "def act(obs):\n    global asked\n    asked += 1\n"
+        "    while asked > 3:\n        Path('hung').touch()\n    return obs.new_zeros(8)\n"
+    )
+    command = [
+        *(
+            sys.executable,
+            "-m",
+            "workbench.cli.main",
+            "record",
+            "PushCube-v1",
+            "--no-pictures",
+            "--out",
+            "out",
+        ),
+        *("--env", "render_backend=none"),
+        *("--num-envs", "2", "--workers", "2", "--actions", "hangs.py:act"),
+    ]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    until(lambda: (tmp_path / "hung").exists() or process.poll() is not None, "the loop")
+    for _ in range(2):
+        time.sleep(0.5)  # the first must have been heard, or both are one
+        os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2 and "interrupted" in errors
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("workers", [pytest.param("1", marks=pytest.mark.slow), "2"])
+def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
+    command = [
+        *(sys.executable, "-m", "workbench.cli.main", "record", "PushCube-v1", "--no-pictures"),
+        *("--env", "render_backend=none"),
+        *("--episodes", "100000", "--max-steps", "3", "--num-envs", "2", "--workers", workers),
+        *("--out", str(tmp_path)),
+    ]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    until(lambda: list(tmp_path.glob("*.json")) or process.poll() is not None, "the first episode")
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
+    said, errors = process.communicate(timeout=60)
+    assert process.returncode == 2 and "interrupted" in errors
+    assert "Traceback" not in errors
+    written = sorted(tmp_path.glob("*.json"))
+    assert len(said.splitlines()) == len(written) + 1
+    assert not (tmp_path / ".writing").exists()
+    assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["record", "nothing_here.py"], "nothing_here.py"),
+        (["open", "nothing_here.py", "--port", "0"], "nothing_here.py"),
+        (["view", "nothing_here.rrd"], "nothing_here.rrd"),
+        (["open", "PickCube-v1", "--host", "0.0.0.0", "--no-token"], "token"),
+        (["open", "PickCube-v1", "--env", "robot"], "name=value"),
+    ],
+)
+def test_arguments_are_refused_with_a_sentence(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2 and says in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["record", "PickCub-v1"], "PickCube-v1"),
+        (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
+        (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
+        (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
+        (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),
+        (["record", "PickCube-v1", "--num-envs", "1", "--actions", "gone:act"], "no module gone"),
+        (["record", "PickCube-v1", "--num-envs", "1", "--actions", "json:act"], "json has no function act"),
+        (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
+    ],
+)
+def test_a_recording_that_cannot_be_made_ends_with_a_sentence(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    said = capsys.readouterr().err
+    assert ended.value.code not in (0, None) and says in said and "Traceback" not in said
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_page_that_cannot_be_opened_ends_with_a_sentence(tmp_path: Path) -> None:
+    """As a process: the door is open by then, and a worker is there."""
+    done = subprocess.run(
+        [sys.executable, "-m", "workbench.cli.main", "open", "PickCub-v1", "--port", "0"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+    )
+    assert done.returncode != 0 and "PickCube-v1" in done.stderr
+    assert "PickCub-v1" in done.stdout and "http" not in done.stdout
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_page_of_an_id_says_where_it_is_once() -> None:
+    with open_workbench(
+        "PickCube-v1", "--num-envs", "1", "--no-spare", "--env", "render_backend=none"
+    ) as opened:
+        opened.wait_for_line("loaded PickCube-v1")
+        assert sum("page  " in line for line in opened.lines) == 1

@@ -1,0 +1,301 @@
+"""Recordings in files judged again: ours, and those of ManiSkill's RecordEpisode; from code, terminal and page."""
+
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+from mani_skill.utils.wrappers.record import RecordEpisode
+
+from tests.drive.episodes import made, write
+from tests.drive.session import rescored
+from tests.session.recorded_runs import opened
+from workbench.authoring.problem import TaskError
+from workbench.cli.main import main
+from workbench.cli.rescore import RescoreOptions, rescore_all
+from workbench.cli.share import export_in_terminal
+from workbench.core.capture.recorded_state import apart, read_states
+from workbench.jobs.actions import read_given
+from workbench.jobs.from_recording import run_of
+from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.replay import arrive
+from workbench.jobs.task import TaskOptions
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.lerobot.export import ExportOptions
+from workbench.recording.reader.read_episode import read_episode, read_maniskill
+from workbench.recording.reader.reading import sources_among
+from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore.recordings import Rescorer
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+TASKS = Path(__file__).parents[2] / "tasks"
+TEXT = (TASKS / "push_cube.py").read_text()
+REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
+STEPS, EPISODES = 12, 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The author's file, and a folder of recordings beside it."""
+    folder = tmp_path_factory.mktemp("author")
+    (folder / "push_cube.py").write_text(TEXT)
+    options = TaskOptions(2, "cpu", 20, {"render_backend": "none"})
+    out = folder / "recordings"
+    record(
+        RecordOptions(
+            str(folder / "push_cube.py"),
+            out,
+            episodes=EPISODES,
+            pictures=False,
+            max_steps=STEPS,
+            options=options,
+        )
+    )
+    return folder
+
+
+@pytest.fixture
+def author(folder: Path) -> Path:
+    """The same, with the file as it was recorded."""
+    (folder / "push_cube.py").write_text(TEXT)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What ManiSkill's own wrapper writes of two episodes of a stock env."""
+    folder = tmp_path_factory.mktemp("foreign")
+    env: Any = gym.make("PickCube-v1", obs_mode="state", reward_mode="dense", render_backend="none")
+    env = RecordEpisode(env, str(folder), save_video=False, trajectory_name="demos", source_type="test")
+    rng = np.random.default_rng(0)
+    for seed in (6, 9):
+        env.reset(seed=seed)
+        for _ in range(STEPS):
+            env.step(rng.uniform(-1, 1, 8).astype(np.float32))
+    env.close()
+    return folder / "demos.h5"
+
+
+def edit(author: Path, old: str, new: str) -> None:
+    assert old in TEXT
+    (author / "push_cube.py").write_text(TEXT.replace(old, new))
+
+
+def test_no_recording_is_opened_in_this_process(
+    author: Path, foreign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise AssertionError(f"{path} was opened here")
+
+    for module in ("read_maniskill", "read_episode"):
+        monkeypatch.setattr(f"workbench.recording.{module}.open_h5", refuse)
+    assert len(rescore_all(RescoreOptions((foreign, author / "recordings")))[0]) == 5
+    assert [run.length for run in read_given(foreign)[0]] == [STEPS, STEPS]
+
+
+def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:
+    verdicts, notes = rescore_all(RescoreOptions((author / "recordings",)))
+    assert [verdict.seed for verdict in verdicts] == [20, 21, 22] and notes == ()
+    for verdict in verdicts:
+        assert not verdict.differs and verdict.differing == () and verdict.metres == 0
+        assert verdict.missed == {} and not verdict.begins_otherwise and verdict.length == STEPS
+
+
+def test_an_edited_reward_differs_by_what_was_edited_and_the_recorded_text_does_not(author: Path) -> None:
+    edit(author, REWARD, f"{REWARD} + 0.25")
+    files = tuple(sorted((author / "recordings").glob("*.rrd"))[:2])
+    verdicts, _ = rescore_all(RescoreOptions(files))
+    assert len(verdicts) == 2
+    for verdict in verdicts:
+        np.testing.assert_allclose(verdict.new_reward, verdict.old_reward + np.float32(0.25), rtol=1e-6)
+        assert verdict.first_difference == 1 and verdict.largest == pytest.approx(0.25, rel=1e-5)
+        assert verdict.returns[1] - verdict.returns[0] == pytest.approx(0.25 * STEPS, rel=1e-5)
+    before = set(Path("/tmp").glob("workbench-recorded-*"))
+    verdicts, _ = rescore_all(RescoreOptions(files, recorded_source=True))
+    assert [verdict.differs for verdict in verdicts] == [False, False]
+    assert set(Path("/tmp").glob("workbench-recorded-*")) <= before
+
+
+def test_another_file_can_be_judged_with(author: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.py"
+    other.write_text(TEXT.replace(REWARD, f"{REWARD} * 0"))
+    verdicts, _ = rescore_all(RescoreOptions((author / "recordings",), task=str(other), use_env_states=True))
+    assert all(not verdict.new_reward.any() for verdict in verdicts) and len(verdicts) == EPISODES
+
+
+def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
+    found = sources_among((foreign,))
+    assert [source.part for source in found] == ["traj_0", "traj_1"]
+    for use_env_states in (False, True):
+        verdicts, _ = rescore_all(RescoreOptions((foreign.parent,), use_env_states=use_env_states))
+        assert [verdict.seed for verdict in verdicts] == [6, 9]
+        for verdict in verdicts:
+            # A stock env and a batched one differ in the last bits.
+            assert verdict.why_not == "" and verdict.metres is not None and verdict.metres < 1e-4
+            assert verdict.success == (None, None) and not verdict.drifted
+            np.testing.assert_allclose(verdict.new_reward, verdict.old_reward, atol=1e-3)
+
+
+def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
+    run = run_of(read_maniskill(foreign, "traj_1"))
+    task = opened("PickCube-v1", 2, reward_mode="dense")
+    step, arrival = arrive(task, run, 8, [1])
+    assert arrival.way == "re-simulated" and arrival.metres is not None and arrival.metres < 1e-5
+    assert step.elapsed_steps.tolist()[1] == 8 and arrival.missed == {}
+    now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
+    assert apart(now, run.state(8))[0] < 1e-5
+    task.env.close()
+
+
+def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
+    run = run_of(read_episode(sorted((author / "recordings").glob("*.json"))[2]))
+    task = opened(str(author / "push_cube.py"), 2)
+    for state in (0, 5, STEPS):
+        _, arrival = arrive(task, run, state, [0])
+        assert (arrival.way, arrival.metres, arrival.missed) == ("re-simulated", 0, {})
+    task.env.close()
+
+
+def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nothing at"):
+        sources_among((tmp_path / "gone",))
+    with pytest.raises(UnreadableRecording, match="no recording in"):
+        sources_among((tmp_path,))
+    (tmp_path / "x.json").write_text("{}")
+    with pytest.raises(UnreadableRecording, match="no recording in"):
+        sources_among((tmp_path / "x.json",))
+
+
+def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
+    write(tmp_path / "made", made(6, seed=1), pictures=False)
+    dataset = tmp_path / "set"
+    assert export_in_terminal([tmp_path / "made"], dataset, ExportOptions()) == 0
+    assert {source.kind for source in sources_among([dataset])} == {"lerobot"}
+    with pytest.raises(UnreadableRecording, match="LeRobot dataset cannot be judged again"):
+        rescore_all(RescoreOptions((dataset,)))
+    verdicts, _ = rescore_all(RescoreOptions((dataset, author / "recordings")))
+    assert len(verdicts) == EPISODES and not any(verdict.why_not for verdict in verdicts)
+
+
+def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp_path: Path) -> None:
+    for file in (author / "recordings").iterdir():
+        shutil.copy(file, tmp_path)
+    broken, cut, _ = sorted(tmp_path.glob("*.rrd"))
+    for file in (broken, broken.with_suffix(".h5"), cut):
+        file.write_bytes(file.read_bytes()[:1000])
+    verdicts, _ = rescore_all(RescoreOptions((tmp_path,)))
+    # Of the second what there is to judge by is whole.
+    assert [bool(verdict.why_not) for verdict in verdicts] == [True, False, False]
+    assert broken.stem in verdicts[0].why_not
+
+
+# --- in the terminal ---------------------------------------------------------------------------------
+
+
+def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as ended:
+        main(["rescore", *arguments])
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out, told.err
+
+
+def test_the_command_prints_a_table_and_writes_it(
+    author: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(author, REWARD, f"{REWARD} * 2")
+    tables = [tmp_path / "out.csv", tmp_path / "out.json"]
+    recordings = str(author / "recordings")
+    code, out, _ = run([recordings, "--csv", str(tables[0]), "--json", str(tables[1])], capsys)
+    assert code == 0 and f"{EPISODES} of {EPISODES} episodes differ" in out
+    rows = list(csv.DictReader(tables[0].open()))
+    assert [row["seed"] for row in rows] == ["20", "21", "22"]
+    said = json.loads(tables[1].read_text())
+    assert all(row["return_now"] == pytest.approx(2 * row["return_before"], rel=1e-5) for row in said)
+    assert all(row["first_difference"] == 1 and row["drift_metres"] == 0 for row in said)
+
+
+def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(author, REWARD, "return self.nonsense(obs)")
+    code, _, err = run([str(author / "recordings")], capsys)
+    line = TEXT[: TEXT.index(REWARD)].count("\n") + 1
+    assert code == 1 and f"push_cube.py:{line}" in err and "nonsense" in err
+    with pytest.raises(TaskError):
+        rescore_all(RescoreOptions((author / "recordings",)))
+
+
+def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreign: Path) -> None:
+    edit(author, REWARD, "return self.nonsense(obs)")
+    verdicts, _ = rescore_all(RescoreOptions((author / "recordings", foreign)))
+    broken = [verdict for verdict in verdicts if "nonsense" in verdict.why_not]
+    judged = [verdict for verdict in verdicts if not verdict.why_not]
+    assert (len(broken), len(judged)) == (EPISODES, 2)
+
+
+def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recordings = str(author / "recordings")
+    assert run([recordings, "--task", "x.py", "--recorded-source"], capsys)[0] == 2
+    code, _, err = run([recordings, "--csv", str(author / "no" / "where.csv")], capsys)
+    assert code == 2 and "there is no folder" in err
+    code, _, err = run([str(author / "nothing")], capsys)
+    assert code == 2 and "There is nothing at" in err
+
+
+# --- for a page ----------------------------------------------------------------------------------------
+
+
+def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreign: Path) -> None:
+    rescorer = Rescorer()
+    try:
+        edit(author, REWARD, f"{REWARD} * 2")
+        rescorer.start(sources_among((author / "recordings",)))
+        view = rescored(rescorer, "done", "failed")
+        assert view.why == "" and len(view.verdicts) == view.total == EPISODES
+        assert view.steps == EPISODES * STEPS and all(verdict.differs for verdict in view.verdicts)
+        assert words.summary(view.verdicts).startswith("3 of 3 episodes differ")
+
+        edit(author, REWARD, "return 1 / 0")
+        rescorer.start(sources_among((author / "recordings",)))
+        view = rescored(rescorer, "failed", "done")
+        assert "could not be opened" in view.why and "ZeroDivisionError" in view.problem.message
+        rescorer.start(sources_among((author / "recordings", foreign)))
+        view = rescored(rescorer, "done", "failed")
+        assert view.state == "done"
+        assert ["ZeroDivisionError" in v.why_not for v in view.verdicts] == [True] * EPISODES + [False] * 2
+        rescorer.start(sources_among((author / "recordings",)), recorded_source=True)
+        view = rescored(rescorer, "done", "failed")
+        assert view.why == "" and not any(verdict.differs for verdict in view.verdicts)
+
+        edit(author, REWARD, "import time; time.sleep(1000)")
+        rescorer.start(sources_among((author / "recordings",)))
+        rescored(rescorer, "loading")
+        rescorer.judging.stop()
+        rescored(rescorer, "stopped")
+    finally:
+        rescorer.judging.close()
+
+
+def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(
+    author: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(author / "recordings", tmp_path / "r")
+    one, other, whole = sorted((tmp_path / "r").glob("*.json"))
+    for path in (one.with_suffix(".h5"), other.with_suffix(".h5"), other.with_suffix(".rrd")):
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    verdicts, _ = rescore_all(RescoreOptions((tmp_path / "r",), task=str(author / "push_cube.py")))
+    by_name = {verdict.of.path.stem: verdict for verdict in verdicts}
+    assert not by_name[one.stem].why_not and not by_name[one.stem].differs
+    assert f"{one.stem}.h5: was cut short or changed" in words.not_carried(verdicts)[0]
+    assert f"{other.stem}.h5 was cut short or changed" in by_name[other.stem].why_not
+    assert not by_name[whole.stem].why_not and by_name[whole.stem].missed == {}

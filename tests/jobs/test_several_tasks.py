@@ -1,0 +1,105 @@
+"""A file with several tasks: one that works is opened, the others can be chosen, also when the one that was tried fails."""
+
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.drive.session import TASKS, wait_until
+from workbench.authoring.problem import TaskError
+from workbench.jobs.open_task import open_task
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+from workbench.session.protocol.messages import Load
+from workbench.session.worker.reload import load_version
+
+OPTIONS = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
+BROKEN = '    def _load_scene(self, options):\n        raise ValueError("no cubes")\n'
+
+
+def tasks(*names: str, broken: tuple[str, ...]) -> str:
+    """A file in which these are registered in this order, with a base class that they have in common."""
+    text = (TASKS / "minimal.py").read_text()
+    text = text.replace('@register_env("WorkbenchMinimal-v1", max_episode_steps=50)\n', "")
+    for name in names:
+        text += f'\n\n@register_env("Several{name}-v1", max_episode_steps=9)\nclass {name}(MinimalEnv):\n'
+        text += BROKEN if name in broken else "    pass\n"
+    return text
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path.resolve() / "several.py"
+
+
+def test_the_first_that_opens_is_opened_and_named(file: Path) -> None:
+    file.write_text(tasks("OneEnv", "TwoEnv", "ThreeEnv", "FourEnv", broken=("FourEnv", "ThreeEnv")))
+    opened, report = load_version(Load(str(file), OPTIONS, any_task=True), None)
+    opened.env.close()
+    task = opened.description
+    assert report is None and (task.chosen, task.env_id, task.in_place_of) == (
+        "TwoEnv",
+        "SeveralTwoEnv-v1",
+        "FourEnv",
+    )
+    assert sorted(task.others) == ["FourEnv", "MinimalEnv", "OneEnv", "ThreeEnv"]
+    (notice,) = task.notices
+    assert notice.startswith("FourEnv was tried first and failed") and "no cubes" in notice
+    assert f"{file}:" in notice and "TwoEnv is open in its place" in notice
+
+
+def test_where_a_certain_task_is_wanted_the_others_are_named_and_none_is_opened(file: Path) -> None:
+    file.write_text(tasks("OneEnv", "TwoEnv", broken=("TwoEnv",)))
+    for reference, any_task in ((str(file), False), (f"{file}:TwoEnv", True)):
+        with pytest.raises(TaskError) as caught:
+            load_version(Load(reference, OPTIONS, any_task=any_task), None)
+        assert caught.value.classes[0] == "TwoEnv" and set(caught.value.classes[1:]) == {
+            "OneEnv",
+            "MinimalEnv",
+        }
+        problem = caught.value.problem
+        assert "no cubes" in problem.message and "TwoEnv of several.py was tried" in problem.message
+        assert "OneEnv" in problem.message and "several.py:" in problem.message
+        assert problem.file == str(file) and problem.line is not None
+    with pytest.raises(TaskError, match="which also has .*OneEnv.*name one"):
+        open_task(str(file), OPTIONS)
+
+
+def test_a_base_class_is_not_opened_in_place_of_its_tasks(file: Path) -> None:
+    file.write_text(tasks("OneEnv", "TwoEnv", broken=("OneEnv", "TwoEnv")))
+    with pytest.raises(TaskError) as caught:
+        load_version(Load(str(file), OPTIONS, any_task=True), None)
+    assert caught.value.classes[0] == "TwoEnv"
+
+
+def test_the_chooser_stays_while_the_one_that_was_tried_fails(
+    child_process: None, file: Path, tmp_path: Path
+) -> None:
+    file.write_text(tasks("OneEnv", "TwoEnv", broken=("TwoEnv",)))
+    session = Session(f"{file}:TwoEnv", OPTIONS, recordings=tmp_path / "recordings")
+    try:
+        view = wait_until(session, lambda v: v.problem is not None, "the failure")
+        assert view.task is None and view.choices[0] == "TwoEnv" and "OneEnv" in view.choices
+
+        session.versions.choose_class("OneEnv")
+        view = wait_until(session, lambda v: v.task is not None, "the one that works")
+        assert view.task.chosen == view.choices[0] == "OneEnv" and view.problem is None
+
+        session.versions.choose_class("TwoEnv")
+        view = wait_until(session, lambda v: v.problem is not None, "the failure again")
+        assert view.task.chosen == "OneEnv" and view.choices[0] == "TwoEnv"
+
+        session.versions.choose_class("OneEnv")
+        view = wait_until(session, lambda v: v.problem is None, "the one that works again")
+        assert view.task.chosen == view.choices[0] == "OneEnv"
+
+        session.versions.choose_class("TwoEnv")
+        wait_until(session, lambda v: v.problem is not None and v.choices[0] == "TwoEnv", "the failure")
+        file.write_text(tasks("OneEnv", "TwoEnv", broken=()))
+        view = wait_until(session, lambda v: v.task.chosen == "TwoEnv", "the mended one")
+        assert view.problem is None
+    finally:
+        session.close()

@@ -1,0 +1,199 @@
+"""What is otherwise in a run, by the numbers that a task says of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from workbench.jobs.verdict import (
+    DOUBTFUL_METRES,
+    DOUBTFUL_RADIANS,
+    Said,
+    Verdict,
+    compare,
+    gap,
+    in_order,
+    single_numbers,
+)
+from workbench.session.rescore import verdict_text as words
+
+REWARD = [0.0, 1.0, 2.0, 3.0]
+
+
+def said(reward: Any = REWARD, **evaluate: Any) -> Said:
+    return Said(np.array(reward, float), {name: np.array(rows) for name, rows in evaluate.items()})
+
+
+def test_what_is_the_same_differs_nowhere() -> None:
+    found = compare(
+        "it", said(success=[False] * 5, height=[0.1] * 5), said(success=[0.0] * 5, height=[0.1] * 5)
+    )
+    assert found.of == "it" and found.length == 4 and not found.differs and found.differing == ()
+    assert found.returns == (6, 6) and found.largest == 0 and found.has_success
+    assert found.success == found.fail == (None, None) and found.look_at is None
+    assert (found.metres, found.radians, found.drift_at) == (None, 0, None) and not found.drifted
+    assert (found.task, found.seed, found.begins_otherwise, found.missed) == ("", -1, False, {})
+    assert words.what_changed(found) == "as it was"
+
+
+@pytest.mark.parametrize(("share", "differs"), [(0.9e-5, False), (1.1e-5, True)])
+def test_a_reward_is_another_from_a_share_of_the_largest_on(share: float, differs: bool) -> None:
+    now = [0.0, 1.0, 2.0 + 3.0 * share, 3.0]
+    found = compare(0, said(), said(now))
+    assert found.differs == differs and found.largest == pytest.approx(3 * share)
+    assert found.first_difference == (3 if differs else None) and found.differing == ("reward",) * differs
+
+
+@pytest.mark.parametrize(("change", "differs"), [(0.9e-7, False), (1.1e-7, True)])
+def test_where_all_is_zero_a_number_is_another_from_a_hair_on(change: float, differs: bool) -> None:
+    zero = np.zeros(4)
+    assert compare(0, said(zero), said(zero + change)).differs == differs
+    found = compare(0, said(height=np.zeros(5)), said(height=np.full(5, change)))
+    assert found.differing == ("height",) * differs and not found.differs
+
+
+def test_the_reward_differs_first_and_most_at_steps_of_the_episode() -> None:
+    found = compare(0, said(), said([0.0, 1.5, 4.0, 3.5]), begin=10)
+    assert (found.first_difference, found.look_at, found.largest) == (12, 13, 2)
+    assert words.what_changed(found) == "reward by up to 2, from step 12"
+
+
+def test_success_and_fail_are_named_by_the_step_after_which_they_are_first_true() -> None:
+    old = said(success=[0, 0, 1, 1, 0], fail=[0] * 5)
+    found = compare(0, old, said(success=[0, 0, 0, 1, 0], fail=[0, 1, 0, 0, 0]), begin=5)
+    assert found.success == (7, 8) and found.fail == (None, 6)
+    assert (found.first_difference, found.look_at) == (6, 8) and found.differing == ("success", "fail")
+    assert words.what_changed(found) == "success now at step 8, was at step 7, fail now at step 6, was never"
+    gone = compare(0, said([1, 1, 1, 1], fail=[0, 0, 1, 1, 1]), said([1, 1, 1, 9]))
+    assert gone.fail == (2, None) and gone.look_at == 2 and gone.first_difference == 2
+    assert not gone.has_success
+
+
+def test_a_flag_that_is_first_true_as_before_and_then_otherwise_is_said() -> None:
+    found = compare(0, said(success=[0, 1, 1, 1, 1]), said(success=[0, 1, 1, 0, 1]))
+    assert found.success == (1, 1) and found.differing == ("success",)
+    assert (found.first_difference, found.look_at) == (3, 3)
+    assert words.what_changed(found) == "success at other steps, from step 3"
+    assert not compare(0, said(success=[0.5] * 5), said(success=[0.0] * 5)).differs, "half a truth is none"
+    both = compare(0, said(success=[1, 1, 1, 1, 1]), said([9, 1, 2, 3], success=[1, 0, 1, 1, 1]))
+    assert words.what_changed(both) == "reward by up to 9, from step 1" and both.look_at == 1
+
+
+def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
+    old = said(height=[0.1] * 5, speed=[1.0] * 5, gone=[1] * 5)
+    found = compare(0, old, said(height=[0.1, 0.1, 0.2, 0.1, 0.1], speed=[1.0] * 5, new=[2] * 5))
+    assert not found.differs and found.differing == found.others == ("height",)
+    assert words.what_changed(found) == "as it was, but for height"
+
+
+def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
+    found = compare(
+        0,
+        said(),
+        said(success=[0] * 5),
+        task="Push-v1",
+        seed=7,
+        begins_otherwise=True,
+        missed={"cube": "gone"},
+    )
+    assert (found.task, found.seed, found.begins_otherwise, found.missed) == (
+        "Push-v1",
+        7,
+        True,
+        {"cube": "gone"},
+    )
+    assert found.has_success and compare(0, said(success=[0] * 5), said()).has_success
+    assert words.not_carried([found, found]) == ("cube: gone",)
+
+
+def test_one_that_was_not_judged_says_nothing_else() -> None:
+    found = Verdict("it", why_not="it has no step")
+    assert (found.seed, found.length, found.returns, found.largest, found.differing) == (-1, 0, (0, 0), 0, ())
+    assert len(found.old_reward) == len(found.new_reward) == 0 and found.metres is None
+    assert words.what_changed(found) == "not judged: it has no step"
+
+
+def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:
+    nan = np.nan
+    old = said(a=[nan, 1, 1, 1, 1], b=[1, 1, 1, nan, 1], c=[1, 1, 1, 1, 1], success=[nan, 0, 0, 0, 0])
+    found = compare(0, old, said(a=[5, 1, 1, 1, 1], b=[1, 1, 1, 1, 1], c=[nan, 1, 1, 1, 1], success=[0] * 5))
+    assert found.differing == ("b", "c")
+    assert compare(0, old, said(a=[5, 2, 1, 1, 1])).differing == ("a",)
+    inf = compare(0, said([np.inf, 1, 1, 1]), said([np.inf, 1, 1, 1]))
+    assert not inf.differs and inf.largest == 0
+    assert gap(np.array([nan, np.inf, 1, 1]), np.array([nan, np.inf, 1, nan])).tolist() == [0, 0, 0, np.inf]
+    lost = compare(0, said(), said([0.0, nan, 2.0, 3.0]))
+    assert (
+        lost.look_at == lost.first_difference == 2
+        and words.what_changed(lost) == "reward NaN now, from step 2"
+    )
+
+
+def test_without_recorded_rewards_there_is_nothing_to_compare_them_with() -> None:
+    found = compare(0, said([], success=[0] * 5), said(success=[0, 0, 0, 0, 1]))
+    assert found.differing == ("success",) and found.largest == 0
+    assert np.isnan(found.old_reward).all() and len(found.old_reward) == 4
+    assert words.returns(found) == "none → 6"
+
+
+def test_it_is_compared_as_far_as_it_is_said_now() -> None:
+    old = said(success=[0, 0, 0, 0, 1], height=[0, 0, 0, 0, 7.0], short=[0.0, 0])
+    found = compare(0, old, said([0.0, 1.0], success=[0, 0, 0], height=[0.0, 0, 0], short=[0.0, 9, 9]))
+    assert found.length == 2 and not found.differing and found.returns == (1, 1)
+
+
+def test_each_entry_has_a_scale_of_its_own() -> None:
+    old = said(large=[1e6] * 5, small=[1.0] * 5, lost=[np.inf] * 5)
+    now = said(large=[1e6 + 1] * 5, small=[1.0, 1.0, 1.5, 1.0, 1.0], lost=[np.inf] * 4 + [-np.inf])
+    assert compare(0, old, now).differing == ("small", "lost")
+
+
+def test_drift_is_that_of_the_state_that_is_furthest() -> None:
+    drift = np.array([[0, 0], [2e-3, 1e-4], [1e-3, 0.02], [0, 0], [0, 0]])
+    found = compare(0, said(), said(), drift, begin=7)
+    assert (found.metres, found.radians, found.drift_at) == (2e-3, 0.02, 8) and found.drifted
+    still = compare(0, said(), said(), np.zeros((5, 2)))
+    assert (still.metres, still.drift_at) == (0, None) and not still.drifted
+    for metres, radians, drifted in (
+        (DOUBTFUL_METRES, DOUBTFUL_RADIANS, False),
+        (2 * DOUBTFUL_METRES, 0.0, True),
+        (0.0, 2 * DOUBTFUL_RADIANS, True),
+        (0.0, 0.02, True),
+        (0.002, 0.0, True),
+        (float("nan"), 0.0, True),
+        (None, 1.0, False),
+    ):
+        assert Verdict(0, metres=metres, radians=radians).drifted == drifted
+
+
+def test_what_changed_most_comes_first_and_what_was_not_judged_last() -> None:
+    moved = {"first_difference": 1, "returns": (1.0, 1.0)}
+    given = [
+        Verdict("same"),
+        Verdict("skipped", why_not="x"),
+        Verdict("less", first_difference=1, returns=(1.0, 1.1)),
+        Verdict("lost", first_difference=1, returns=(1.0, float("nan"))),
+        Verdict("fails", fail=(None, 2), **moved),  # pyright: ignore[reportArgumentType]
+        Verdict("succeeds", success=(None, 2), **moved),  # pyright: ignore[reportArgumentType]
+        Verdict("both", success=(None, 2), fail=(1, None), **moved),  # pyright: ignore[reportArgumentType]
+        Verdict("more", first_difference=1, returns=(1.0, -9.0)),
+    ]
+    order = ["both", "succeeds", "fails", "lost", "more", "less", "same", "skipped"]
+    assert [verdict.of for verdict in in_order(given)] == order
+    never = replace(given[3], returns=(float("nan"), float("nan")))
+    assert [verdict.of for verdict in in_order([never, given[2]])] == ["less", "lost"]
+
+
+def test_entries_of_one_number_an_env_are_compared_and_no_others() -> None:
+    evaluate: dict[str, Any] = {
+        "flag": np.array([True, False]),
+        "column": np.array([[1], [2]]),
+        "place": np.zeros((2, 3)),
+        "odd": np.array(["a", "b"]),
+        "reward": np.array([1.0, 2.0]),
+    }
+    found = single_numbers(evaluate)
+    assert list(found) == ["flag", "column", "evaluate/reward"] and found["column"].tolist() == [1, 2]

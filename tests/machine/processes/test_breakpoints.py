@@ -1,0 +1,43 @@
+"""``breakpoint()`` where there is no terminal: it raises at its own line, unless Python is told of something else."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from workbench.machine.processes.child_python import child_environment, python_command
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+BEGIN = "from workbench.machine.processes.breakpoints import refuse_breakpoints\nrefuse_breakpoints('remove this line')\n"
+
+
+@pytest.mark.parametrize(
+    ("named", "call", "raises"),
+    [
+        ("", "breakpoint()", True),
+        ("pdb.set_trace", "breakpoint()", True),
+        ("0", "breakpoint()", False),
+        ("builtins.print", "breakpoint()", False),
+        ("0", "from pdb import set_trace\nset_trace(header='here')", True),
+    ],
+)
+def test_it_raises_at_its_line_or_does_what_python_was_told(
+    named: str, call: str, raises: bool, tmp_path: Path
+) -> None:
+    file = tmp_path / "task.py"
+    file.write_text(f"{BEGIN}{call}\nprint('went on')\n")
+    done = subprocess.run(
+        python_command(str(file)),
+        env=child_environment(PYTHONBREAKPOINT=named),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ("went on" in done.stdout) != raises
+    line = len(BEGIN.splitlines()) + len(call.splitlines())
+    assert (f"line {line}, in <module>\n    {call.splitlines()[-1]}" in done.stderr) == raises
+    assert ("no terminal to ask in: remove this line" in done.stderr) == raises

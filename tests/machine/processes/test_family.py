@@ -1,0 +1,222 @@
+"""Nothing that a worker started outlives it, however it tries, and nothing else is touched."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.drive.waiting import until
+from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.family import (
+    children,
+    describe_exit,
+    end_family,
+    family,
+    main_thread_ended,
+    proportional_memory,
+    resident_memory,
+)
+from workbench.session.process.memory_limit import FamilyMemory
+
+_MEMBER = '''
+import ctypes, mmap, os, signal, sys, threading, time
+
+
+def detach():
+    """As a daemon does it, and under another name and an empty environment."""
+    if os.fork() == 0:
+        os.setsid()
+        if os.fork() == 0:
+            os.execve("/bin/sleep", ["innocent", "600"], {})
+        os._exit(0)
+    os.wait()
+
+
+def main(how, *_):
+    if how in ("hold", "share"):
+        held = mmap.mmap(-1, 64 * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        held.write(b"x" * len(held))
+        if how == "share":
+            for _ in range(4):
+                if os.fork() == 0:
+                    time.sleep(600)
+        print("ready", flush=True)
+        time.sleep(600)
+    detach()
+    os.posix_spawn("/bin/sleep", ["sleep", "600"], {})
+    print("ready", flush=True)
+    sys.stdin.readline()
+    if how == "exit":
+        sys.exit(3)
+    if how == "crash":
+        ctypes.string_at(0)
+    if how == "group":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        os.killpg(0, signal.SIGTERM)
+        os._exit(5)
+    if how == "pthread_exit":
+        threading.Thread(target=time.sleep, args=(600,)).start()
+        ctypes.CDLL(None).pthread_exit(None)
+    time.sleep(600)
+'''
+
+
+@pytest.fixture
+def begin(child_process: None, tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    begun: list[subprocess.Popen[bytes]] = []
+    (tmp_path / "family_member.py").write_text(_MEMBER)
+
+    def begin(how: str) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
+            python_command(
+                "-m", "workbench.machine.processes.family", str(os.getpid()), "family_member", how
+            ),
+            env=child_environment(PYTHONPATH=str(tmp_path)),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        begun.append(process)
+        assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+        return process
+
+    yield begin
+    for process in begun:
+        end_family(process)
+
+
+def members(keeper: int) -> list[psutil.Process]:
+    return [psutil.Process(pid) for pid in family(keeper)[1:]]
+
+
+def gone(processes: list[psutil.Process]) -> bool:
+    return not psutil.wait_procs(processes, timeout=10)[1]
+
+
+@pytest.mark.parametrize(("how", "code"), [("exit", 3), ("crash", -signal.SIGSEGV), ("group", 5)])
+def test_what_detached_itself_goes_with_the_worker_and_the_exit_code_is_the_workers(
+    begin: Callable[..., subprocess.Popen[bytes]], how: str, code: int
+) -> None:
+    keeper = begin(how)
+    until(lambda: len(family(keeper.pid)) == 4, "the whole family")
+    all_of_it = members(keeper.pid)
+    assert {process.name() for process in all_of_it} >= {"sleep"}
+    assert keeper.stdin is not None
+    keeper.stdin.write(b"\n")
+    keeper.stdin.close()
+    assert keeper.wait(timeout=20) == code
+    assert gone(all_of_it)
+
+
+def test_a_worker_that_is_killed_takes_its_family_along(
+    begin: Callable[..., subprocess.Popen[bytes]],
+) -> None:
+    keeper = begin("wait")
+    all_of_it = members(keeper.pid)
+    os.kill(children(keeper.pid)[0], signal.SIGKILL)
+    assert keeper.wait(timeout=20) == -signal.SIGKILL and gone(all_of_it)
+
+
+def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
+    one, other = begin("wait"), begin("wait")
+    ours = subprocess.Popen(["sleep", "600"], start_new_session=True)
+    all_of_one, all_of_other = members(one.pid), members(other.pid)
+    end_family(one)
+    assert one.returncode == -signal.SIGKILL and gone(all_of_one)
+    assert all(process.is_running() for process in all_of_other) and ours.poll() is None
+    end_family(other)
+    ours.kill()
+    assert ours.wait() == -signal.SIGKILL and gone(all_of_other)
+
+
+def test_a_keeper_that_was_stopped_is_not_waited_for(
+    begin: Callable[..., subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.machine.processes.family._LONGEST_END", 0.1)
+    keeper = begin("wait")
+    all_of_it = members(keeper.pid)
+    os.kill(keeper.pid, signal.SIGSTOP)
+    end_family(keeper)
+    worker = all_of_it.pop(0)
+    assert gone([worker])
+    for process in all_of_it:
+        process.kill()
+
+
+def test_a_server_that_is_killed_leaves_no_family(child_process: None, tmp_path: Path) -> None:
+    (tmp_path / "family_member.py").write_text(_MEMBER)
+    (tmp_path / "server.py").write_text(
+        "import os, subprocess, sys, time\n"
+        "command = [sys.executable, '-m', 'workbench.machine.processes.family', str(os.getpid()), 'family_member', 'wait']\n"
+        "subprocess.Popen(command, stdin=subprocess.DEVNULL)\n"
+        "time.sleep(600)\n"
+    )
+    server = subprocess.Popen(
+        [sys.executable, str(tmp_path / "server.py")],
+        env=child_environment(PYTHONPATH=str(tmp_path)),
+        stdout=subprocess.PIPE,
+    )
+    assert server.stdout is not None
+    # The member's stdin is at its end: it goes on to sleep.
+    assert server.stdout.readline() == b"ready\n"
+    until(lambda: len(family(server.pid)) == 5, "the whole family")
+    all_of_it = members(server.pid)
+    server.kill()
+    server.wait()
+    assert gone(all_of_it)
+
+
+def test_the_memory_of_a_family_counts_what_is_shared_once(
+    begin: Callable[..., subprocess.Popen[bytes]],
+) -> None:
+    keeper = begin("share")
+    until(lambda: len(family(keeper.pid)) == 6, "the whole family")
+    everyone = family(keeper.pid)[1:]
+    assert sum(map(resident_memory, everyone)) > 5 * 64 * 2**20
+    together = proportional_memory(everyone)
+    assert 64 * 2**20 < together < 2 * 64 * 2**20
+    memory = FamilyMemory(keeper.pid)
+    assert 64 * 2**20 < memory.look(limit=2 * 64 * 2**20) < 2 * 64 * 2**20
+    end_family(keeper)
+    assert memory.look() == 0
+
+
+def test_the_memory_of_what_detached_itself_is_counted(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
+    keeper = begin("hold")
+    alone = FamilyMemory(keeper.pid).look()
+    assert alone == resident_memory(children(keeper.pid)[0]) > 64 * 2**20
+    end_family(keeper)
+
+
+def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
+    keeper = begin("pthread_exit")
+    worker = children(keeper.pid)[0]
+    assert not main_thread_ended(worker)
+    assert keeper.stdin is not None
+    keeper.stdin.write(b"\n")
+    keeper.stdin.close()
+    until(lambda: main_thread_ended(worker), "the end of its main thread")
+    assert keeper.poll() is None
+    end_family(keeper)
+    assert not main_thread_ended(worker)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (-signal.SIGSEGV, "was killed by SIGSEGV"),
+        (-40, "was killed by signal 40"),  # a real-time one, which Python has no name for
+        (3, "ended with exit code 3"),
+        (None, "stopped answering"),
+    ],
+)
+def test_an_end_is_said_in_words(code: int | None, words: str) -> None:
+    assert describe_exit(code) == words

@@ -1,0 +1,300 @@
+"""What is sent comes back as it was, and whatever else comes is data of the kinds that are awaited or unreadable."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import struct
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from msgspec import inspect
+
+from tests.ui.scenes import camera, description, step_of, table_scene
+from workbench.core.capture.inspection import Inspection
+from workbench.core.rules import Finding
+from workbench.jobs.pool import Answer
+from workbench.jobs.task import Stepped, TaskOptions
+from workbench.jobs.verdict import Rescore
+from workbench.machine.processes.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
+from workbench.recording.episode.source import Source
+from workbench.session.protocol.messages import Event, Failed, Load, Loaded, Loading, Status
+from workbench.session.protocol.questions import QUESTIONS
+
+EVENTS: tuple[type, ...] = get_args(Event)
+WHATEVER = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(max_size=9)
+    | st.builds(msgspec.msgpack.Ext, st.integers(-128, 127), st.binary(max_size=12)),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5) | st.integers(0, 9), inner, max_size=3),
+    max_leaves=5,
+)  # fmt: skip
+ARRAYS = st.builds(
+    lambda kind, shape: np.zeros(shape, kind),
+    st.sampled_from(["?", "<i4", "<f4", "<f8", "<U3", "|u1"]),
+    st.lists(st.integers(0, 3), max_size=3),
+)
+
+
+def same(one: object, other: object) -> bool:
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
+    if is_dataclass(one):
+        return type(one) is type(other) and all(
+            same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one)
+        )
+    if isinstance(one, dict):
+        return (
+            isinstance(other, dict)
+            and one.keys() == other.keys()
+            and all(same(one[k], other[k]) for k in one)
+        )
+    if isinstance(one, tuple):
+        return isinstance(other, tuple) and len(one) == len(other) and all(map(same, one, other))
+    return one == other
+
+
+@st.composite
+def of_schema(draw: st.DrawFn, kind: inspect.Type, wrong: float) -> Any:
+    """Data as a message of this kind has it; each part of it is something else with this probability."""
+    if wrong and draw(st.floats(0, 1)) < wrong:
+        return draw(WHATEVER)
+    again = lambda one: draw(of_schema(one, wrong))  # noqa: E731
+    several = lambda one: [again(one) for _ in range(draw(st.integers(0, 2)))]  # noqa: E731
+    match kind:
+        case inspect.DataclassType():
+            chosen = [field for field in kind.fields if field.required or draw(st.booleans())]
+            left_out = (
+                draw(st.sampled_from(kind.fields))
+                if wrong and kind.fields and draw(st.integers(0, 9)) == 0
+                else None
+            )
+            return {field.encode_name: again(field.type) for field in chosen if field is not left_out}
+        case inspect.UnionType():
+            return again(draw(st.sampled_from(kind.types)))
+        case inspect.DictType():
+            return {
+                draw(st.text(max_size=4))
+                if isinstance(kind.key_type, inspect.StrType)
+                else _hashable(again(kind.key_type)): again(kind.value_type)
+                for _ in range(draw(st.integers(0, 2)))
+            }
+        case inspect.TupleType():
+            return [again(one) for one in kind.item_types]
+        case (
+            inspect.VarTupleType()
+            | inspect.ListType()
+            | inspect.FrozenSetType()
+            | inspect.SetType()
+            | inspect.CollectionType()
+        ):
+            return several(kind.item_type)
+        case inspect.LiteralType():
+            return draw(st.sampled_from(kind.values))
+        case inspect.EnumType():
+            return draw(st.sampled_from([one.value for one in kind.cls]))
+        case inspect.CustomType():
+            return draw(st.binary(max_size=5)) if kind.cls is Path else draw(ARRAYS)
+        case inspect.IntType():
+            return draw(st.integers(-(2**31), 2**31))
+        case inspect.FloatType():
+            return draw(st.floats())
+        case inspect.StrType():
+            return draw(st.text(max_size=5))
+        case inspect.BoolType():
+            return draw(st.booleans())
+        case inspect.BytesType():
+            return draw(st.binary(max_size=5))
+        case inspect.NoneType():
+            return None
+    assert isinstance(kind, inspect.AnyType), kind
+    return draw(WHATEVER.filter(lambda value: not _has_extension(value)))
+
+
+def _hashable(value: Any) -> Any:
+    value = tuple(map(_hashable, value)) if isinstance(value, list) else value
+    return value if isinstance(value, str | int | float | bytes | tuple | None) else 0
+
+
+def _has_extension(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(map(_has_extension, value.values()))
+    return (
+        any(map(_has_extension, value)) if isinstance(value, list) else isinstance(value, msgspec.msgpack.Ext)
+    )
+
+
+@pytest.mark.parametrize("kind", [*EVENTS, *QUESTIONS], ids=lambda kind: kind.__name__)
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+)
+@given(st.data())
+def test_whatever_is_made_of_the_schema_is_that_message_and_what_is_not_is_unreadable(
+    kind: type, data: st.DataObject
+) -> None:
+    schema = inspect.type_info(kind)
+    number = 3 if kind in QUESTIONS else None
+    unpacker = Unpacker(EVENTS, QUESTIONS)
+    right = unpacker.message(pack((kind.__name__, number, data.draw(of_schema(schema, 0.0)))))
+    assert isinstance(right.request if number else right, kind)
+    try:
+        wrong = unpacker.message(pack((kind.__name__, number, data.draw(of_schema(schema, 0.2)))))
+    except Unreadable as error:
+        assert str(error)
+    else:
+        # What it says passes: then it says the same when it is packed again.
+        again = unpacker.message(pack_message(wrong))
+        assert type(again) is type(wrong)
+
+
+def test_every_answer_has_a_type_that_can_be_read() -> None:
+    kinds: tuple[Any, ...] = QUESTIONS
+    for question in kinds:
+        for kind in (value_type(question), question.part):
+            with pytest.raises(Unreadable, match="Expected|in place of"):
+                Unpacker().unpack(
+                    pack({3: True} if kind in (str, None, type(None)) else "?"), kind or type(None)
+                )
+
+
+def messages() -> list[Any]:
+    geometry, poses = table_scene(2)
+    task = description(geometry, (camera(),))
+    step = step_of(poses, success=np.array([True, False]), words=np.array(["a", "bc"]), none=np.zeros((2, 0)))
+    return [
+        Loading("importing"),
+        Status(True, float("inf"), float("nan")),
+        Loaded(task, step, {"import": 1.0}),
+        Stepped(
+            step, np.zeros(2, bool), snapshot=b"\0" * 99, new_parts={3: b"x"}, part_keys=(1, 2), number=7
+        ),
+        Inspection(1, 2, refused=(("state", "no"),)),
+        Answer(3, pack(step)),
+        Call(4, Load("file.py", TaskOptions(2, env_kwargs={"a": [1, None, 2.5]}), source={"f": "text"})),
+        Call(5, Rescore((Source(Path("/a/b.rrd"), None, "1", "one"),), True)),
+    ]
+
+
+@pytest.mark.parametrize("message", messages(), ids=lambda message: type(message).__name__)
+def test_a_message_comes_as_it_was_sent(message: Any) -> None:
+    got = Unpacker(EVENTS, QUESTIONS).message(pack_message(message))
+    if isinstance(message, Status):
+        assert np.isnan(got.real_time_factor) and got.steps_per_second == float("inf")
+    else:
+        assert same(got, message)
+
+
+def test_arrays_can_be_written_to_and_one_that_is_named_twice_is_sent_once() -> None:
+    array = np.arange(1000.0)
+    packed = pack(
+        {"a": array, "b": [array, array[::2]], "scalar": np.float32(2), "none": np.zeros((0, 3), "<i2")}
+    )
+    assert len(packed) < 12.5 * len(array)
+    got = Unpacker().unpack(packed, dict[str, Any])
+    assert got["a"] is got["b"][0] and np.array_equal(got["b"][1], array[::2])
+    assert got["scalar"] == 2.0 and got["none"].shape == (0, 3) and got["none"].dtype == "<i2"
+    got["a"] += 1
+    assert got["a"][1] == 2.0 and array[1] == 1.0
+
+
+def test_any_byte_of_a_truth_is_a_truth() -> None:
+    raw = pack(np.array([True, False, True]))
+    truths = Unpacker().unpack(raw[:-1] + b"\x7f", np.ndarray)
+    assert truths.dtype == np.bool_ and truths.tolist() == [True, False, True]
+    assert truths.view(np.uint8).tolist() == [1, 0, 1] and truths.sum() == 2
+
+
+def test_half_a_character_is_sent_so_that_it_can_be_written() -> None:
+    message = Finding("r", "warn", "a\ud800b", None, None, "", "", 1, 0)
+    assert Unpacker().unpack(pack(message), Finding).message == "a\\ud800b"
+
+
+@pytest.mark.parametrize("value", [object(), np.array([object()]), np.zeros(2, [("a", "<i4")]), lambda: None])
+def test_what_is_no_data_is_not_sent(value: object) -> None:
+    with pytest.raises(TypeError, match="cannot be sent"):
+        pack({"a": value})
+
+
+def framed(message: object, arrays: bytes = b"") -> bytes:
+    raw = msgspec.msgpack.encode(message)
+    return struct.pack("!I", len(raw)) + raw + arrays
+
+
+def array(name: str, shape: tuple[int, ...], code: int = 1) -> msgspec.msgpack.Ext:
+    return msgspec.msgpack.Ext(code, msgspec.msgpack.encode((name, shape)))
+
+
+@pytest.mark.parametrize(
+    ("sent", "says"),
+    [
+        (b"", "unpack"),
+        (b"hello", "longer than it is"),
+        (pickle.dumps(Loading("x")), "longer than it is"),
+        (framed(("Loading", None, {"activity": 3})), "Expected `str`, got `int`"),
+        (framed(("Loading", None, {})), "missing required field `activity`"),
+        (framed(("dict", None, {"a": 1})), "it was a dict, which is no message"),
+        (framed(("Load", None, {})), "it was a Load, which is no message"),
+        (framed(("Loading", 3, {"activity": "x"})), "it was a Loading, which is no message"),
+        (framed(["Loading"]), "at least|length"),
+        (framed(("Failed", None, {"problem": None, "kept": True})), "Expected `object`"),
+    ],
+)
+def test_what_is_no_message_is_said_to_be_unreadable(sent: bytes, says: str) -> None:
+    with pytest.raises(Unreadable, match=says):
+        Unpacker(EVENTS).message(sent)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        array("<f4", (3,)),
+        array("<f4", (1 << 40, 1 << 40)),
+        array("<f4", (-1,)),
+        array("|O", (1,)),
+        array("nonsense", (1,)),
+        array("<f4", (2,), code=2),
+        array("<f4", (2,), code=9),
+        array("<f4,<f4", (1,)),
+        array("<f4", (1,) * 600),
+        msgspec.msgpack.Ext(2, b"7"),
+        [1.0, 2.0],
+        None,
+    ],
+)
+def test_what_is_no_array_is_unreadable(value: object) -> None:
+    with pytest.raises(Unreadable):
+        Unpacker().unpack(framed({"a": value}, b"\0" * 8), dict[str, np.ndarray])
+
+
+@pytest.mark.parametrize("seed", [1, *[pytest.param(n, marks=pytest.mark.slow) for n in range(2, 30)]])
+def test_bytes_that_changed_on_the_way_raise_nothing_else(seed: int) -> None:
+    chosen = random.Random(seed)
+    unpacker = Unpacker(EVENTS)
+    sent = [pack_message(message) for message in messages() if isinstance(message, Event)]
+    for _ in range(1000):
+        raw = bytearray(chosen.choice(sent)[:3000])
+        for _ in range(chosen.randint(1, 4)):
+            raw[chosen.randrange(len(raw))] = chosen.randrange(256)
+        try:
+            assert isinstance(unpacker.message(raw), Event)
+        except Unreadable as error:
+            assert str(error)
+
+
+def test_a_failure_without_its_author_s_file_is_one(tmp_path: Path) -> None:
+    with pytest.raises(Unreadable):
+        Unpacker([Failed]).message(framed(("Failed", None, {"problem": {"stage": "step"}, "kept": False})))
+
+
+def test_a_path_is_the_bytes_that_the_disk_has_and_nothing_else_is_one() -> None:
+    path = Path(os.fsdecode(b"/author/caf\xe9.py"))
+    assert Unpacker().unpack(pack(path), Path) == path
+    for value, kind in (("/a/text", Path), (b"bytes", np.ndarray), (np.zeros(2), Path)):
+        with pytest.raises(Unreadable):
+            Unpacker().unpack(pack(value), kind)

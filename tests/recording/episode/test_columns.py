@@ -1,0 +1,143 @@
+"""Rows that are packed and put together again are the rows, and what is no row is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from tests.drive.rows import EpisodeRow, packed
+from workbench.core.env.step_result import OtherEntry, StepResult
+from workbench.jobs.gather import batch_columns
+from workbench.recording.episode.columns import BatchPacker, assemble, layout_type
+
+
+def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:
+    poses = np.zeros((2, 7), dtype=np.float32)
+    held = {name: np.asarray(value) for name, value in evaluate.items()}
+    return EpisodeRow(poses, held, action=np.asarray(action, dtype=np.float32))
+
+
+def through(rows: list[EpisodeRow]) -> dict[str, np.ndarray]:
+    """`rows` packed, and unpacked as columns."""
+    packer = BatchPacker()
+    contents = [packed(one, packer, 2) for one in rows]
+    runs = [np.frombuffer(content, layout_type(layout.text)) for layout, content in contents]
+    return assemble(runs)
+
+
+def test_types_are_kept_where_every_row_has_the_entry() -> None:
+    vectors = np.arange(6.0).reshape(3, 2)
+    rows = [
+        row(success=flag, contacts=4, offset=vector) for flag, vector in zip((True, False, True), vectors)
+    ]
+    columns = through(rows)
+    assert columns["evaluate/success"].dtype == np.bool_
+    assert columns["evaluate/contacts"].dtype.kind == "i"
+    np.testing.assert_array_equal(columns["evaluate/success"], [True, False, True])
+    np.testing.assert_array_equal(columns["evaluate/offset"], vectors)
+
+
+def test_entries_that_come_and_go_leave_nan() -> None:
+    columns = through([row(early=True), row(late=np.ones(2)), row(late=np.ones(2), early=False)])
+    np.testing.assert_array_equal(columns["evaluate/early"], [1, np.nan, 0])
+    np.testing.assert_array_equal(columns["evaluate/late"], [[np.nan, np.nan], [1, 1], [1, 1]])
+
+
+def test_entries_that_change_their_shape_are_padded() -> None:
+    columns = through([row(d=np.float32(1)), row(d=np.full(2, 2.0))])
+    np.testing.assert_array_equal(columns["evaluate/d"], [[1, np.nan], [2, 2]])
+
+
+def check(one: EpisodeRow, bodies: int = 2) -> None:
+    packed(one, BatchPacker(), 2)[0].check(bodies, 2)
+
+
+def test_what_is_no_number_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"evaluate\(\)\['phase'\] has dtype <U5"):
+        check(row(phase="reach"))
+
+
+def test_actions_and_bodies_must_fit() -> None:
+    with pytest.raises(ValueError, match="3 numbers, but 2 action names"):
+        check(row(action=(0, 0, 0)))
+    with pytest.raises(ValueError, match="the scene has 3 bodies"):
+        check(row(), bodies=3)
+
+
+VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(
+    lambda dtype: hnp.arrays(dtype, st.sampled_from([(), (0,), (1,), (3,), (2, 2)]))
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.dictionaries(st.text(max_size=3), VALUE, max_size=3), min_size=1, max_size=8))
+def test_any_rows_come_back(entries: list[dict[str, np.ndarray]]) -> None:
+    columns = through(
+        [
+            row()
+            if not held
+            else EpisodeRow(np.zeros((2, 7), np.float32), held, action=np.zeros(2, np.float32))
+            for held in entries
+        ]
+    )
+    assert set(columns) == {"poses", "action", "reward", "terminated", "truncated"} | {
+        f"evaluate/{name}" for held in entries for name in held
+    }
+    for name in {name for held in entries for name in held}:
+        column = columns[f"evaluate/{name}"]
+        for index, held in enumerate(entries):
+            if name not in held:
+                assert np.isnan(column[index]).all()
+            else:
+                value = held[name]
+                kept = column[index].reshape(-1)
+                same = value.reshape(-1).astype(column.dtype)
+                np.testing.assert_array_equal(kept[: value.size], same)
+                assert value.size == kept.size or np.isnan(kept[value.size :]).all()
+
+
+def test_a_batch_is_packed_as_its_envs_are() -> None:
+    rng = np.random.default_rng(0)
+    step = StepResult(
+        elapsed_steps=np.array([1, 4, 2], np.int32),
+        reward=rng.random(3, np.float32),
+        terminated=np.array([False, True, False]),
+        truncated=np.array([True, False, False]),
+        evaluate={"success": np.array([True, False, True]), "reward_terms/reach": rng.random((3, 2))},
+        poses=rng.random((3, 5, 7), np.float32),
+        action=rng.random((3, 4), np.float32),
+        others={
+            "progress": OtherEntry("float", numbers=np.array(0.5)),
+            "goal": OtherEntry("float32 tensor of shape (2,)", numbers=np.ones(2, np.float32)),
+            "phase": OtherEntry("str", ("reach",)),
+        },
+    )
+    columns = {
+        "state/actors/cube": rng.random((3, 13, 2), np.float32)[:, :, 0],  # not in one piece
+        "state/actors/mug": np.full((3, 13), np.nan, np.float32),
+        "obs/agent/qpos": rng.random((3, 9), np.float32),
+        "obs/extra/none": np.zeros((3, 0), np.float32),
+    }
+    packer = BatchPacker()
+    together = batch_columns(step, columns, frozenset({"actors/cube"}))
+    layout, rows = packer.pack(together)
+    assert step.action is not None
+    for env in range(3):
+        by_hand = EpisodeRow(
+            step.poses[env],
+            {name: values[env] for name, values in step.evaluate.items()},
+            {"actors/cube": columns["state/actors/cube"][env]},
+            {name[4:]: values[env] for name, values in columns.items() if name.startswith("obs/")},
+            step.action[env],
+            float(step.reward[env]),
+            bool(step.terminated[env]),
+            bool(step.truncated[env]),
+            others=step.others,
+        )
+        assert packed(by_hand, packer, 4) == (layout, rows[env])
+    assert packer.pack(together)[0] is layout

@@ -1,0 +1,75 @@
+"""A picture that was encoded is the picture, as far as its format goes."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from workbench.recording.episode.encoded_pictures import EncodedPictures, encode
+
+SHAPE = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(SHAPE.flatmap(lambda shape: hnp.arrays(np.int32, shape)))
+def test_ids_come_back_whatever_they_are(ids: np.ndarray) -> None:
+    (found,) = EncodedPictures("segmentation", [encode("segmentation", ids)])
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found, ids)
+
+
+@settings(max_examples=50, deadline=None)
+@given(SHAPE.flatmap(lambda shape: hnp.arrays(np.uint16, shape)))
+def test_whole_millimetres_come_back(millimetres: np.ndarray) -> None:
+    depth = (millimetres / 1000).astype(np.float32)
+    found = EncodedPictures("depth", [encode("depth", depth)])[0]
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, depth)
+
+
+def test_what_is_no_distance_is_nothing_and_the_farthest_stays() -> None:
+    depth = np.array([[np.nan, np.inf], [-1.0, 70.0]], dtype=np.float32)
+    np.testing.assert_array_equal(
+        EncodedPictures("depth", [encode("depth", depth)])[0], np.array([[0, 0], [0, 65.535]], np.float32)
+    )
+
+
+def test_colour_keeps_rows_and_channels_apart() -> None:
+    image = np.zeros((16, 24, 3), dtype=np.uint8)
+    image[:8, :, 0] = 250
+    image[:, 12:, 2] = 200
+    found = EncodedPictures("rgb", [encode("rgb", image)])[-1]
+    assert found.shape == image.shape
+    assert np.abs(found.astype(int) - image).max() < 12
+
+
+def test_what_is_no_picture_is_an_error() -> None:
+    with pytest.raises(OSError):
+        EncodedPictures("rgb", [b"not a picture"])[0]
+
+
+def test_a_picture_that_claims_too_many_pixels_or_is_of_another_format_is_refused() -> None:
+    def png(width: int, height: int) -> bytes:
+        header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+        chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b""))
+        return b"\x89PNG\r\n\x1a\n" + b"".join(
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+            for kind, content in chunks
+        )
+
+    for width, height in ((5000, 5000), (60_000, 60_000), (0, 5)):
+        with pytest.raises(OSError, match="pixels|no picture"):
+            EncodedPictures("depth", [png(width, height)])[0]
+    written = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(written, "GIF")
+    with pytest.raises(OSError):
+        EncodedPictures("rgb", [written.getvalue()])[0]
+    with pytest.raises(OSError, match="no depth"):
+        EncodedPictures("depth", [encode("rgb", np.zeros((4, 4, 3), np.uint8))])[0]

@@ -1,0 +1,235 @@
+"""An episode comes out of a reader as it is, and one that does not fit together is a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import CameraInfo
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
+from workbench.machine.processes.wire import Unpacker, pack_message
+from workbench.recording.episode.columns import MOST_LINES, TextEntry
+from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality, encode
+from workbench.recording.episode.episode import CameraTrack, Episode, EpisodeInfo, Unread
+from workbench.recording.reader.episode_wire import Garbled, KnownShapes, SentShapes, packed, unpacked
+from workbench.recording.reader.requests import EpisodeRead, PictureRead, RowsRead
+
+T, B = 3, 2
+PICTURE = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+
+
+def an_episode() -> Episode:
+    corner = Mesh(
+        np.eye(3, dtype=np.float32),
+        np.array([[0, 1, 2]], np.uint32),
+        np.ones((3, 3), np.float32),
+        np.ones((3, 2), np.float32),
+    )
+    red = Material((1.0, 0.0, 0.0, 1.0), 0.25, 0.75, np.full((2, 2, 4), 9, np.uint8))
+    none = np.zeros(1, np.int32)
+    visuals = tuple(Visual(f"box/{k}", corner, red, none, np.array([k], np.int32)) for k in range(B))
+    lens = CameraInfo("eye", "sensor", 6, 4, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb",))
+    track = CameraTrack(
+        lens,
+        np.arange(T + 1),
+        np.ones((T + 1, 7), np.float32),
+        EncodedPictures("rgb", [encode("rgb", PICTURE)] * (T + 1)),
+    )
+    return Episode(
+        EpisodeInfo("Box-v1", 0, 3, None, "", {}, 0.05, None, "cpu", env_kwargs={"robot_uids": "panda"}),
+        SceneGeometry(1, ("floor", "box"), ("static", "dynamic"), (False, False), visuals),
+        {1: "box"},
+        np.arange((T + 1) * B * 7, dtype=np.float32).reshape(T + 1, B, 7),
+        np.ones((T, 2), np.float32),
+        ("x", "y"),
+        np.arange(T, dtype=np.float32),
+        np.array([False, False, True]),
+        np.zeros(T, np.bool_),
+        {"success": np.array([False, False, False, True])},
+        [track],
+        {"actors/box": np.ones((T + 1, 13), np.float32)},
+        {"": np.ones((T + 1, 5))},
+        {"mean": np.ones(T + 1)},
+        {"phase": ((0, TextEntry("str", "reach", False, True)), (2, None))},
+        (Unread("a.h5", "is broken."),),
+    )
+
+
+def crossed(read: EpisodeRead) -> EpisodeRead:
+    return Unpacker((EpisodeRead, RowsRead)).message(pack_message(read))
+
+
+def fetched(camera: int, modality: Modality, index: int, encoded: bool) -> PictureRead:
+    assert (camera, modality) == (0, "rgb") and 0 <= index <= T
+    return PictureRead(blob=encode("rgb", PICTURE)) if encoded else PictureRead(PICTURE + np.uint8(index))
+
+
+def here(read: EpisodeRead, known: dict | None = None, shapes: SharedShapes | None = None) -> Episode:
+    return unpacked(crossed(read), fetched, 1, shapes or SharedShapes(), {} if known is None else known)
+
+
+def test_it_is_the_same_on_the_other_side() -> None:
+    there = an_episode()
+    episode = here(packed(there, None, 1, SentShapes()))
+    assert episode.info == there.info and episode.segmentation == there.segmentation
+    assert (episode.action_names, episode.texts, episode.unread) == (
+        there.action_names,
+        there.texts,
+        there.unread,
+    )
+    for name in ("poses", "action", "reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(episode, name), getattr(there, name), strict=True)
+    for name in ("evaluate", "env_states", "obs", "batch"):
+        assert list(getattr(episode, name)) == list(getattr(there, name))
+        for key, values in getattr(there, name).items():
+            np.testing.assert_array_equal(getattr(episode, name)[key], values, strict=True)
+    assert episode.geometry is not None and there.geometry is not None
+    assert replace(episode.geometry, visuals=()) == replace(there.geometry, visuals=())
+    first, second = episode.geometry.visuals
+    assert first.mesh is second.mesh and (first.name, second.name) == ("box/0", "box/1")
+    for name in ("vertices", "faces", "normals", "uvs"):
+        wanted = getattr(there.geometry.visuals[0].mesh, name)
+        np.testing.assert_array_equal(getattr(first.mesh, name), wanted, strict=True)
+    assert (first.material.metallic, first.material.roughness) == (0.25, 0.75)
+    (track,) = episode.cameras
+    assert track.info.key == ("sensor", "eye") and track.depth is None and track.rgb is not None
+    assert len(track.rgb) == T + 1 and track.rgb.blob(-1) == encode("rgb", PICTURE)
+    np.testing.assert_array_equal(track.rgb[2], PICTURE + 2)
+
+
+def test_a_shape_crosses_once_for_all_episodes_that_share_it() -> None:
+    sent, shapes, (_, known) = SentShapes(), SharedShapes(), KnownShapes().of(SharedShapes())
+    one, other = (packed(an_episode(), None, number, sent) for number in (1, 2))
+    assert (len(one.shapes), len(other.shapes)) == (1, 0)
+    first, second = (here(read, known, shapes).geometry for read in (one, other))
+    assert first is not None and second is not None
+    assert first.visuals[0].mesh is second.visuals[0].mesh
+    with pytest.raises(Garbled, match="a visual without a shape"):
+        here(other)
+
+
+def of_episode(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
+    return lambda read: msgspec.structs.replace(read, episode=replace(read.episode, **changes))
+
+
+def of_scene(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
+    def change(read: EpisodeRead) -> EpisodeRead:
+        assert read.episode.geometry is not None
+        return of_episode(geometry=replace(read.episode.geometry, **changes))(read)
+
+    return change
+
+
+def of_first(part: str, field: str = "", **changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
+    """Of the first camera, shape or visual, or of a field of it."""
+
+    def change(read: EpisodeRead) -> EpisodeRead:
+        first, *others = getattr(read, part)
+        into = {field: replace(getattr(first, field), **changes)} if field else changes
+        return msgspec.structs.replace(read, **{part: [msgspec.structs.replace(first, **into), *others]})
+
+    return change
+
+
+def numbers(*shape: int, kind: str = "f4") -> NDArray:
+    return np.zeros(shape, kind)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (of_episode(reward=numbers(T, 1)), "rewards of shape"),
+        (of_episode(reward=numbers(T, kind="S3")), "rewards of shape"),
+        (of_episode(reward=numbers(T + 1)), "poses of shape|of shape"),
+        (of_episode(poses=numbers(T, B, 7)), "poses of shape"),
+        (of_episode(poses=numbers(T + 1, B + 1, 7)), "poses of shape"),
+        (of_episode(geometry=None), "poses of shape"),
+        (of_episode(action=numbers(T, 3)), "actions of shape"),
+        (of_episode(action=numbers(T, 2, kind="U1")), "actions of shape"),
+        (of_episode(terminated=numbers(T + 1, kind="?")), "terminated of shape"),
+        (of_episode(truncated=numbers(T, 1, kind="?")), "truncated of shape"),
+        (of_episode(texts={"a": ((0, None),) * (MOST_LINES + 1)}), "too many entries"),
+        (of_scene(body_kinds=("static",)), "other bodies"),
+        (of_scene(body_hidden=(False,)), "other bodies"),
+        (of_first("visuals", shape=10**9), "without a shape"),
+        (of_first("visuals", bodies=np.array([B])), "bodies that are not there"),
+        (of_first("visuals", bodies=np.array([-1])), "bodies that are not there"),
+        (of_first("visuals", bodies=numbers(1)), "bodies of shape"),
+        (of_first("shapes", "mesh", vertices=numbers(3, 2)), "vertices of shape"),
+        (of_first("shapes", "mesh", vertices=numbers(3, 3, kind="i4")), "vertices of shape"),
+        (of_first("shapes", "mesh", faces=np.array([[0, 1, 3]])), "vertices that are not there"),
+        (of_first("shapes", "mesh", faces=np.array([[0, 1, -1]])), "vertices that are not there"),
+        (of_first("shapes", "mesh", faces=numbers(1, 3)), "faces of shape"),
+        (of_first("shapes", "mesh", normals=numbers(2, 3)), "normals of shape"),
+        (of_first("shapes", "mesh", uvs=numbers(3, 3)), "uvs of shape"),
+        (of_first("shapes", "material", texture=numbers(2, 2, 3, kind="u1")), "a texture of shape"),
+        (of_first("shapes", "material", texture=numbers(2, 2, 4)), "a texture of shape"),
+        (of_first("shapes", "material", texture=numbers(0, 2, 4, kind="u1")), "a texture of shape"),
+        (of_first("cameras", frame=numbers(T + 1)), "eye: frames of shape"),
+        (of_first("cameras", pose=numbers(T, 7)), "eye: poses of shape"),
+        (of_first("cameras", pictures={"rgb": T}), "4 frames and 3 pictures"),
+    ],
+)
+def test_what_does_not_fit_together_is_said(change: Callable[[EpisodeRead], EpisodeRead], says: str) -> None:
+    with pytest.raises(Garbled, match=says):
+        here(change(packed(an_episode(), None, 1, SentShapes())))
+
+
+@pytest.mark.parametrize(("width", "height"), [(0, 4), (6, -1), (5000, 5000)])
+def test_a_camera_of_no_size_or_of_far_too_much_is_said(width: int, height: int) -> None:
+    read = packed(an_episode(), None, 1, SentShapes())
+    lens = msgspec.structs.replace(read.cameras[0].camera, width=width, height=height)
+    with pytest.raises(Garbled, match=f"pictures of {width} x {height}"):
+        here(of_first("cameras", camera=lens)(read))
+
+
+@pytest.mark.parametrize("rows", [numbers(T), np.zeros((), np.float32), np.zeros(T + 1, "S2")])
+def test_a_column_without_a_row_a_state_is_left_out_and_named(rows: NDArray) -> None:
+    read = of_episode(obs={"odd": rows, "whole": numbers(T + 1, 2)})(
+        packed(an_episode(), None, 1, SentShapes())
+    )
+    episode = here(read)
+    assert list(episode.obs) == ["whole"]
+    assert [broken.file for broken in episode.unread] == ["a.h5", "odd"]
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        None,
+        numbers(4, 6, 3),
+        numbers(4, 6, kind="u1"),
+        numbers(0, 6, 3, kind="u1"),
+        numbers(4, 6, 4, kind="u1"),
+    ],
+)
+def test_a_picture_that_is_none_is_said(picture: NDArray | None) -> None:
+    read = crossed(packed(an_episode(), None, 1, SentShapes()))
+    episode = unpacked(read, lambda *_: PictureRead(picture), 1, SharedShapes(), {})
+    pictures = episode.cameras[0].rgb
+    assert pictures is not None
+    with pytest.raises(OSError, match="the reader gave"):
+        pictures[0]
+    with pytest.raises(OSError, match="no picture"):
+        pictures.blob(0)
+
+
+@pytest.mark.parametrize(
+    ("modality", "picture"), [("depth", numbers(4, 6)), ("segmentation", numbers(4, 6, kind="i4"))]
+)
+def test_pictures_of_one_number_a_pixel_come_as_they_are(modality: Modality, picture: NDArray) -> None:
+    read = of_first("cameras", pictures={modality: T + 1})(packed(an_episode(), None, 1, SentShapes()))
+    (track,) = unpacked(crossed(read), lambda *_: PictureRead(picture), 1, SharedShapes(), {}).cameras
+    np.testing.assert_array_equal(getattr(track, modality)[T], picture, strict=True)
+
+
+def test_a_camera_may_be_a_pixel_wide() -> None:
+    read = packed(an_episode(), None, 1, SentShapes())
+    lens = msgspec.structs.replace(read.cameras[0].camera, width=1, height=1)
+    assert here(of_first("cameras", camera=lens)(read)).cameras[0].info.width == 1

@@ -1,0 +1,270 @@
+"""Recorded episodes as a LeRobot dataset and back. What lerobot itself says of it: tests/sweeps/lerobot_loads.py."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from workbench.recording.episode.episode import Episode, Unread
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.lerobot.export import ExportOptions, export_lerobot
+from workbench.recording.lerobot.format import Choice, frames_of
+from workbench.recording.lerobot.read import is_lerobot, lerobot_rows, read_lerobot
+from workbench.recording.library.library import Library, LibraryError
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.reader.reading import read_source, sources_among
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@pytest.fixture(scope="module")
+def episode(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Episode:
+    read = read_episode(recorded.episode.write(tmp_path_factory.mktemp("recordings")).json)
+    states = np.arange(read.length + 1, dtype=np.float32)
+    obs = {
+        "agent/qpos": np.outer(states, np.ones(9, np.float32)),
+        "extra/goal": np.outer(states, [1.0, 2.0, 3.0]),
+    }
+    return replace(read, obs=obs)
+
+
+@pytest.fixture
+def succeeding(episode: Episode) -> Episode:
+    succeeds = np.zeros(episode.length + 1, np.bool_)
+    succeeds[-2] = True
+    return replace(episode, evaluate={**episode.evaluate, "success": succeeds})
+
+
+def shorter(episode: Episode, steps: int) -> Episode:
+    """Its first steps."""
+    return replace(
+        episode,
+        action=episode.action[:steps],
+        reward=episode.reward[:steps],
+        terminated=episode.terminated[:steps],
+        truncated=episode.truncated[:steps],
+        evaluate={key: values[: steps + 1] for key, values in episode.evaluate.items()},
+        obs={key: values[: steps + 1] for key, values in episode.obs.items()},
+    )
+
+
+def export(folder: Path, *episodes: Episode, options: ExportOptions | None = None) -> Any:
+    sources = [
+        (f"episode {index}", lambda episode=episode: episode) for index, episode in enumerate(episodes)
+    ]
+    return export_lerobot(sources, folder, options or ExportOptions())
+
+
+def test_what_was_exported_is_read_back(episode: Episode, tmp_path: Path) -> None:
+    made = export(tmp_path / "set", shorter(episode, 5), episode)
+    assert (made.episodes, made.frames) == (2, 5 + episode.length)
+    assert is_lerobot(tmp_path / "set")
+    first, second = lerobot_rows(tmp_path / "set")
+    assert (first.length, second.length, second.seed) == (5, episode.length, episode.info.seed)
+    assert second.total_reward == pytest.approx(float(episode.reward.sum()), rel=1e-5)
+    read = read_lerobot(tmp_path / "set", 1)
+    assert read.geometry is None and read.info.control_dt == pytest.approx(episode.info.control_dt)
+    assert read.action_names == tuple(name.replace("/", ".") for name in episode.action_names)
+    np.testing.assert_array_equal(read.action, episode.action)
+    np.testing.assert_array_equal(read.reward, episode.reward)
+    np.testing.assert_array_equal(read.obs["state"][:-1], episode.obs["agent/qpos"][:-1])
+    assert np.isnan(read.obs["state"][-1]).all(), "the last state was not in it"
+    cameras = {camera.info.name: camera for camera in episode.cameras}
+    assert {camera.info.name for camera in read.cameras} == set(cameras)
+    for camera in read.cameras:
+        of = cameras[camera.info.name]
+        assert camera.rgb is not None and of.rgb is not None and len(camera.rgb) == episode.length
+        # Each frame is the picture of its state, and not of the one before or after it.
+        for state in range(episode.length):
+            distances = [
+                np.abs(camera.rgb[state].astype(int) - of.rgb[other].astype(int)).mean()
+                for other in range(episode.length)
+            ]
+            assert int(np.argmin(distances)) == state
+
+
+def test_the_tables_are_of_the_format(episode: Episode, succeeding: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode, succeeding, options=ExportOptions(instruction="pick it up"))
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert (info["fps"], info["total_episodes"], info["splits"]) == (20, 2, {"train": "0:2"})
+    assert info["features"]["action"]["shape"] == [episode.action.shape[1]]
+    assert all("/" not in key for key in info["features"])
+    rows = pq.read_table(folder / "data/chunk-000/file-000.parquet")
+    assert set(rows.column_names) == {key for key, of in info["features"].items() if of["dtype"] != "video"}
+    assert rows["index"].to_pylist() == list(range(2 * episode.length))
+    assert rows["frame_index"].to_pylist() == 2 * list(range(episode.length))
+    assert rows["timestamp"].to_numpy() == pytest.approx(np.tile(np.arange(episode.length) / 20, 2))
+    assert rows["next.success"].to_pylist()[-3:] == [False, True, False]
+    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    second = episodes[1]
+    assert (second["dataset_from_index"], second["dataset_to_index"]) == (episode.length, 2 * episode.length)
+    assert second["videos/observation.images.base_camera/from_timestamp"] == episode.length / 20
+    assert second["tasks"] == ["pick it up"]
+    stats = json.loads((folder / "meta/stats.json").read_text())
+    both = np.concatenate([episode.action, episode.action])
+    assert stats["action"]["mean"] == pytest.approx(both.mean(axis=0), abs=1e-6)
+    assert stats["action"]["std"] == pytest.approx(both.std(axis=0), abs=1e-6)
+    assert np.array(stats["observation.images.base_camera"]["mean"]).shape == (3, 1, 1)
+    tasks = pq.read_table(folder / "meta/tasks.parquet")
+    assert tasks["__index_level_0__"].to_pylist() == ["pick it up"]
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
+
+
+def test_only_successes_are_exported_where_that_is_asked_for(
+    episode: Episode, succeeding: Episode, tmp_path: Path
+) -> None:
+    only = ExportOptions(only_successes=True)
+    made = export(tmp_path / "set", episode, succeeding, options=only)
+    assert (made.episodes, made.left_out) == (1, 1)
+    with pytest.raises(ValueError, match="none of them reaches success"):
+        export(tmp_path / "none", episode, options=only)
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_goes_into_it_can_be_chosen(episode: Episode) -> None:
+    frames = frames_of(episode, Choice(state=("extra",), environment=("agent/qpos",), cameras=(), every=3))
+    assert frames.names["observation.state"] == ["extra.goal.0", "extra.goal.1", "extra.goal.2"]
+    assert frames.columns["observation.environment_state"].shape == (3, 9)
+    assert frames.columns["action"].tolist() == episode.action[[0, 3, 6]].tolist()
+    assert frames.columns["next.reward"].sum() == pytest.approx(episode.reward.sum(), rel=1e-5)
+    with pytest.raises(ValueError, match="no observation 'agnet'; it has agent/qpos, extra/goal"):
+        frames_of(episode, Choice(state=("agnet",)))
+    with pytest.raises(ValueError, match="no camera 'x'"):
+        frames_of(episode, Choice(cameras=("x",)))
+    joints = frames_of(
+        replace(episode, obs={}, env_states={"articulations/panda": np.zeros((episode.length + 1, 31))})
+    )
+    assert joints.columns["observation.state"].shape == (episode.length, 9)
+
+
+def test_a_lower_rate_has_to_divide_the_steps(episode: Episode, tmp_path: Path) -> None:
+    made = export(tmp_path / "set", episode, options=ExportOptions(fps=10))
+    assert made.frames == episode.length // 2
+    with pytest.raises(ValueError, match="no whole multiple of 7"):
+        export(tmp_path / "other", episode, options=ExportOptions(fps=7))
+
+
+def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
+    episode: Episode, tmp_path: Path
+) -> None:
+    narrow = replace(episode, action=episode.action[:, :2], action_names=episode.action_names[:2])
+    with pytest.raises(
+        ValueError, match=r"episode 1 does not go into one dataset with episode 0: action has the shape \[2\]"
+    ):
+        export(tmp_path / "set", episode, narrow)
+    assert list(tmp_path.iterdir()) == []
+    cut = replace(episode, unread=(Unread("c.rrd", "was cut short."),))
+    made = export(tmp_path / "rest", episode, narrow, cut, episode, options=ExportOptions(only_fitting=True))
+    assert made.episodes == 2 and made.frames == 2 * episode.length
+    assert made.not_fitting[0].startswith("episode 1 does not go") and made.not_fitting[1:] == [
+        "c.rrd was cut short."
+    ]
+    assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length
+
+
+def test_a_folder_with_something_in_it_is_not_written_to(episode: Episode, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="something at"):
+        export(tmp_path, episode)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="Cannot write the dataset"):
+        export(tmp_path / "file" / "set", episode)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine.txt"]
+
+
+def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode)
+    with pytest.raises(UnreadableRecording, match="no episode 7"):
+        read_lerobot(folder, 7)
+    info = json.loads((folder / "meta/info.json").read_text())
+    (folder / "meta/info.json").write_text(json.dumps({**info, "data_path": "../../secret.parquet"}))
+    with pytest.raises(UnreadableRecording, match="outside of it"):
+        read_lerobot(folder, 0)
+    (folder / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
+    with pytest.raises(UnreadableRecording, match="version v2.1; version 3 can be read"):
+        lerobot_rows(folder)
+    (folder / "meta/info.json").write_text("{")
+    with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+        lerobot_rows(folder)
+
+
+def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Path) -> None:
+    for name in ("broken", "whole"):
+        export(tmp_path / name, episode)
+    (tmp_path / "broken/meta/info.json").write_text("{")
+    broken, whole = sources_among([tmp_path])
+    assert (broken.name, whole.name) == ("broken#0", "whole#0")
+    with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+        read_source(broken)
+    np.testing.assert_array_equal(read_source(whole).action, episode.action)
+
+
+def test_a_dataset_is_in_the_library_an_episode_a_row(
+    episode: Episode, succeeding: Episode, tmp_path: Path
+) -> None:
+    export(tmp_path / "sets" / "push", episode, succeeding)
+    library = Library(tmp_path)
+    try:
+        library.refresh()
+        first, second = library.rows()
+        assert (first.name, first.kind, first.success) == ("sets/push#0", "lerobot", False)
+        assert (second.success, second.length, second.seed) == (True, episode.length, episode.info.seed)
+        assert second.problem is None
+        np.testing.assert_array_equal(read_source(second.source).action, episode.action)
+        with pytest.raises(LibraryError, match="delete the folder"):
+            library.delete([first.id, second.id])
+        assert is_lerobot(tmp_path / "sets" / "push")
+    finally:
+        library.close()
+
+
+def test_a_film_that_is_a_playlist_names_no_other_file(episode: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode)
+    (film, *_) = sorted(folder.glob("videos/**/*.mp4"))
+    other = tmp_path / "other.mp4"
+    shutil.copyfile(film, other)
+    playlists = (
+        f"ffconcat version 1.0\nfile {other}\n",
+        f"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nfile:{other}\n#EXT-X-ENDLIST\n",
+    )
+    for playlist in playlists:
+        film.write_text(playlist)
+        pictures = read_lerobot(folder, 0).cameras[0].rgb
+        assert pictures is not None
+        with pytest.raises(UnreadableRecording, match="cannot be read"):
+            pictures[0]
+
+
+def test_what_a_dataset_claims_is_bounded(episode: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode)
+    info = json.loads((folder / "meta/info.json").read_text())
+    camera = next(key for key, feature in info["features"].items() if feature["dtype"] == "video")
+
+    def said(change: dict[str, Any]) -> None:
+        (folder / "meta/info.json").write_text(json.dumps({**info, **change}))
+
+    # Python's own formatting would write a gigabyte, or say what an object is made of.
+    for pattern in ("data/{chunk_index:01000000000d}.parquet", "data/{chunk_index.__class__}.parquet"):
+        said({"data_path": pattern})
+        with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+            read_lerobot(folder, 0)
+    huge = {**info["features"][camera], "shape": [100_000, 100_000, 3]}
+    said({"features": {**info["features"], camera: huge}})
+    with pytest.raises(UnreadableRecording, match="100000 x 100000"):
+        read_lerobot(folder, 0)
+    said({})
+    os.mkfifo(folder / "data" / "chunk-000" / "file-001.parquet")
+    assert lerobot_rows(folder)[0].length == episode.length

@@ -1,0 +1,106 @@
+"""The index is a cache: what is wrong with it is thrown away, what is only held by another process is not."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from workbench.recording.episode.row import Facts
+from workbench.recording.library import index as library_index
+from workbench.recording.library.index import LibraryIndex, index_path
+from workbench.recording.reader.scan import Found
+
+
+def found(key: str, size: int = 5) -> Found:
+    return Found(key, {".json": size}, {".json": 7})
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(library_index, "LOCKED_SECONDS", 0.05)
+    return tmp_path / "recordings"
+
+
+def keep(index: LibraryIndex, *keys: str) -> None:
+    index.store([(found(key), [(Facts(kind="workbench"), os.fsencode(key))]) for key in keys])
+
+
+def test_an_index_that_another_process_holds_is_left_as_it_is(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a", "b")
+    path = index_path(folder)
+    inode = os.stat(path).st_ino
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    keep(index, "c")
+    assert index.thumbnails([("a", 0)]) == {}
+    other.execute("ROLLBACK")
+    other.close()
+    assert index.load().keys() == {"a", "b"} and os.stat(path).st_ino == inode
+    assert index.thumbnails([("a", 0), ("b", 0), ("c", 0), ("a", 1)]) == {("a", 0): b"a", ("b", 0): b"b"}
+    index.close()
+
+
+def test_what_was_read_again_takes_the_place_of_what_was_kept_and_what_is_gone_goes(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a", "b", "c")
+    facts = Facts(kind="workbench")
+    index.store([(found("a", size=6), [(facts, None), (facts, b"second")])], gone=["b"])
+    index.close()
+    index = LibraryIndex(folder)
+    kept = index.load()
+    assert kept.keys() == {"a", "c"} and kept["a"].found == found("a", size=6) and len(kept["a"].rows) == 2
+    wanted = [("a", 0), ("a", 1), ("b", 0), ("c", 0)]
+    assert index.thumbnails(wanted) == {("a", 1): b"second", ("c", 0): b"c"}
+    index.close()
+
+
+def test_a_name_that_is_no_text_is_kept_like_any_other(folder: Path) -> None:
+    name = os.fsdecode(b"\xff\xfe")
+    index = LibraryIndex(folder)
+    keep(index, name)
+    index.close()
+    index = LibraryIndex(folder)
+    assert index.load()[name].found == found(name)
+    assert index.thumbnails([(name, 0)]) == {(name, 0): b"\xff\xfe"}
+    index.close()
+
+
+def test_an_index_that_was_closed_holds_nothing_and_takes_nothing(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a")
+    index.close()
+    keep(index, "b")
+    assert index.load() == {} and index.thumbnails([("a", 0)]) == {}
+    index = LibraryIndex(folder)
+    assert index.load().keys() == {"a"}
+    index.close()
+
+
+def test_what_a_file_that_was_taken_away_left_beside_it_goes_with_it(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a")
+    path = index_path(folder)
+    path.unlink()
+    journal = path.with_name(f"{path.name}-journal")
+    journal.write_bytes(b"")
+    keep(index, "b")
+    assert path.exists() and not journal.exists()
+    keep(index, "c")
+    assert index.load().keys() == {"c"}
+    index.close()
+
+
+def test_where_no_index_can_lie_it_is_in_memory(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("no folder")
+    index = LibraryIndex(folder)
+    keep(index, "a")
+    assert index.load().keys() == {"a"} and index.thumbnails([("a", 0)]) == {("a", 0): b"a"}
+    index.close()
+    index = LibraryIndex(folder)
+    assert index.load() == {}
+    index.close()

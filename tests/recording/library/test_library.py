@@ -1,0 +1,641 @@
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import h5py
+import mani_skill.envs  # noqa: F401  (registers the tasks)
+import msgspec
+import numpy as np
+import pytest
+import rerun as rr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mani_skill.utils.wrappers.record import RecordEpisode
+from PIL import Image
+
+from tests.drive.episodes import Made
+from tests.drive.waiting import until
+from tests.recording.library_files import describe, jpeg
+from workbench.recording.episode.row import Entry, Facts, LibraryRow, clean_facts
+from workbench.recording.library.index import LibraryIndex, index_path
+from workbench.recording.library.library import Library, LibraryError
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.reader.read_rows import read_found
+from workbench.recording.reader.reading import read_rows
+from workbench.recording.reader.scan import Found, scan_folder
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@pytest.fixture(scope="module")
+def maniskill(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with two episodes, of 3 and 2 steps, that ManiSkill's own recorder wrote."""
+    folder = tmp_path_factory.mktemp("demos")
+    env: Any = gym.make("PushCube-v1", obs_mode="none", render_backend="none", num_envs=1)
+    env = RecordEpisode(env, str(folder), trajectory_name="demo", save_video=False, source_type="test")
+    for seed, steps in ((5, 3), (6, 2)):
+        env.reset(seed=seed)
+        for _ in range(steps):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+    env.close()
+    return folder
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> Iterator[Library]:
+    library = Library(tmp_path)
+    yield library
+    library.close()
+
+
+def read(folder: Path) -> list[LibraryRow]:
+    """As somebody who opens it anew sees it."""
+    library = Library(folder)
+    library.refresh()
+    library.close()
+    return list(library.rows())
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """All files that a person sees."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+# --- what rows say --------------------------------------------------------------------------------------
+
+
+def test_a_recording_of_ours_is_a_row_with_what_its_description_says(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path / "monday", "a", id="ab12", tags=["good", "good", " "], note="slips")
+    library.refresh()
+    (row,) = library.rows()
+    assert (row.id, row.name, row.kind, row.task, row.seed, row.length) == (
+        "ab12",
+        "monday/a",
+        "workbench",
+        "PushCube-v1",
+        7,
+        12,
+    )
+    assert (row.total_reward, row.success, row.source_hash) == (3.5, True, "aaaaaaaaaaaa")
+    assert (row.tags, row.note, row.problem) == (("good",), "slips", None)
+    assert row.date is not None and row.date.isoformat() == "2026-11-21T10:00:00+00:00"
+    assert [path.suffix for path in row.paths] == [".json", ".h5", ".rrd"]
+    assert row.size == sum(path.stat().st_size for path in row.paths)
+    assert (
+        library.thumbnails(("ab12",)).get("ab12") == jpeg()
+        and library.thumbnails(("other",)).get("other") is None
+    )
+
+
+def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
+    tmp_path: Path, library: Library, make_episode: Callable[..., Made]
+) -> None:
+    made = make_episode(5, reward=np.full(5, 0.5, np.float32), evaluate={"success": np.arange(6) >= 4})
+    unfinished = make_episode().writer(tmp_path)
+    files = made.write(tmp_path)
+    library.refresh()
+    (row,) = library.rows()
+    assert (row.id, row.task, row.seed, row.length) == (made.info.id, "Made-v1", 7, 5)
+    assert (row.total_reward, row.success, row.problem) == (2.5, True, None)
+    assert set(row.paths) == {files.json, files.h5, files.rrd}
+    library.set_tags([row.id], add=["good"])
+    library.set_note([row.id], "slips")
+    read_back = read_episode(files.json)
+    assert read_back.info == made.info and len(read_back.reward) == 5
+    assert [row.tags for row in library.rows()] == [("good",)]
+    unfinished.discard()
+
+
+def test_each_trajectory_of_maniskills_recorder_is_a_row(maniskill: Path) -> None:
+    first, second = read(maniskill)
+    assert (first.name, second.name) == ("demo#traj_0", "demo#traj_1")
+    assert (first.kind, first.task, first.trajectory, first.problem) == (
+        "maniskill",
+        "PushCube-v1",
+        "traj_0",
+        None,
+    )
+    assert (first.seed, first.length, second.seed, second.length) == (5, 3, 6, 2)
+    assert first.success is False and first.total_reward is not None and first.total_reward > 0
+    assert first.acted_by == "test"
+    assert first.control_mode == "pd_joint_delta_pos" and first.id != second.id
+
+
+def test_a_trajectory_with_pictures_has_a_thumbnail(
+    maniskill: Path, tmp_path: Path, library: Library
+) -> None:
+    for suffix in (".json", ".h5"):
+        shutil.copy(maniskill / f"demo{suffix}", tmp_path)
+    seen = np.zeros((4, 200, 300, 3), np.uint8)
+    seen[3] = (255, 0, 0)
+    with h5py.File(tmp_path / "demo.h5", "r+") as file:
+        file.create_dataset("traj_0/obs/sensor_data/eye/depth", data=np.zeros((4, 2, 2, 1), np.int16))
+        file.create_dataset("traj_0/obs/sensor_data/hand/rgb", data=seen, compression="gzip")
+    library.refresh()
+    first, second = library.rows()
+    picture = library.thumbnails((first.id,)).get(first.id)
+    assert picture is not None and library.thumbnails((second.id,)).get(second.id) is None
+    with Image.open(io.BytesIO(picture)) as image:
+        assert image.size == (96, 64)
+        red, green, _ = np.asarray(image.convert("RGB")).mean((0, 1))
+    assert red > 250 and green < 5
+
+
+def test_a_lone_rrd_is_a_row_with_its_properties(tmp_path: Path) -> None:
+    recording = rr.RecordingStream("workbench Old-v1")
+    memory = recording.memory_recording()
+    recording.send_property(
+        "episode", rr.AnyValues(task="Old-v1", seed=4, length=6, success=True, fail=False)
+    )
+    (tmp_path / "old.rrd").write_bytes(memory.drain_as_bytes())
+    (row,) = read(tmp_path)
+    assert (row.kind, row.task, row.seed, row.length, row.success) == ("rrd only", "Old-v1", 4, 6, True)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"x.json": b'{"workbench": {"task": '}, "x.json is not JSON, or was cut short."),
+        ({"x.json": b"[" * 100_000}, "x.json is not JSON, or was cut short."),
+        ({"x.rrd": b""}, "x.rrd is no recording that rerun can read"),
+        ({"x.rrd": b"RRF2" + bytes(300)}, "x.rrd is no recording that rerun can read"),
+        ({"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}'}, "is missing"),
+        (
+            {"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}', "x.h5": b"HDF"},
+            "x.h5 is damaged, or still being written.",
+        ),
+        ({"x.json": b'{"workbench": {"task": "A-v1"}}', "x.h5": b""}, "x.rrd is missing."),
+        ({"x.json": b"3", "x.h5": b""}, "x.json names neither an env nor episodes."),
+    ],
+)
+def test_files_that_are_broken_are_rows_that_say_so(
+    tmp_path: Path, files: dict[str, bytes], said: str
+) -> None:
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    (row,) = read(tmp_path)
+    assert row.problem is not None and said in row.problem
+
+
+def test_an_h5_alone_is_a_row_once_it_is_clear_that_nothing_comes_to_it(tmp_path: Path) -> None:
+    path = tmp_path / "x.h5"
+    path.write_bytes(b"HDF")
+    assert read(tmp_path) == []
+    os.utime(path, (1e9, 1e9))
+    (row,) = read(tmp_path)
+    assert row.problem is not None and "needs x.json beside it" in row.problem
+
+
+def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
+    (tmp_path / "package.json").write_text('{"name": "x"}')
+    (tmp_path / "lonely.notes").write_text("{}")
+    (tmp_path / "notes.txt").write_text("x")
+    describe(tmp_path / ".hidden", "a")
+    (tmp_path / "round").symlink_to(tmp_path)
+    (tmp_path / "nowhere.json").symlink_to(tmp_path / "gone.json")
+    assert read(tmp_path) == []
+
+
+def test_names_of_files_that_are_no_text_can_be_shown_and_deleted(tmp_path: Path, library: Library) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    describe(folder, os.fsdecode(b"a\xff\n"), id="aaaa")
+    for _ in range(2):
+        library.refresh()
+        (row,) = library.rows()
+        row.name.encode()
+    library.set_note(["aaaa"], "x")
+    library.delete(["aaaa"])
+    assert library.rows() == ()
+    library.undo_delete()
+    assert [row.note for row in library.rows()] == ["x"]
+
+
+_anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+_TYPES: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("id", "task", "source_hash", "written_at", "note"), (str,)),
+    **dict.fromkeys(("env_index", "length"), (int,)),
+    **dict.fromkeys(("success", "fail"), (bool, type(None))),
+    "seed": (int, type(None)),
+    "return": (int, float),
+    "recovered": (bool,),
+    "tags": (list,),
+    "thumbnail": (str, type(None)),
+}
+
+
+def is_wrong(name: str, value: Any) -> bool:
+    if type(value) not in _TYPES[name]:
+        return True
+    if name == "tags":
+        return not all(isinstance(tag, str) for tag in value)
+    return type(value) is int and name != "return" and not -(2**63) <= value < 2**63
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.fixed_dictionaries({}, optional=dict.fromkeys(_TYPES, _anything)))
+def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        describe(Path(name), "a", **fields)
+        ((facts, picture),) = read_found(Path(name), scan_folder(Path(name)).found["a"])
+    wrong = {key for key, value in fields.items() if is_wrong(key, value)}
+    said = re.search(
+        r"a\.json is not as a recording is described: .* at \$\.workbench\.(\w+)", facts.problem or ""
+    )
+    assert facts.kind == "workbench"
+    assert said[1] in wrong if wrong and said else (facts.problem is None and not wrong)
+    assert clean_facts(msgspec.msgpack.decode(msgspec.msgpack.encode(facts), type=Facts)) == facts
+    assert picture is None or picture[:2] == b"\xff\xd8"
+
+
+def test_a_wrong_field_is_named_by_its_path_and_the_others_are_shown(tmp_path: Path, maniskill: Path) -> None:
+    describe(tmp_path, "ours", task="Push-v1", seed="seven", scene={"body_names": [], "body_kinds": []})
+    for suffix in (".json", ".h5"):
+        shutil.copy(maniskill / f"demo{suffix}", tmp_path)
+    said = json.loads((tmp_path / "demo.json").read_text())
+    said["episodes"][1]["elapsed_steps"] = "two"
+    (tmp_path / "demo.json").write_text(json.dumps(said))
+    good, wrong, ours = read(tmp_path)
+    assert (good.name, good.length, good.problem) == ("demo#traj_0", 3, None)
+    assert wrong.problem is not None and wrong.problem.endswith("at $.episodes[1].elapsed_steps.")
+    assert (ours.task, ours.seed, ours.length) == ("Push-v1", None, 12)
+    assert ours.problem == (
+        "ours.json is not as a recording is described: expected `int | null`, got `str` at $.workbench.seed."
+    )
+    describe(tmp_path, "ours", scene={"body_names": [], "body_kinds": []})
+    assert read(tmp_path)[2].problem == (
+        "ours.json is not as a recording is described: "
+        "object missing required field `body_hidden` at $.workbench.scene."
+    )
+
+
+def test_a_copy_of_a_recording_is_another_row(tmp_path: Path) -> None:
+    describe(tmp_path, "a", id="ab12")
+    shutil.copytree(tmp_path, tmp_path / "copy", ignore=shutil.ignore_patterns("copy"))
+    first, second = read(tmp_path)
+    assert first.id == "ab12" and second.id.startswith("at-")
+
+
+# --- keeping up -----------------------------------------------------------------------------------------
+
+
+def test_only_what_changed_is_read_again(
+    tmp_path: Path, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "abc":
+        describe(tmp_path, name, note=name)
+    library.refresh()
+    read_keys: list[str] = []
+
+    def spy(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
+        wanted = list(wanted)
+        read_keys.extend(found.key for found in wanted)
+        return read_rows(folder, wanted)
+
+    monkeypatch.setattr("workbench.recording.library.library.read_rows", spy)
+    library.refresh()
+    assert read_keys == []
+    describe(tmp_path, "b", note="changed")
+    read_keys.clear()
+    for suffix in (".json", ".h5", ".rrd"):
+        (tmp_path / f"c{suffix}").unlink()
+    library.refresh()
+    assert read_keys == ["b"]
+    assert [(row.name, row.note) for row in library.rows()] == [("a", "a"), ("b", "changed")]
+    read_keys.clear()
+    assert [row.note for row in read(tmp_path)] == ["a", "changed"]
+    assert read_keys == []  # from the index
+
+
+def test_a_folder_that_comes_later_is_looked_into_and_has_its_thumbnails(tmp_path: Path) -> None:
+    library = Library(tmp_path / "later")
+    library.refresh()
+    assert library.rows() == ()
+    describe(tmp_path / "later", "a", id="ab12")
+    library.refresh()
+    assert library.thumbnails(["ab12"]) == {"ab12": jpeg()}
+    library.close()
+
+
+@pytest.mark.parametrize(
+    "damage", ["deleted", "garbage", "cut", "another program's", "rows of another version"]
+)
+def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> None:
+    for k in range(30):
+        describe(tmp_path, f"r{k:02}", seed=k)
+    good = read(tmp_path)
+    index = index_path(tmp_path)
+    content = index.read_bytes()
+    if damage == "deleted":
+        index.unlink()
+    elif damage == "garbage":
+        index.write_bytes(os.urandom(len(content)))
+    elif damage == "cut":
+        index.write_bytes(content[: len(content) // 2])
+    else:
+        with sqlite3.connect(index) as database:
+            if damage == "another program's":
+                database.execute("ALTER TABLE read DROP COLUMN rows")
+            else:
+                database.execute("UPDATE read SET rows = ? WHERE key = ?", (b"\x93\x80\x80\x91\x80", b"r03"))
+                assert database.total_changes == 1
+        database.close()
+    assert len(good) == 30 and read(tmp_path) == good
+    library = Library(tmp_path)
+    library.refresh()
+    assert len(library.thumbnails([row.id for row in good])) == 30
+    library.close()
+
+
+def test_a_page_of_garbage_within_the_index_costs_no_more_than_reading_again(tmp_path: Path) -> None:
+    for k in range(120):
+        describe(tmp_path, f"r{k:03}", seed=k)
+    good = read(tmp_path)
+    index = index_path(tmp_path)
+    content = bytearray(index.read_bytes())
+    for page in range(1, len(content) // 4096):
+        content[page * 4096 : page * 4096 + 200] = os.urandom(200)
+    index.write_bytes(content)
+    assert read(tmp_path) == good
+
+
+def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> None:
+    folder, mine = tmp_path / "recordings", tmp_path / "another program's.sqlite"
+    describe(folder, "a")
+    with sqlite3.connect(mine) as database:
+        database.execute("CREATE TABLE read (theirs)")
+    database.close()
+    (folder / ".workbench").mkdir()
+    (folder / ".workbench" / "library.sqlite").symlink_to(mine)
+    before = mine.read_bytes()
+    assert [row.name for row in read(folder)] == ["a"]
+    assert mine.read_bytes() == before
+    assert sorted(path.name for path in (folder / ".workbench").iterdir()) == ["library.sqlite"]
+
+
+def test_without_a_place_for_the_index_it_is_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, cache = tmp_path / "recordings", tmp_path / "cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    describe(folder, "a")
+    assert index_path(folder).is_relative_to(cache)
+    LibraryIndex(folder).close()
+    assert index_path(folder).is_file()
+    shutil.rmtree(cache)
+    cache.write_text("no place here")
+    library = Library(folder)
+    library.refresh()
+    assert [row.name for row in library.rows()] == ["a"]
+    assert library.thumbnails([row.id for row in library.rows()]).keys() == {row.id for row in library.rows()}
+    library.close()
+
+
+def test_indices_of_many_folders_do_not_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("workbench.recording.library.index.MOST_INDICES", 3)
+    for k in range(6):
+        index = LibraryIndex(tmp_path / f"{k}")
+        os.utime(index_path(tmp_path / f"{k}"), (k, k))
+        index.close()
+    LibraryIndex(tmp_path / "last").close()
+    left = {path.name for path in index_path(tmp_path).parent.iterdir()}
+    assert left == {index_path(tmp_path / name).name for name in ("4", "5", "last")}
+
+
+def test_two_processes_at_once_have_the_same_rows(tmp_path: Path) -> None:
+    for k in range(150):
+        describe(tmp_path, f"r{k:03}", seed=k)
+    program = (
+        "import sys, pathlib\n"
+        "from workbench.recording.library.library import Library\n"
+        "for _ in range(3):\n"
+        "    library = Library(pathlib.Path(sys.argv[1])); library.refresh(); library.close()\n"
+        "print(*(row.id for row in library.rows()))\n"
+    )
+    running = [
+        subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = {process.communicate(timeout=100)[0] for process in running}
+    assert said == {" ".join(row.id for row in read(tmp_path)) + "\n"} and running[0].returncode == 0
+
+
+def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
+    folder = tmp_path / "later"
+    library = Library(folder)
+    library.watch()
+
+    def wait_for(names: list[str], problem: bool) -> None:
+        def shown() -> bool:
+            view = library.view()
+            return [row.name for row in view.rows] == names and (view.problem is not None) == problem
+
+        until(shown, str(names), seen=library.view)
+
+    try:
+        wait_for([], problem=True)
+        describe(folder, "a")
+        wait_for(["a"], problem=False)
+        describe(folder / "more", "b")
+        wait_for(["a", "more/b"], problem=False)
+        shutil.rmtree(folder / "more")
+        wait_for(["a"], problem=False)
+        shutil.rmtree(folder)
+        wait_for([], problem=True)
+        assert "is not there" in str(library.view().problem)
+    finally:
+        library.close()
+
+
+def test_rows_are_shown_while_others_are_read_and_from_the_index_before_anything_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.recording.library.library.PUBLISH_EVERY", 0.0)
+    for k in range(5):
+        describe(tmp_path, f"r{k}")
+        os.utime(tmp_path / f"r{k}.json", ns=(10**18 + k, 10**18 + k))
+    for suffix in (".h5", ".rrd"):
+        for path in tmp_path.glob(f"*{suffix}"):
+            os.utime(path, ns=(10**18, 10**18))
+    seen: list[tuple[int, object]] = []
+
+    def follow(library: Library) -> None:
+        real = library._publish
+
+        def publish(*arguments: Any, **changes: Any) -> None:
+            real(*arguments, **changes)
+            seen.append((len(library.rows()), library.view().reading))
+
+        library._publish = publish  # type: ignore[method-assign]
+
+    library = Library(tmp_path)
+    follow(library)
+    library.refresh()
+    library.close()
+    assert seen == [*((k, (k, 5)) for k in range(1, 6)), (5, None)]
+    seen.clear()
+    library = Library(tmp_path)
+    follow(library)
+    library.refresh()
+    library.close()
+    assert seen == [(5, (0, 0)), (5, None)]
+
+
+# --- tags and notes ---------------------------------------------------------------------------------------
+
+
+def test_tags_and_note_go_where_the_recording_goes_and_nothing_else_of_it_changes(
+    tmp_path: Path, library: Library
+) -> None:
+    path = describe(tmp_path, "a", id="a1", tags=["old"])
+    before = json.loads(path.read_text())
+    library.refresh()
+    library.set_tags(["a1"], add=["good", "demo"], remove=["old"])
+    library.set_note(["a1"], "slips\nat the end")
+    row = library.row("a1")
+    assert row is not None and (row.tags, row.note) == (("good", "demo"), "slips at the end")
+    after = json.loads(path.read_text())
+    assert after.pop("workbench") == {
+        **before.pop("workbench"),
+        "tags": ["good", "demo"],
+        "note": "slips at the end",
+    }
+    assert after == before
+    # Moved elsewhere, under another name, without the index: they are there.
+    for suffix in (".json", ".h5", ".rrd"):
+        (tmp_path / "elsewhere").mkdir(exist_ok=True)
+        os.rename(path.with_suffix(suffix), tmp_path / "elsewhere" / f"renamed{suffix}")
+    (moved,) = read(tmp_path / "elsewhere")
+    assert (moved.id, moved.tags, moved.note) == ("a1", ("good", "demo"), "slips at the end")
+
+
+def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, library: Library) -> None:
+    shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
+    before = tree(tmp_path)
+    library.refresh()
+    first, second = library.rows()
+    dates = [first.date, second.date]
+    library.set_tags([second.id], add=["fast"])
+    library.set_note([first.id], "odd")
+    assert [(row.tags, row.note) for row in library.rows()] == [((), "odd"), (("fast",), "")]
+    assert tree(tmp_path).keys() - before.keys() == {"demo.notes"}
+    assert [row.date for row in library.rows()] == dates
+    assert before.items() <= tree(tmp_path).items()
+    assert [(row.tags, row.note) for row in read(tmp_path)] == [((), "odd"), (("fast",), "")]
+    library.set_tags([second.id], remove=["fast"])
+    library.set_note([first.id], "")
+    assert tree(tmp_path) == before
+
+
+def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path, "a", id="a1")
+    library.refresh()
+    (tmp_path / "a.json").write_text("{}")
+    before = tree(tmp_path)
+    with pytest.raises(LibraryError, match="a could not be kept .*is not a recording"):
+        library.set_note(["a1"], "x")
+    assert tree(tmp_path) == before
+    with pytest.raises(LibraryError, match="not in the library any more"):
+        library.set_tags(["a1", "zz"], add=["x"])
+
+
+# --- deleting ---------------------------------------------------------------------------------------------
+
+
+def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library: Library) -> None:
+    for name in ("a", "b", "sub/c"):
+        path = tmp_path / name
+        describe(path.parent, path.name, id=path.name * 4)
+    before = tree(tmp_path)
+    library.refresh()
+    library.delete(["aaaa", "cccc"])
+    assert [row.name for row in library.rows()] == ["b"] == [row.name for row in read(tmp_path)]
+    assert {name for name in tree(tmp_path) if not name.startswith(".trash/")} == {"b.json", "b.h5", "b.rrd"}
+    assert library.view().trash.files == 6
+    library.undo_delete()
+    assert tree(tmp_path) == before and [row.name for row in library.rows()] == ["a", "b", "sub/c"]
+    assert library.view().trash.files == 0
+    with pytest.raises(LibraryError, match="trash is empty"):
+        library.undo_delete()
+
+
+def test_what_stands_there_now_is_not_written_over_when_a_deletion_is_taken_back(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path, "a", id="aaaa")
+    library.refresh()
+    library.delete(["aaaa"])
+    describe(tmp_path, "a", id="bbbb")
+    before = tree(tmp_path)
+    with pytest.raises(LibraryError, match="there is a file of that name already"):
+        library.undo_delete()
+    assert tree(tmp_path) == before
+    library.empty_trash()
+    assert not (tmp_path / ".trash").exists() and library.view().trash.files == 0
+
+
+def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
+    tmp_path: Path, maniskill: Path, library: Library
+) -> None:
+    shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
+    library.refresh()
+    before = tree(tmp_path)
+    first, second = library.rows()
+    for refused in (library.may_delete, library.delete):
+        with pytest.raises(LibraryError, match="demo.h5 holds 2 recordings"):
+            refused([first.id])
+    assert tree(tmp_path) == before
+    library.set_note([first.id], "x")
+    library.delete([first.id, second.id])
+    assert library.rows() == () and library.view().trash.files == 3
+
+
+def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, library: Library) -> None:
+    describe(tmp_path, "a", id="aaaa")
+    (tmp_path / ".trash").write_text("a file where the folder should be")
+    before = tree(tmp_path)
+    library.refresh()
+    with pytest.raises(LibraryError, match="Not everything was deleted"):
+        library.delete(["aaaa"])
+    assert tree(tmp_path) == before and [row.id for row in library.rows()] == ["aaaa"]
+
+
+def test_a_trash_that_is_a_link_is_nobodys_trash(tmp_path: Path) -> None:
+    folder, other = tmp_path / "recordings", tmp_path / "other"
+    describe(folder, "a")
+    (other / "2026").mkdir(parents=True)
+    (other / "2026" / "precious.txt").write_text("mine")
+    (folder / ".trash").symlink_to(other)
+    library = Library(folder)
+    library.refresh()
+    try:
+        assert library.view().trash.files == 0
+        with pytest.raises(LibraryError, match="is a link"):
+            library.delete([row.id for row in library.rows()])
+        with pytest.raises(LibraryError):
+            library.empty_trash()
+        assert (folder / "a.json").exists() and (other / "2026" / "precious.txt").exists()
+    finally:
+        library.close()

@@ -1,0 +1,177 @@
+"""HDF5 files that point elsewhere, or claim what they do not hold."""
+
+from __future__ import annotations
+
+import os
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.recording.foreign_h5 import write
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.maniskill.safe_h5 import DEEPEST, RefusedH5, open_h5
+from workbench.recording.reader.read_episode import read_maniskill
+from workbench.recording.reader.read_rows import read_found
+from workbench.recording.reader.scan import scan_folder
+
+SECRET = b"the secret of another file, thirty-two bytes and more of it......"
+
+
+def external_link(group: h5py.Group) -> None:
+    group["obs"] = h5py.ExternalLink(os.fspath(Path(group.file.filename).parent / "other.h5"), "/secret")
+
+
+def external_group(group: h5py.Group) -> None:
+    del group["env_states"]
+    group["env_states"] = h5py.ExternalLink(os.fspath(Path(group.file.filename).parent / "other.h5"), "/")
+
+
+def external_storage(group: h5py.Group) -> None:
+    secret = os.fspath(Path(group.file.filename).parent / "secret.txt")
+    group.create_dataset("obs", shape=(4, 8), dtype=np.uint8, external=[(secret, 0, 32)])
+
+
+def virtual(group: h5py.Group) -> None:
+    layout = h5py.VirtualLayout(shape=(4, 8), dtype=np.uint8)
+    other = os.fspath(Path(group.file.filename).parent / "other.h5")
+    layout[:] = h5py.VirtualSource(other, "secret", shape=(4, 8))
+    group.create_virtual_dataset("obs", layout)
+
+
+def soft_link_out(group: h5py.Group) -> None:
+    group["way"] = h5py.ExternalLink(os.fspath(Path(group.file.filename).parent / "other.h5"), "/")
+    group["obs"] = h5py.SoftLink("/traj_0/way/secret")
+
+
+def terabytes(group: h5py.Group) -> None:
+    group.create_dataset("obs", shape=(4, 1 << 38), dtype=np.uint8, chunks=(1, 1 << 16))
+
+
+def two_gigabytes(group: h5py.Group) -> None:
+    del group["rewards"]
+    group.create_dataset("rewards", shape=(1 << 29,), dtype=np.float32, chunks=(1 << 20,), compression="gzip")
+
+
+def huge_chunks(group: h5py.Group) -> None:
+    del group["rewards"]
+    group.create_dataset("rewards", shape=(3,), maxshape=(None,), dtype=np.float32, chunks=(1 << 29,))
+
+
+def circle(group: h5py.Group) -> None:
+    group["obs/again"] = group
+
+
+def soft_circle(group: h5py.Group) -> None:
+    group["obs"] = h5py.SoftLink("/traj_0/obs")
+
+
+def strange_filter(group: h5py.Group) -> None:
+    creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    creation.set_chunk((4, 8))
+    creation.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, (3,))
+    space = h5py.h5s.create_simple((4, 8))
+    h5py.h5d.create(group.id, b"obs", h5py.h5t.NATIVE_FLOAT, space, dcpl=creation)
+
+
+def words(group: h5py.Group) -> None:
+    del group["actions"]
+    group["actions"] = np.array([["a"], ["b"], ["c"]], dtype="S1")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (external_link, "traj_0/obs in another file (an external link)"),
+        (external_group, "traj_0/env_states in another file (an external link)"),
+        (external_storage, "traj_0/obs stored in another file (external storage)"),
+        (virtual, "traj_0/obs put together from other files (a virtual dataset)"),
+        (soft_link_out, "traj_0/way in another file (an external link)"),
+        (terabytes, "claims 1,099,511,627,776 bytes of numbers for traj_0/obs"),
+        (two_gigabytes, "claims 2,147,483,648 bytes of numbers for traj_0/rewards"),
+        (huge_chunks, "claims chunks of 2,147,483,648 bytes for traj_0/rewards"),
+        (circle, f"groups more than {DEEPEST} deep"),
+        (soft_circle, "links that lead round in a circle (at traj_0/obs)"),
+        (strange_filter, "packed by a filter that h5py does not bring along (32015)"),
+        (words, "no plain number"),
+    ],
+)
+def test_what_leads_out_of_the_file_or_claims_too_much_is_refused(
+    spoil: Callable[[h5py.Group], None], says: str, tmp_path: Path
+) -> None:
+    (tmp_path / "secret.txt").write_bytes(SECRET)
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["secret"] = np.frombuffer(SECRET[:32], np.uint8).reshape(4, 8)
+    path = write(tmp_path, spoil)
+    tracemalloc.start()
+    try:
+        if spoil is words:
+            with pytest.raises(UnreadableRecording):
+                read_maniskill(path, "traj_0")
+            return
+        with pytest.raises(UnreadableRecording) as caught:
+            read_maniskill(path, "traj_0")
+        assert says in str(caught.value), str(caught.value)
+        assert str(caught.value).startswith("theirs.h5 ")
+        (row,) = read_found(tmp_path, scan_folder(tmp_path).found["theirs"])
+        if spoil in (two_gigabytes, huge_chunks):
+            assert row[0].problem is not None and says in row[0].problem
+        # Nothing of the size that was claimed was ever allocated.
+        assert tracemalloc.get_traced_memory()[1] < 50 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_path: Path) -> None:
+    def spoil(group: h5py.Group) -> None:
+        values = np.zeros((4, 3000), np.float32)
+        group.create_dataset("obs/state", data=values, compression="gzip", compression_opts=9, shuffle=True)
+        group.create_dataset("obs/fast", data=values, compression="lzf", fletcher32=True)
+        group["obs/same"] = h5py.SoftLink("state")
+        group["obs/rooted"] = h5py.SoftLink("/traj_0/obs/state")
+        group["obs/word"] = np.bytes_(b"what is no number is left out")
+        group.create_dataset("obs/empty", shape=(4, 0), dtype=np.float32)
+
+    read = read_maniskill(write(tmp_path, spoil), "traj_0")
+    assert {name: values.shape for name, values in read.obs.items()} == {
+        "empty": (4, 0),
+        "fast": (4, 3000),
+        "rooted": (4, 3000),
+        "same": (4, 3000),
+        "state": (4, 3000),
+    }
+    assert read.reward.tolist() == [1, 1, 1]
+
+
+def test_one_dataset_under_many_names_is_not_read_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.recording.maniskill.safe_h5.MOST_BYTES", 1 << 20)
+
+    def spoil(group: h5py.Group) -> None:
+        group["obs/0"] = np.arange(30_000, dtype=np.float32)
+        for name in range(1, 50):
+            group[f"obs/{name}"] = group["obs/0"]
+
+    with pytest.raises(UnreadableRecording, match="GB of numbers"):
+        read_maniskill(write(tmp_path, spoil), "traj_0")
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.h5")
+    (tmp_path / "zero.h5").symlink_to("/dev/zero")
+    for name in ("pipe.h5", "zero.h5"):
+        with pytest.raises(OSError, match="not a regular file"), open_h5(tmp_path / name):
+            pass
+
+
+def test_a_group_of_no_such_name_is_missing_and_not_refused(tmp_path: Path) -> None:
+    with open_h5(write(tmp_path)) as file:
+        assert file.get("traj_0/nothing/below") is None and "traj_1" not in file
+        with pytest.raises(KeyError):
+            file["traj_1"]
+    with open_h5(write(tmp_path, external_link)) as other, pytest.raises(RefusedH5):
+        other["traj_0/obs"]

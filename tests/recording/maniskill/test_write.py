@@ -1,0 +1,244 @@
+"""Our .h5 and .json are what ManiSkill's RecordEpisode would have written, and what it wrote is read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import h5py
+import mani_skill.envs  # noqa: F401  (registers the tasks)
+import numpy as np
+import pytest
+from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
+from mani_skill.trajectory.utils import dict_to_list_of_dicts
+from mani_skill.utils.wrappers.record import RecordEpisode
+from numpy.typing import NDArray
+
+from tests.drive.episodes import Made
+from workbench.core.scene.shapes import SceneGeometry
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.reader.read_episode import read_episode, read_maniskill, trajectories
+
+STEPS = 6
+SEED = 4
+
+
+def flat(nested: Any, prefix: str = "") -> dict[str, NDArray]:
+    if isinstance(nested, dict):
+        return {
+            key: value for name in nested for key, value in flat(nested[name], f"{prefix}/{name}").items()
+        }
+    return {prefix.lstrip("/"): nested[0].numpy().copy()}
+
+
+def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
+    """The .h5 of one episode from ManiSkill's wrapper, which asks git for its commit, and from ours."""
+    stock: Any = gym.make(task, num_envs=1, render_backend="none", **kwargs)
+    env: Any = RecordEpisode(
+        stock,
+        str(folder / "theirs"),
+        trajectory_name="theirs",
+        save_video=False,
+    )
+    base = env.unwrapped
+    obs, info = env.reset(seed=SEED)
+    env.action_space.seed(SEED)
+    rows: dict[str, list[Any]] = {name: [] for name in ("action", "reward", "terminated", "truncated")}
+    states, seen, judged = [flat(base.get_state_dict())], [flat(obs)], [base.evaluate()]
+    for _ in range(STEPS):
+        action = env.action_space.sample()
+        obs, reward, terminated, truncated, info = env.step(action)
+        for name, value in zip(rows, (action, float(reward), bool(terminated), bool(truncated))):
+            rows[name].append(value)
+        states.append(flat(base.get_state_dict()))
+        seen.append(flat(obs))
+        judged.append(base.evaluate())
+    actions = np.stack(rows["action"]).astype(np.float32)
+    episode = Made(
+        info=EpisodeInfo(
+            task=task,
+            env_index=0,
+            seed=SEED,
+            source_file=None,
+            source_hash="",
+            source={},
+            control_dt=base.control_timestep,
+            control_mode=base.control_mode,
+            backend="cpu",
+            env_kwargs=dict(num_envs=1, **kwargs),
+            max_episode_steps=50,
+        ),
+        geometry=SceneGeometry(1, (), (), (), ()),
+        segmentation={},
+        poses=np.zeros((STEPS + 1, 0, 7), np.float32),
+        action=actions,
+        action_names=tuple(f"a{index}" for index in range(actions.shape[1])),
+        reward=np.array(rows["reward"], np.float32),
+        terminated=np.array(rows["terminated"]),
+        truncated=np.array(rows["truncated"]),
+        evaluate=stacked([flat(one) for one in judged]),
+        cameras=[],
+        env_states=stacked(states),
+        obs=stacked(seen),
+    )
+    env.close()
+    return folder / "theirs" / "theirs.h5", episode.write(folder / "ours").h5
+
+
+def tree(path: Path) -> dict[str, NDArray]:
+    found: dict[str, NDArray] = {}
+    with h5py.File(path) as file:
+        file.visititems(
+            lambda name, node: found.update({name: node[()]}) if isinstance(node, h5py.Dataset) else None
+        )
+    return found
+
+
+@pytest.mark.parametrize(
+    ("task", "obs_mode"),
+    [("PickCube-v1", "state_dict"), ("PickCube-v1", "state"), ("MS-CartpoleBalance-v1", "state")],
+)
+def test_names_types_shapes_and_numbers_are_theirs(
+    child_process: None, tmp_path: Path, task: str, obs_mode: str
+) -> None:
+    theirs, ours = record_both(task, tmp_path, obs_mode=obs_mode)
+    expected, found = tree(theirs), tree(ours)
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype, name
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+    said, document = (json.loads(path.with_suffix(".json").read_bytes()) for path in (theirs, ours))
+    assert document.keys() >= said.keys()
+    assert document["env_info"]["env_id"] == said["env_info"]["env_id"]
+    assert document["env_info"]["max_episode_steps"] == 50
+    (episode,), (expected_episode,) = document["episodes"], said["episodes"]
+    expected_episode["reset_kwargs"]["options"] = {}  # where nobody gave any, as in ours
+    assert episode == expected_episode
+
+    dataset = ManiSkillTrajectoryDataset(str(ours), load_count=-1)
+    assert len(dataset) == STEPS
+    with h5py.File(ours) as file:
+        states = dict_to_list_of_dicts(file["traj_0/env_states"])
+    assert len(states) == STEPS + 1
+
+
+def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+    """Longer than a piece of the journal and than a chunk of the file."""
+    count = np.arange(3001, dtype=np.float32)
+    states = np.stack([count, np.sin(count), np.zeros_like(count)] * 10, axis=1)
+    files = make_episode(3000, env_states={"actors/cube": states}, reward=count[1:]).write(tmp_path)
+    with h5py.File(files.h5) as file:
+        group: Any = file["traj_0"]
+        assert group["env_states/actors/cube"].chunks[0] < 3001
+        np.testing.assert_array_equal(group["env_states/actors/cube"][:], states)
+        np.testing.assert_array_equal(group["rewards"][:], count[1:])
+    assert files.h5.stat().st_size < states.nbytes / 2
+    found = read_episode(files.rrd)
+    np.testing.assert_array_equal(found.env_states["actors/cube"], states)
+    np.testing.assert_array_equal(found.reward, count[1:])
+    assert found.poses is not None
+    np.testing.assert_array_equal(found.poses[:, 1, 0], np.arange(3001))
+
+
+def test_theirs_is_read_as_ours_is(child_process: None, tmp_path: Path) -> None:
+    theirs, ours = record_both("PickCube-v1", tmp_path, obs_mode="state_dict")
+    assert trajectories(theirs) == trajectories(ours) == ("traj_0",)
+    found, expected = read_maniskill(theirs, "traj_0"), read_episode(ours)
+    assert found.geometry is None and found.poses is None and found.cameras == []
+    for name in ("action", "reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    for field in ("env_states", "obs"):
+        assert getattr(found, field).keys() == getattr(expected, field).keys()
+        for name, values in getattr(found, field).items():
+            np.testing.assert_array_equal(values, getattr(expected, field)[name])
+    np.testing.assert_array_equal(found.evaluate["success"][1:], expected.evaluate["success"][1:])
+    assert (found.info.task, found.info.seed, found.info.control_dt) == ("PickCube-v1", SEED, 0.05)
+    assert found.info.env_kwargs["obs_mode"] == "state_dict"
+
+
+def test_their_cameras_are_read_too(recorded: Any, tmp_path: Path) -> None:
+    """`recorded` is the same episode as plain arrays."""
+    env: Any = gym.make(
+        "PickCube-v1",
+        num_envs=1,
+        obs_mode="rgb+depth+segmentation",
+        robot_uids="panda_wristcam",
+        render_backend="cpu",
+        sensor_configs={"width": 96, "height": 96},
+    )
+    env = RecordEpisode(env, str(tmp_path), trajectory_name="theirs", save_video=False)
+    env.reset(seed=recorded.episode.info.seed)
+    for action in recorded.episode.action[:3]:
+        env.step(action)
+    env.close()
+    found = read_maniskill(tmp_path / "theirs.h5", "traj_0")
+    assert found.obs.keys() == recorded.episode.obs.keys()
+    assert [track.info.name for track in found.cameras] == ["base_camera", "hand_camera"]
+    for track, made in zip(found.cameras, recorded.episode.cameras):
+        assert (track.info.width, track.info.height) == (96, 96)
+        assert track.info.fovy == pytest.approx(made.info.fovy, abs=1e-5)
+        np.testing.assert_allclose(track.info.intrinsic, made.info.intrinsic)
+        np.testing.assert_allclose(track.pose[:, :3], made.pose[:4, :3], atol=1e-5)
+        # A quaternion and its negative are one rotation.
+        same = np.abs((track.pose[:, 3:] * made.pose[:4, 3:]).sum(axis=1))
+        np.testing.assert_allclose(same, 1, atol=1e-5)
+        assert track.rgb is not None and track.depth is not None and track.segmentation is not None
+        for state in range(4):
+            assert np.abs(track.rgb[state].astype(int) - made.rgb[state]).mean() < 6
+            np.testing.assert_array_equal(track.segmentation[state], made.segmentation[state])
+            assert np.abs(track.depth[state] - made.depth[state]).max() < 2e-3
+
+
+@pytest.mark.parametrize(("suffix", "lost"), [(".rrd", "poses"), (".h5", "env_states"), (".json", "")])
+def test_a_file_that_was_cut_takes_only_its_own_with_it(
+    make_episode: Callable[..., Made], tmp_path: Path, suffix: str, lost: str
+) -> None:
+    states = {"actors/cube": np.zeros((7, 13), np.float32)}
+    made = make_episode(6, reward=np.arange(6, dtype=np.float32), env_states=states)
+    path = made.write(tmp_path).rrd
+    file = path.with_suffix(suffix)
+    file.write_bytes(file.read_bytes()[:-100])
+    read = read_episode(path)
+    (said,) = read.unread
+    assert said.sentence.startswith(f"{file.name} was cut short or changed (")
+    np.testing.assert_array_equal(read.reward, made.reward)
+    assert read.info == made.info
+    assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")
+
+
+def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> None:
+    theirs, ours = record_both("MS-CartpoleBalance-v1", tmp_path, obs_mode="state")
+    for reading, why in (
+        (lambda: read_episode(tmp_path / "none.rrd"), "none.rrd is not there"),
+        (lambda: read_episode(theirs), "theirs.json is not from the workbench"),
+        (lambda: read_maniskill(theirs, "traj_7"), "says nothing of traj_7"),
+        (lambda: trajectories(ours.with_suffix(".json")), "no .h5 that can be read"),
+    ):
+        with pytest.raises(UnreadableRecording, match=why):
+            reading()
+    ours.with_suffix(".rrd").write_bytes(b"RRF2 and then nothing")
+    (said,) = read_episode(ours).unread
+    assert said.sentence.startswith(f"{ours.stem}.rrd was cut short or changed")
+    ours.with_suffix(".rrd").unlink()
+    assert read_episode(ours).length == STEPS
+    ours.with_suffix(".json").write_text('{"workbench": {"length": 3}}')
+    with pytest.raises(
+        UnreadableRecording,
+        match=r"is not as a recording is described: object missing required field `id` at \$\.workbench",
+    ):
+        read_episode(ours)
+    ours.with_suffix(".json").write_text('{"workbench": {"leng')
+    with pytest.raises(UnreadableRecording, match=r"is not JSON, or was cut short"):
+        read_episode(ours)
+    ours.with_suffix(".json").unlink()
+    with pytest.raises(UnreadableRecording, match=r"json is missing"):
+        read_episode(ours)

@@ -1,0 +1,68 @@
+"""Which recordings files and folders are, and what each is called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.recording.foreign_h5 import write as write_h5
+from tests.recording.library_files import describe
+from workbench.recording.episode.source import Kind, Source, UnreadableRecording
+from workbench.recording.reader.reading import read_source, sources_among
+
+
+@pytest.mark.parametrize(
+    ("path", "part", "kind", "stem"),
+    [
+        ("a/push.v2.json", None, "ours", "push.v2"),
+        ("a/push.h5", None, "ours", "push"),
+        ("a/push.h5", "traj_3", "maniskill", "push_traj_3"),
+        ("a/set.one", "4", "lerobot", "set.one_4"),
+    ],
+)
+def test_who_made_it_and_what_files_made_of_it_are_called(
+    path: str, part: str | None, kind: Kind, stem: str
+) -> None:
+    source = Source(Path(path), part)
+    assert (source.kind, source.stem) == (kind, stem)
+
+
+def test_each_is_found_once_by_name_whatever_names_it(child_process: None, tmp_path: Path) -> None:
+    second, first = describe(tmp_path, "b", id="two"), describe(tmp_path / "a", "z", id="one")
+    describe(tmp_path / "c", "copy", id="one")
+    theirs = write_h5(tmp_path)
+    found = sources_among([tmp_path])
+    assert [(source.id, source.path, source.name) for source in found] == [
+        ("one", first, "z"),
+        ("two", second, "b"),
+        (f"{theirs}#traj_0", theirs, "theirs#traj_0"),
+    ]
+    assert sources_among([second.with_suffix(".rrd"), tmp_path, second]) == (found[1], found[0], found[2])
+    assert sources_among([second.with_suffix(".h5")]) == (found[1],)
+
+
+def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is_not(
+    child_process: None, tmp_path: Path
+) -> None:
+    folder, empty, other = tmp_path / "recordings", tmp_path / "empty", tmp_path / "notes.txt"
+    describe(folder, "a", id="one")
+    empty.mkdir()
+    other.write_text("")
+    assert [source.id for source in sources_among([empty, folder])] == ["one"]
+    with pytest.raises(UnreadableRecording, match=f"no recording in {other}: looked for are"):
+        sources_among([folder, other])
+    with pytest.raises(UnreadableRecording, match=f"no recording in {empty}, {empty}: looked for are"):
+        sources_among([empty, empty])
+    with pytest.raises(FileNotFoundError, match=f"nothing at {tmp_path / 'none'}:"):
+        sources_among([folder, tmp_path / "none"])
+    with pytest.raises(UnreadableRecording, match="No recording is named"):
+        sources_among([])
+
+
+def test_an_episode_is_read_by_the_way_of_its_kind(child_process: None, tmp_path: Path) -> None:
+    theirs = write_h5(tmp_path)
+    episode = read_source(Source(theirs, "traj_0"))
+    assert (episode.info.task, episode.length) == ("PickCube-v1", 3)
+    with pytest.raises(UnreadableRecording, match="theirs"):
+        read_source(Source(theirs, "traj_1"))

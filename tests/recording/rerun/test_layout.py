@@ -1,0 +1,36 @@
+"""No body of a recording lies below another one, whatever the task calls its bodies."""
+
+from __future__ import annotations
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from workbench.core.scene.shapes import SceneGeometry
+from workbench.recording.rerun.layout import body_entities
+
+NAME = st.text(st.sampled_from("ab/ c.ä"), max_size=6) | st.sampled_from(["cameras", "cameras/a", "a/b", "a"])
+
+
+def entities(*names: str) -> tuple[str, ...]:
+    count = len(names)
+    return body_entities(SceneGeometry(1, names, ("dynamic",) * count, (False,) * count, ()))
+
+
+def test_bodies_go_by_their_names() -> None:
+    assert entities("cube", "panda/panda_hand") == ("/world/cube", "/world/panda/panda_hand")
+
+
+def test_an_actor_named_like_an_articulation_gives_way() -> None:
+    assert entities("panda", "panda/hand") == ("/world/panda_", "/world/panda/hand")
+    assert entities("cameras", "cameras/eye") == ("/world/cameras__", "/world/cameras_/eye")
+
+
+@given(st.lists(NAME, max_size=6).map(tuple))
+@example(("a", "a/b", "a_", "a_/b"))
+@example(("", "/", "unnamed"))
+def test_entities_are_apart(names: tuple[str, ...]) -> None:
+    found = entities(*names)
+    assert len(set(found)) == len(names)
+    for one in found:
+        assert one.startswith("/world/") and not one.startswith("/world/cameras/") and one != "/world/cameras"
+        assert not any(other.startswith(one + "/") for other in found)

@@ -1,0 +1,144 @@
+"""Pictures that are encoded beside the steps come into the recording as if they had not been, and errors are still told."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.drive.episodes import Made, Track
+from tests.drive.rows import append
+from tests.drive.waiting import until
+from workbench.core.camera_data import CameraInfo
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.writing import encode_pool
+from workbench.recording.writing.publish import RecordingError
+from workbench.recording.writing.recover import recover
+
+Maker = Callable[..., Made]
+STATES = 7
+
+
+@pytest.fixture
+def seen(make_episode: Maker) -> Made:
+    """Every picture is one number, which tells it from all others."""
+    info = CameraInfo(
+        "eye", "sensor", 40, 30, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("segmentation",)
+    )
+    ids = np.broadcast_to(np.arange(STATES, dtype=np.int32)[:, None, None], (STATES, 30, 40)).copy()
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (STATES, 1))
+    return make_episode(STATES - 1, cameras=[Track(info, np.arange(STATES), poses, segmentation=ids)])
+
+
+@pytest.fixture
+def held_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """No picture is encoded before the event is set."""
+    go, encode = threading.Event(), encode_pool.encode
+
+    def wait(*args: Any) -> bytes:
+        assert go.wait(60)
+        return encode(*args)
+
+    monkeypatch.setattr(encode_pool, "encode", wait)
+    yield go
+    go.set()
+
+
+def pictures_of(path: Path) -> list[int]:
+    (camera,) = read_episode(path).cameras
+    assert camera.segmentation is not None
+    assert camera.frame.tolist() == list(range(len(camera.segmentation)))
+    return [int(camera.segmentation[k][0, 0]) for k in range(len(camera.segmentation))]
+
+
+def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.Event, tmp_path: Path) -> None:
+    writer = seen.writer(tmp_path)
+    for row in seen.rows():
+        append(writer, row)
+    assert not held_back.is_set()
+    held_back.set()
+    assert pictures_of(writer.finish().json) == list(range(STATES))
+
+
+def test_what_is_too_much_to_wait_is_encoded_at_once(
+    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(encode_pool, "MOST_BYTES", 1)
+    assert pictures_of(seen.write(tmp_path).json) == list(range(STATES))
+
+
+def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Path) -> None:
+    writer = seen.writer(tmp_path)
+    first, second, *_ = seen.rows()
+    append(writer, first)
+    (picture,) = second.pictures
+    assert picture.segmentation is not None
+    wrong = dataclasses.replace(picture, segmentation=picture.segmentation.astype(np.float32))
+    with pytest.raises(ValueError, match="float32"):
+        append(writer, dataclasses.replace(second, pictures=(wrong,)))
+    append(writer, second)
+    assert pictures_of(writer.finish().json) == [0, 1]
+
+
+def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kept(
+    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    encode = encode_pool.encode
+
+    def fails(modality: Any, picture: np.ndarray) -> bytes:
+        if picture[0, 0] == 4:
+            raise MemoryError("no room for a picture")
+        return encode(modality, picture)
+
+    monkeypatch.setattr(encode_pool, "encode", fails)
+    writer = seen.writer(tmp_path)
+    with pytest.raises(RecordingError, match="no room for a picture"):
+        for row in seen.rows():
+            append(writer, row)
+        writer.finish()
+    writer.close()
+    (files,) = recover(tmp_path)
+    assert pictures_of(files.json) == [0, 1, 2, 3]
+
+
+def test_what_was_encoded_does_not_wait_any_more(
+    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """However many pictures there were: only where too many wait at once are they encoded by whoever brings them."""
+    picture = np.zeros((30, 40), np.int32)
+    monkeypatch.setattr(encode_pool, "_pool", None)
+    monkeypatch.setattr(encode_pool, "MOST_BYTES", 2 * picture.nbytes)
+    encode, by = encode_pool.encode, []
+
+    def noted(*args: Any) -> bytes:
+        by.append(threading.current_thread())
+        return encode(*args)
+
+    monkeypatch.setattr(encode_pool, "encode", noted)
+    for number in range(8):
+        soon = encode_pool.encode_soon([("picture/0/segmentation", number, "segmentation", picture)])
+        assert [entry.number for entry in soon.result(60)] == [number]
+        # The last picture is done a moment before it is counted so.
+        until(lambda: encode_pool._pool is not None and encode_pool._pool._bytes == 0, "nothing to wait")
+    assert threading.current_thread() not in by and len(by) == 8
+
+
+def test_pictures_are_handed_over_as_soon_as_there_are_enough(
+    seen: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And each time anew: a thread that is woken for each takes longer than the pictures."""
+    picture = np.zeros((30, 40), np.int32)
+    monkeypatch.setattr(encode_pool, "_pool", None)
+    monkeypatch.setattr(encode_pool, "_TOGETHER_BYTES", 3 * picture.nbytes)
+    first = encode_pool.encode_soon([])
+    soons = [first]
+    for number in range(7):
+        soons.append(encode_pool.encode_soon([("picture/0/segmentation", number, "segmentation", picture)]))
+    until(lambda: all(soon.done() for soon in soons[:7]), "six pictures")
+    assert encode_pool._pool is not None and encode_pool._pool._gathered == soons[7:]
+    soons[7].result(60)

@@ -1,0 +1,403 @@
+"""A recording is there, whole, under a name of its own, or it is not there at all; and whoever records goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import psutil
+import pytest
+import rerun as rr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.episodes import Made, Track, journal_of
+from tests.drive.rows import EpisodeRow, append
+from tests.recording.verify_rrd import verify_rrd
+from workbench.core.camera_data import CameraInfo, Picture
+from workbench.core.scene.shapes import Mesh
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.rerun import write
+from workbench.recording.writing.episode_writer import EpisodeFiles, EpisodeWriter
+from workbench.recording.writing.finish import episode_stem
+from workbench.recording.writing.journal import FOLDER
+from workbench.recording.writing.publish import RecordingError
+from workbench.recording.writing.recover import recover
+
+Maker = Callable[..., Made]
+
+
+@pytest.fixture
+def unprivileged(tmp_path: Path) -> Iterator[None]:
+    """Not root, who may write anywhere."""
+    if os.geteuid() != 0:
+        yield
+        return
+    for folder in (tmp_path, *tmp_path.parents):
+        if folder.stat().st_mode & 0o077 == 0:  # pytest's own, as many as there are processes of tests
+            folder.chmod(0o755)
+    os.chown(tmp_path, 65534, 65534)
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@contextmanager
+def little_room(size: int) -> Iterator[None]:
+    """A write that fails half way, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def wide(make_episode: Maker, steps: int = 3) -> Made:
+    noise = np.random.default_rng(0).random((steps, 2000)).astype(np.float32)
+    return make_episode(steps, action=noise, action_names=tuple(map(str, range(2000))))
+
+
+def left(folder: Path) -> list[str]:
+    """What lies in `folder`, and in the folder of the journals."""
+    return sorted(
+        os.path.relpath(Path(parent, name), folder) for parent, _, names in os.walk(folder) for name in names
+    )
+
+
+def test_three_files_of_one_name_and_nothing_else(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode(evaluate={"success": np.array([0, 0, 0, 1], bool)})
+    files = episode.write(tmp_path / "a" / "b")
+    assert sorted(os.listdir(tmp_path / "a" / "b")) == sorted(
+        path.name for path in (files.rrd, files.h5, files.json)
+    )
+    assert files.rrd.stem == files.h5.stem == files.json.stem == episode_stem(episode.info)
+    said = json.loads(files.json.read_bytes())["workbench"]
+    assert said["id"] == episode.info.id and said["success"] is True and said["fail"] is None
+    assert (said["length"], said["return"], said["seed"], said["thumbnail"]) == (3, 0.0, 7, None)
+
+
+def test_files_that_exist_are_never_written_over(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode()
+    stem = episode_stem(episode.info)
+    (tmp_path / f"{stem}.rrd").write_text("mine")
+    (tmp_path / f"{stem}_2.json").write_text("mine too")
+    names = [episode.write(tmp_path).json.stem for _ in range(2)]
+    assert names == [f"{stem}_3", f"{stem}_4"]
+    assert (tmp_path / f"{stem}.rrd").read_text() == "mine"
+    assert not (tmp_path / f"{stem}.h5").exists() and not (tmp_path / f"{stem}_2.rrd").exists()
+
+
+def test_names_are_kept_apart_without_hard_links(
+    child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    episode = make_episode()
+    stems = [episode.write(tmp_path).rrd.stem for _ in range(2)]
+    assert stems == [episode_stem(episode.info), episode_stem(episode.info) + "_2"]
+    assert len(left(tmp_path)) == 6
+    assert verify_rrd(tmp_path / f"{stems[1]}.rrd") is None
+
+
+def test_threads_that_write_at_once_get_files_each(make_episode: Maker, tmp_path: Path) -> None:
+    written: list[EpisodeFiles] = []
+    threads = []
+    for steps in range(1, 5):
+        episode = make_episode(steps)
+        threads.append(threading.Thread(target=lambda e=episode: written.append(e.write(tmp_path))))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(read_episode(files.json).length for files in written) == [1, 2, 3, 4]
+    assert len(left(tmp_path)) == 12
+
+
+def test_rows_that_do_not_fit_are_refused_and_the_episode_goes_on(
+    make_episode: Maker, tmp_path: Path
+) -> None:
+    info = CameraInfo("eye", "sensor", 4, 3, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb",))
+    image, pose = np.zeros((3, 4, 3), np.uint8), np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
+    track = Track(info, np.arange(4), np.tile(pose, (4, 1)), rgb=np.tile(image, (4, 1, 1, 1)))
+    episode = make_episode(cameras=[track])
+    first, second, *_ = episode.rows()
+    writer = episode.writer(tmp_path)
+    refused = [
+        (dataclasses.replace(first, poses=first.poses[:1]), "the scene has 2 bodies"),
+        (dataclasses.replace(first, evaluate={"phase": np.array("reach")}), "dtype <U5"),
+        (
+            dataclasses.replace(first, pictures=(Picture("nose", "sensor", 0, pose, rgb=image),)),
+            "camera nose, which the task has not",
+        ),
+        (
+            dataclasses.replace(first, pictures=(Picture("eye", "sensor", 0, pose, rgb=image[:2]),)),
+            "4 x 2, but the camera is 4 x 3",
+        ),
+        (dataclasses.replace(first, pictures=first.pictures * 2), "two pictures of one state"),
+    ]
+    for row, why in refused:
+        with pytest.raises(ValueError, match=why):
+            append(writer, row)
+    with pytest.raises(ValueError, match="no state yet"):
+        make_episode().writer(tmp_path).finish()
+    append(writer, first)
+    given = Picture("eye", "sensor", 0, pose, depth=np.zeros((3, 4), np.float32))
+    for row, why in (
+        (dataclasses.replace(second, action=np.zeros(3)), "3 numbers, but 1 action names"),
+        (dataclasses.replace(second, pictures=(given,)), "gave rgb first and now depth"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            append(writer, row)
+    append(writer, second)
+    assert len(writer) == 1
+    found = read_episode(writer.finish().rrd)
+    assert found.length == 1 and len(found.cameras[0].frame) == 2 and found.evaluate == {}
+
+
+def test_an_episode_that_is_discarded_leaves_nothing(make_episode: Maker, tmp_path: Path) -> None:
+    writer = make_episode().writer(tmp_path)
+    for row in make_episode().rows():
+        append(writer, row)
+    assert left(tmp_path) and writer.bytes_written > 500
+    writer.discard()
+    assert os.listdir(tmp_path) == []
+
+
+def test_finishing_twice_gives_the_same_files(make_episode: Maker, tmp_path: Path) -> None:
+    writer = make_episode().writer(tmp_path)
+    for row in make_episode().rows():
+        append(writer, row)
+    assert writer.finish() == writer.finish()
+    assert len(left(tmp_path)) == 3
+
+
+def test_a_folder_without_permission_is_said(make_episode: Maker, tmp_path: Path, unprivileged: None) -> None:
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o555)
+    with pytest.raises(RecordingError, match="locked may not be written to. Choose another folder"):
+        make_episode().writer(folder)
+    assert os.listdir(folder) == []
+
+
+def test_a_file_in_place_of_the_folder_is_said(make_episode: Maker, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordingError, match="file is not a folder"):
+        make_episode().writer(tmp_path / "file")
+
+
+def test_a_folder_that_is_removed_under_way_is_said(make_episode: Maker, tmp_path: Path) -> None:
+    folder = tmp_path / "gone"
+    writer = make_episode().writer(folder)
+    rows = list(make_episode().rows())
+    append(writer, rows[0])
+    shutil.rmtree(folder)
+    with pytest.raises(RecordingError, match="gone was removed"):
+        append(writer, rows[1])
+        writer.finish()
+    with pytest.raises(RecordingError, match="gone was removed"):
+        writer.finish()
+    assert not folder.exists()
+    assert len(left(make_episode().write(folder).rrd.parent)) == 3
+
+
+@pytest.mark.parametrize("room", [0, 4000, 40_000])
+def test_a_disk_without_room_leaves_the_journal_or_nothing(
+    make_episode: Maker, tmp_path: Path, room: int
+) -> None:
+    episode = wide(make_episode)
+    with little_room(room):
+        with pytest.raises(RecordingError, match=r"Cannot record Made-v1 .*limit"):
+            writer = episode.writer(tmp_path)
+            for row in episode.rows():
+                append(writer, row)
+                journal_of(writer).write()
+        if room:
+            writer.close()
+    assert {Path(name).parent.name for name in left(tmp_path)} <= {FOLDER}
+    recovered = recover(tmp_path)
+    # Rows of 8 kB: what was written of them before the disk was full is an episode, if it is one step.
+    assert [read_episode(files.rrd).length for files in recovered] == ([1] if room == 40_000 else [])
+    assert len(left(tmp_path)) == 3 * len(recovered)
+    assert read_episode(episode.write(tmp_path).rrd).length == 3
+
+
+@pytest.fixture
+def small_disk(child_process: None, tmp_path: Path) -> Iterator[Path]:
+    """A filesystem of 1 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("no filesystem may be mounted here")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("ballast", [850_000, 940_000])
+def test_a_full_disk_is_said_and_what_was_recorded_is_found_when_there_is_room(
+    make_episode: Maker, small_disk: Path, ballast: int
+) -> None:
+    (small_disk / "ballast").write_bytes(bytes(ballast))
+    episode = wide(make_episode, steps=12)
+    with pytest.raises(RecordingError, match="disk that holds .* is full. Make room there"):
+        writer = episode.writer(small_disk)
+        for row in episode.rows():
+            append(writer, row)
+        writer.finish()
+    writer.close()
+    assert set(os.listdir(small_disk)) <= {"ballast", FOLDER}
+    (small_disk / "ballast").unlink()
+    for files in recover(small_disk):
+        assert 0 < read_episode(files.json).length <= 12
+        assert verify_rrd(files.rrd) is None
+    assert not (small_disk / FOLDER).exists()
+
+
+def test_who_acts_cannot_be_written_to_a_folder_that_is_gone(make_episode: Maker, tmp_path: Path) -> None:
+    writer = make_episode().writer(tmp_path / "gone")
+    append(writer, next(iter(make_episode().rows())))
+    journal_of(writer).write()
+    shutil.rmtree(tmp_path / "gone")
+    journal_of(writer).sync()
+    with pytest.raises(RecordingError, match="Cannot record Made-v1 .*gone was removed"):
+        writer.acted_by("somebody else")
+    writer.close()
+
+
+def test_finishing_again_helps_once_there_is_room(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
+    episode = wide(make_episode)
+    writer = episode.writer(tmp_path)
+    for row in episode.rows():
+        append(writer, row)
+    with little_room(30_000):
+        with pytest.raises(RecordingError):
+            writer.finish()
+    assert verify_rrd(writer.finish().rrd) is None
+    assert len(left(tmp_path)) == 3
+
+
+@pytest.mark.parametrize("suffix", [".rrd", ".h5"])
+@pytest.mark.parametrize("kept", [0.05, 0.5, 0.99])
+def test_files_that_were_cut_short_are_not_given_their_names(
+    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, kept: float
+) -> None:
+    def cut(path: Path) -> None:
+        if path.suffix == suffix:
+            os.truncate(path, int(path.stat().st_size * kept))
+
+    open_h5, write_chunks = h5py.File, write.write_chunks
+
+    def open_short(path: Path, mode: str, **how: Any) -> h5py.File:
+        if mode == "r":
+            cut(path)
+        return open_h5(path, mode, **how)
+
+    def write_short(chunks: Any, path: Path, application_id: str) -> None:
+        write_chunks(chunks, path, application_id)
+        cut(path)
+
+    monkeypatch.setattr(h5py, "File", open_short)
+    monkeypatch.setattr(write, "write_chunks", write_short)
+    writer = wide(make_episode).writer(tmp_path)
+    for row in wide(make_episode).rows():
+        append(writer, row)
+    with pytest.raises(RecordingError):
+        writer.finish()
+    assert {Path(name).suffix for name in left(tmp_path)} == {".arrow", ".scene"}
+
+
+def test_what_rerun_refuses_is_an_error_out_of_strict_mode_too(make_episode: Maker, tmp_path: Path) -> None:
+    rr.set_strict_mode(False)
+    episode = make_episode()
+    (visual,) = episode.geometry.visuals
+    flat = Mesh(np.zeros((3, 2), dtype=np.float32), visual.mesh.faces)  # vertices without z
+    broken = (dataclasses.replace(visual, mesh=flat),)
+    episode.geometry = dataclasses.replace(episode.geometry, visuals=broken)
+    with pytest.raises(ValueError):
+        episode.write(tmp_path)
+    assert {Path(name).suffix for name in left(tmp_path)} == {".arrow", ".scene"}
+
+
+def test_episodes_of_one_scene_share_its_meshes(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode()
+    writers: list[EpisodeWriter] = []
+    for env in range(3):
+        episode.info = dataclasses.replace(INFO, id=f"{env}")
+        writers.append(episode.writer(tmp_path))
+    scenes = list((tmp_path / FOLDER).glob("*.scene"))
+    assert len(scenes) == 3 and len({path.stat().st_ino for path in scenes}) == 1
+    for writer in writers:
+        append(writer, next(iter(episode.rows())))
+        writer.finish()
+    assert len(left(tmp_path)) == 9
+
+
+def test_writing_many_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> None:
+    process = psutil.Process()
+    make_episode().write(tmp_path)
+    before = process.num_threads(), process.num_fds()
+    for _ in range(10):
+        make_episode().write(tmp_path)
+    until_quiet = threading.Event()
+    for _ in range(100):  # the thread of the journals ends a moment after the last of them
+        if process.num_threads() <= before[0]:
+            break
+        until_quiet.wait(0.1)
+    assert process.num_threads() <= before[0] and process.num_fds() <= before[1]
+    assert len(left(tmp_path)) == 33
+
+
+@given(task=st.text(max_size=200), seed=st.integers(-1, 2**31 - 1), env=st.integers(0, 5000))
+def test_names_are_safe_anywhere(task: str, seed: int, env: int) -> None:
+    stem = episode_stem(dataclasses.replace(INFO, task=task, seed=seed, env_index=env))
+    assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,150}", stem)
+
+
+def test_names_sort_by_seed_then_env_then_time() -> None:
+    infos = [(2, 0), (2, 3), (2, 11), (10, 0), (100, 0)]
+    names = [
+        episode_stem(
+            dataclasses.replace(INFO, seed=seed, env_index=env, written_at=f"2026-11-21T12:{m}:00+00:00")
+        )
+        for seed, env in infos
+        for m in ("00", "01")
+    ]
+    assert names == sorted(names)
+    assert re.fullmatch(r"PushCube-v1_seed0002_env00_2026-11-2\dT\d\d-\d\d-00", names[0])
+
+
+def test_a_row_holds_nothing_of_the_batch(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode()
+    poses = episode.poses[0].copy()
+    writer = episode.writer(tmp_path)
+    append(writer, EpisodeRow(poses))
+    poses[:] = -1
+    found = read_episode(writer.finish().json)
+    assert found.poses is not None
+    np.testing.assert_array_equal(found.poses[0], episode.poses[0])
+
+
+INFO = EpisodeInfo("PushCube-v1", 0, 0, None, "", {}, 0.05, None, "cpu")

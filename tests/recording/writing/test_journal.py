@@ -1,0 +1,338 @@
+"""A journal holds whole states, whatever fails: calls of the system, its folder, what is still being encoded."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from pathlib import Path
+
+import pytest
+
+from tests.drive.episodes import entries_of
+from tests.drive.waiting import until
+from tests.recording.refused_calls import descriptors, refused
+from workbench.recording.writing import journal as journals
+from workbench.recording.writing.journal import Entry, Journal, claim
+
+
+@pytest.fixture(autouse=True)
+def no_thread_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written when is the test's affair."""
+    keeper = type(journals._keeper)()
+    monkeypatch.setattr(keeper, "watch", lambda journal: None)
+    monkeypatch.setattr(journals, "_keeper", keeper)
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[Journal]:
+    journal = Journal(tmp_path / "folder" / "a.arrow")
+    yield journal
+    journal.close()
+
+
+def rows(path: Path) -> list[bytes]:
+    return [entry.value for entry in entries_of(path) if entry.kind == "row"]
+
+
+def numbers(*values: int) -> list[bytes]:
+    return [bytes([value]) for value in values]
+
+
+@pytest.mark.parametrize("removed", ["folder", "file"])
+def test_a_folder_that_vanished_is_told_at_the_next_row(
+    tmp_path: Path, journal: Journal, removed: str
+) -> None:
+    journal.append(Entry("row", 0, b"0"))
+    journal.sync()
+    journal.append(Entry("row", 0, b"1"))
+    if removed == "folder":
+        shutil.rmtree(tmp_path / "folder")
+    else:
+        journal.path.unlink()
+    journal.sync()
+    for tell in (lambda: journal.append(Entry("row", 0, b"2")), journal.append, journal.finish):
+        with pytest.raises(FileNotFoundError, match="was removed during the recording"):
+            tell()
+
+
+def test_a_folder_that_was_renamed_keeps_its_journal(tmp_path: Path, journal: Journal) -> None:
+    (tmp_path / "folder").rename(tmp_path / "elsewhere")
+    journal.append(Entry("row", 0, b"0"))
+    journal.finish()
+    assert rows(tmp_path / "elsewhere" / "a.arrow") == [b"0"]
+
+
+def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no_good_of_it(
+    journal: Journal,
+) -> None:
+    journal.append(Entry("row", 0, b"0"))
+    with refused(1, ("fsync",)):
+        journal.sync()
+    for _ in range(2):
+        journal.sync()
+        for tell in (lambda: journal.append(Entry("row", 0, b"1")), journal.append):
+            with pytest.raises(OSError, match="Input/output error"):
+                tell()
+    journal.finish()
+    assert rows(journal.path) == [b"0"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize("then", [0, errno.EIO])
+@pytest.mark.parametrize("half", [0, 5])
+def test_what_could_not_be_written_is_written_once_there_is_room(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch, number: int, then: int, half: int
+) -> None:
+    """Also where half of it was, and what is to take that back fails too."""
+    journal.append(Entry("row", 0, b"0"))
+    journal.write()
+    for value in numbers(1, 2):
+        journal.append(Entry("row", 0, value * 3000))
+    write = os.pwrite
+    with monkeypatch.context() as patch:
+        if half:
+            patch.setattr(os, "pwrite", lambda descriptor, view, at: write(descriptor, view[:half], at))
+        with refused(2 if half else 1, ("pwrite",), number, then):
+            journal.write()
+    with pytest.raises(OSError) as told:
+        journal.append(Entry("row", 0, b"not kept"))
+    assert told.value.errno == number
+    assert rows(journal.path) == [b"0"]
+    journal.finish()
+    assert rows(journal.path) == [b"0", *(value * 3000 for value in numbers(1, 2))]
+    assert journal.size == journal.path.stat().st_size
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch, alone: bool
+) -> None:
+    """Also a row so large that whoever brings it writes it."""
+    monkeypatch.setattr(journals, "_BATCH_BYTES", 100)
+
+    def bring(value: bytes) -> bool:
+        try:
+            journal.append(*([] if alone else [Entry("camera/0", 0, value)]), Entry("row", 0, value))
+        except OSError:
+            return False
+        return True
+
+    with refused(2, ("pwrite",), errno.ENOSPC, then=errno.ENOSPC):
+        taken = [value * 200 for value in numbers(1, 2, 3) if bring(value * 200)]
+    assert len(taken) < 3
+    journal.finish()
+    assert rows(journal.path) == taken
+
+
+def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
+    begin = journal.size
+    made: Future[list[Entry]] = Future()
+    journal.append(Entry("row", 0, b"0" * 100))
+    journal.append(made, Entry("row", 0, b"1" * 100))
+    waiting = journal.size
+    assert begin + 200 < waiting < begin + 300
+    made.set_result([Entry("picture/0/rgb", 1, b"p" * 1000)])
+    assert journal.size > waiting + 1000
+    for _ in range(2):
+        journal.write()
+        assert journal.size == journal.path.stat().st_size
+
+
+def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(journal: Journal) -> None:
+    made: Future[list[Entry]] = Future()
+    made.set_exception(MemoryError("no room"))
+    journal.append(Entry("row", 0, b"0"))
+    journal.append(Entry("camera/0", 1, b"pose"), made, Entry("row", 0, b"1"))
+    for _ in range(2):
+        with pytest.raises(OSError, match="could not be encoded .*no room"):
+            journal.finish()
+    assert entries_of(journal.path) == [Entry("row", 0, b"0")]
+
+
+def test_rows_that_come_while_the_disk_fails_keep_their_order(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        journal.append(Entry("row", 0, b"2"))
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for value in (b"0", b"1"):
+        journal.append(Entry("row", 0, value))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", full)
+        journal.write()
+    journal.finish()
+    assert rows(journal.path) == [b"0", b"1", b"2"]
+    assert journal.size == journal.path.stat().st_size
+
+
+def test_a_journal_that_cannot_be_removed_is_let_go_of(journal: Journal) -> None:
+    with refused(1, ("unlink",)), pytest.raises(OSError, match="Input/output error"):
+        journal.remove()
+    held = claim(journal.path)
+    assert held is not None
+    os.close(held)
+
+
+@pytest.mark.parametrize("then", [0, errno.EROFS])
+def test_a_journal_that_cannot_be_begun_leaves_nothing_open(tmp_path: Path, then: int) -> None:
+    with refused() as calls:
+        Journal(tmp_path / "0" / "a.arrow").remove()
+    assert len(calls) > 3
+    for at, call in enumerate(calls, 1):
+        before = descriptors()
+        with refused(at, then=then):
+            try:
+                Journal(tmp_path / str(at) / "a.arrow").remove()
+            except OSError as error:
+                assert error.errno == errno.EIO, call
+        assert descriptors() == before, call
+        left = list((tmp_path / str(at)).glob("*"))
+        assert not left or then or call.startswith("unlink"), call
+
+
+def test_one_process_writes_it_and_whoever_finds_it_later_has_it_alone(
+    tmp_path: Path, journal: Journal
+) -> None:
+    assert claim(journal.path) is None, "its writer lives"
+    assert claim(tmp_path / "none.arrow") is None
+    (tmp_path / "link.arrow").symlink_to(journal.path)
+    journal.close()
+    assert claim(tmp_path / "link.arrow") is None and claim(tmp_path) is None
+    before = descriptors()
+    held = claim(journal.path)
+    assert held is not None and claim(journal.path) is None and len(descriptors()) == len(before) + 1
+    os.close(held)
+    with pytest.raises(FileExistsError):
+        Journal(journal.path)
+    again = claim(journal.path)
+    assert again is not None
+    os.close(again)
+    assert descriptors() == before
+
+
+def test_a_journal_that_its_writer_removes_meanwhile_is_not_claimed(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = journals.fcntl.flock
+
+    def late(descriptor: int, how: int) -> None:
+        journal.remove()
+        lock(descriptor, how)
+
+    before = descriptors()
+    monkeypatch.setattr(journals.fcntl, "flock", late)
+    assert claim(journal.path) is None
+    assert len(descriptors()) == len(before) - 1, "its own"
+
+
+def test_a_lock_that_the_disk_refuses_is_told_and_holds_nothing(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Network drives may have none."""
+
+    def refuse(descriptor: int, how: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    journal.close()
+    before = descriptors()
+    monkeypatch.setattr(journals.fcntl, "flock", refuse)
+    with pytest.raises(OSError, match="No locks available"):
+        claim(journal.path)
+    assert descriptors() == before
+
+
+def test_a_disk_that_does_not_give_what_was_written_is_no_end(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A journal may end anywhere, but what a network drive does not give for a moment is not lost."""
+    for value in numbers(0, 1, 2):
+        journal.append(Entry("row", 0, value * 5000))
+        journal.write()
+    opened = journals.open_regular_file
+
+    def failing(path: Path):
+        file = opened(path)
+        read = file.read
+
+        class Failing:
+            closed = False
+            left = 3
+            mode = "rb"
+
+            def read(self, size: int = -1) -> bytes:
+                self.left -= 1
+                if self.left < 0:
+                    raise OSError(errno.EIO, "Input/output error")
+                return read(size)
+
+            seek, tell, close = file.seek, file.tell, file.close
+
+        return Failing()
+
+    monkeypatch.setattr(journals, "open_regular_file", failing)
+    with pytest.raises(OSError, match="Input/output error"):
+        rows(journal.path)
+
+
+def test_threads_write_all_journals_and_end_with_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journals, "_keeper", type(journals._keeper)())
+    monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
+    lasting: set[str] = set()
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        lasting.add(os.readlink(f"/proc/self/fd/{descriptor}"))
+
+    monkeypatch.setattr(os, "fsync", noted)
+    before = set(threading.enumerate())
+    three = [Journal(tmp_path / f"{k}.arrow") for k in range(3)]
+    (thread,) = set(threading.enumerate()) - before
+    assert thread.daemon, "the end of a process does not wait for it"
+    for journal in three:
+        journal.append(Entry("row", 0, b"x"))
+    until(
+        lambda: all(rows(journal.path) == [b"x"] and str(journal.path) in lasting for journal in three),
+        "every row on the disk",
+        seen=thread.is_alive,
+    )
+    for journal in three:
+        journal.close()
+    thread.join(20)
+    assert not thread.is_alive()
+
+
+def test_what_waits_is_written_to_all_journals_before_the_disk_is_waited_for_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper = type(journals._keeper)()
+    monkeypatch.setattr(journals, "_keeper", keeper)
+    monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
+    three: list[Journal] = []
+    put: list[bool] = []
+    seen: list[list[list[bytes]]] = []
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        if put:
+            seen.append([rows(journal.path) for journal in three])
+        fsync(descriptor)
+        # The last of a round, so that the next one begins with all of them.
+        if len(three) == 3 and not put and descriptor == list(keeper._journals)[-1]._descriptor:
+            for number, journal in enumerate(three):
+                journal.append(Entry("row", 0, bytes([number])))
+            put.append(True)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    three += [Journal(tmp_path / f"{number}.arrow") for number in range(3)]
+    until(lambda: len(seen) >= 3, "three writes")
+    assert seen[0] == [[b"\0"], [b"\1"], [b"\2"]]
+    for journal in three:
+        journal.close()

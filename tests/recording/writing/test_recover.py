@@ -1,0 +1,341 @@
+"""What a dead writer leaves becomes an episode, whatever fails meanwhile; nothing else is touched."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.episodes import Made, entries_of, header_of, journal_of
+from tests.drive.rows import append
+from tests.drive.waiting import until
+from tests.recording.refused_calls import descriptors, refused
+from workbench.core.scene.shapes import Mesh
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.writing import finish as making
+from workbench.recording.writing.finish import episode_stem
+from workbench.recording.writing.journal import FOLDER, Entry, Journal
+from workbench.recording.writing.publish import RecordingError
+from workbench.recording.writing.recover import recover
+
+Maker = Callable[..., Made]
+
+
+def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp_path: Path) -> None:
+    """Rows that were appended long ago are there though none came after them."""
+    episode = make_episode(5)
+    writer = episode.writer(tmp_path)
+    for k, row in enumerate(episode.rows()):
+        if k == 4:
+            writer.acted_by("somebody else")
+        append(writer, row)
+    journal = next((tmp_path / FOLDER).glob("*.arrow"))
+    until(lambda: sum(entry.kind == "row" for entry in entries_of(journal)) == 6, "all rows")
+    assert recover(tmp_path) == []  # its writer lives
+    writer.close()
+    (files,) = recover(tmp_path)
+    found = read_episode(files.h5)
+    acted_by = (*episode.info.acted_by, (3, "somebody else"))
+    assert found.info == dataclasses.replace(episode.info, recovered=True, acted_by=acted_by)
+    assert found.length == 5
+
+
+def test_a_journal_may_end_anywhere(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode(4)
+    writer = episode.writer(tmp_path)
+    ends = []
+    for row in episode.rows():
+        append(writer, row)
+        journal_of(writer).write()
+        ends.append(journal_of(writer).size)
+    journal_of(writer).write()
+    journal = next((tmp_path / FOLDER).glob("*.arrow"))
+    whole = journal.read_bytes()
+    writer.discard()
+    chance = random.Random(0)
+    cut = tmp_path / "cut.arrow"
+    for end in [*ends, *(chance.randrange(len(whole)) for _ in range(40))]:
+        cut.write_bytes(whole[:end])
+        rows = sum(entry.kind == "row" for entry in entries_of(cut))
+        assert rows == sum(one <= end for one in ends)
+
+
+def test_garbage_at_the_end_is_left_out(make_episode: Maker, tmp_path: Path) -> None:
+    """After a power cut a file may be as long as it was meant to be, and hold something else."""
+    episode = make_episode(4)
+    writer = episode.writer(tmp_path)
+    for row in episode.rows():
+        append(writer, row)
+    journal_of(writer).write()
+    writer.close()
+    journal = next((tmp_path / FOLDER).glob("*.arrow"))
+    with journal.open("ab") as file:
+        file.write(bytes(1000) + os.urandom(5000))
+    (files,) = recover(tmp_path)
+    assert read_episode(files.rrd).length == 4
+
+
+@pytest.mark.parametrize("linked", [0, 1, 2, 3])
+def test_a_writer_that_died_between_two_names(
+    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, linked: int
+) -> None:
+    episode = make_episode()
+    writer = episode.writer(tmp_path)
+    for row in episode.rows():
+        append(writer, row)
+    link = os.link
+    done: list[str] = []
+
+    class Death(BaseException):
+        pass
+
+    def dying(source: str, target: str) -> None:
+        if len(done) == linked:
+            raise Death
+        link(source, target)
+        done.append(target)
+
+    # Death takes no time to clean up.
+    monkeypatch.setattr(os, "link", dying)
+    monkeypatch.setattr("workbench.recording.writing.publish._remove", lambda paths: None)
+    monkeypatch.setattr(Path, "unlink", lambda self, missing_ok=False: None)
+    if linked == 3:
+        monkeypatch.setattr(
+            "workbench.recording.writing.publish.sync_folder", lambda folder: (_ for _ in ()).throw(Death())
+        )
+    with pytest.raises(Death):
+        journal_of(writer).finish()
+        making.make_files(journal_of(writer).path, header_of(journal_of(writer).path), tmp_path)
+    monkeypatch.undo()
+    writer.close()
+    assert len([path for path in tmp_path.iterdir() if path.is_file()]) == linked
+    recovered = recover(tmp_path)
+    assert len(recovered) == (0 if linked == 3 else 1)
+    (path,) = tmp_path.glob("*.json")
+    assert read_episode(path).info.id == episode.info.id
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path: Path) -> None:
+    writer = make_episode().writer(tmp_path)
+    append(writer, next(iter(make_episode().rows())))
+    journal_of(writer).write()
+    writer.close()
+    Journal(tmp_path / FOLDER / "empty.arrow").close()
+    (tmp_path / FOLDER / "stray.rrd").write_text("half")
+    (tmp_path / "mine.txt").write_text("mine")
+    assert recover(tmp_path) == []
+    assert os.listdir(tmp_path) == ["mine.txt"]
+    assert recover(tmp_path / "nowhere") == []
+
+
+def test_without_its_meshes_an_episode_is_recovered_bare(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode()
+    writer = episode.writer(tmp_path)
+    for row in episode.rows():
+        append(writer, row)
+    journal_of(writer).write()
+    writer.close()
+    scene = next((tmp_path / FOLDER).glob("*.scene"))
+    scene.write_bytes(scene.read_bytes()[:-100])
+    (files,) = recover(tmp_path)
+    found = read_episode(files.rrd)
+    assert found.geometry is not None and found.poses is not None
+    assert found.geometry.visuals == () and found.geometry.body_names == episode.geometry.body_names
+    np.testing.assert_array_equal(found.poses, episode.poses)
+
+
+def test_files_of_another_folder_are_no_strays(tmp_path: Path) -> None:
+    folder, other = tmp_path / "recordings", tmp_path / "other"
+    folder.mkdir()
+    other.mkdir()
+    (other / "precious.json").write_text("{}")
+    (folder / FOLDER).symlink_to(other)
+    with pytest.raises(RecordingError, match="is a link"):
+        recover(folder)
+    assert (other / "precious.json").exists()
+
+
+def left(episode: Made, folder: Path, **info: object) -> Path:
+    """The journal of `episode` as a writer leaves it that dies before it makes the files."""
+    episode.info = dataclasses.replace(episode.info, **info)  # type: ignore[arg-type]
+    writer = episode.writer(folder)
+    for row in episode.rows():
+        append(writer, row)
+    journal_of(writer).write()
+    writer.close()
+    return folder / FOLDER / f"{episode.info.id}.arrow"
+
+
+def lengths(folder: Path) -> dict[str, int]:
+    """Of each whole recording, by its id; there is nothing else in the folder."""
+    found = {episode.info.id: episode.length for episode in map(read_episode, folder.glob("*.json"))}
+    assert len(list(folder.iterdir())) == 3 * len(found), sorted(path.name for path in folder.iterdir())
+    return found
+
+
+@pytest.mark.parametrize("suffix", [".rrd", ".h5"])
+def test_a_strangers_file_under_the_name_is_left_alone(
+    make_episode: Maker, tmp_path: Path, suffix: str
+) -> None:
+    """Also where the writer died with a file of that ending half made."""
+    journal = left(make_episode(), tmp_path, written_at="2026-11-21T12:00:00+00:00")
+    stem = episode_stem(dataclasses.replace(make_episode().info, written_at="2026-11-21T12:00:00+00:00"))
+    journal.with_suffix(suffix).write_text("half made")
+    (tmp_path / f"{stem}{suffix}").write_text("of a stranger")
+    (files,) = recover(tmp_path)
+    assert files.json.name == f"{stem}_2.json"
+    assert (tmp_path / f"{stem}{suffix}").read_text() == "of a stranger"
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize("text", ["no JSON", "{}", "[]", '{"workbench": 3}', '{"workbench": {"id": "9"}}'])
+def test_a_strangers_json_under_the_name_is_left_alone(
+    make_episode: Maker, tmp_path: Path, text: str
+) -> None:
+    left(make_episode(2), tmp_path, id="0", written_at="2026-11-21T12:00:00+00:00")
+    (files,) = recover(tmp_path)
+    files.h5.unlink()
+    files.rrd.unlink()
+    files.json.write_text(text)
+    left(make_episode(4), tmp_path, id="1", written_at="2026-11-21T12:00:00+00:00")
+    (others,) = recover(tmp_path)
+    assert others.json.stem == f"{files.json.stem}_2" and read_episode(others.json).length == 4
+    assert files.json.read_text() == text and len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize("named", [[".h5"], [".h5", ".rrd"]])
+def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_taken_back(
+    make_episode: Maker, tmp_path: Path, named: list[str]
+) -> None:
+    """The first name was another recording's, so it was at the second."""
+    left(make_episode(2), tmp_path, id="0", written_at="2026-11-21T12:00:00+00:00")
+    (first,) = recover(tmp_path)
+    journal = left(make_episode(4), tmp_path, id="1", written_at="2026-11-21T12:00:00+00:00")
+    for suffix in named:
+        journal.with_suffix(suffix).write_text("made, and not named in full")
+        os.link(journal.with_suffix(suffix), tmp_path / f"{first.json.stem}_2{suffix}")
+    (second,) = recover(tmp_path)
+    assert second.json.stem == f"{first.json.stem}_2"
+    assert lengths(tmp_path) == {"0": 2, "1": 4}
+
+
+def test_two_of_one_name_become_two(make_episode: Maker, tmp_path: Path) -> None:
+    for number, steps in enumerate((2, 4)):
+        left(make_episode(steps), tmp_path, id=f"{number}", written_at="2026-11-21T12:00:00+00:00")
+    assert [files.json.stem[-5:] for files in recover(tmp_path)] == ["00-00", "-00_2"]
+    assert lengths(tmp_path) == {"0": 2, "1": 4}
+
+
+@pytest.mark.parametrize("then", [0, errno.EROFS])
+def test_whatever_call_fails_the_next_recovery_makes_each_episode_whole_and_once(
+    make_episode: Maker, tmp_path: Path, then: int
+) -> None:
+    def begun(folder: Path) -> Path:
+        left(make_episode(2), folder, id="0")
+        (folder / FOLDER / "stray.rrd").write_text("half")
+        return folder
+
+    folder = begun(tmp_path / "0")
+    with refused() as calls:
+        recover(folder)
+    assert {call.split()[0] for call in calls} >= {"open", "fsync", "link", "unlink", "rmdir"}
+    for at, call in enumerate(calls, 1):
+        folder = begun(tmp_path / str(at))
+        before = descriptors()
+        with refused(at, then=then):
+            try:
+                recover(folder)
+            except RecordingError:
+                pass
+        assert descriptors() == before, call
+        recover(folder)
+        assert lengths(folder) == {"0": 2}, call
+
+
+def refused_by_rerun(make_episode: Maker, folder: Path) -> None:
+    episode = make_episode()
+    (visual,) = episode.geometry.visuals
+    flat = dataclasses.replace(visual, mesh=Mesh(np.zeros((3, 2), np.float32), visual.mesh.faces))
+    episode.geometry = dataclasses.replace(episode.geometry, visuals=(flat,))
+    left(episode, folder, id="0")
+
+
+def not_a_state(make_episode: Maker, folder: Path) -> None:
+    changed(left(make_episode(), folder, id="0"), "layout", lambda text: text.replace(b"<f4", b"<f8"))
+
+
+def of_a_camera_that_is_not_there(make_episode: Maker, folder: Path) -> None:
+    path = left(make_episode(), folder, id="0")
+    changed(path, "acted", lambda text: text, more=Entry("camera/7", 0, bytes(28)))
+
+
+def of_another_version(make_episode: Maker, folder: Path) -> None:
+    def further(text: bytes) -> bytes:
+        header = json.loads(text)
+        return json.dumps({**header, "info": json.dumps({**json.loads(header["info"]), "later": 1})}).encode()
+
+    changed(left(make_episode(), folder, id="0"), "header", further)
+
+
+def changed(path: Path, kind: str, change: Callable[[bytes], bytes], more: Entry | None = None) -> None:
+    """Write the journal again with another value of the entries of a kind, and one entry `more` before the last row."""
+    entries = entries_of(path)
+    path.unlink()
+    journal = Journal(path)
+    for number, entry in enumerate(entries):
+        if more is not None and number == len(entries) - 1:
+            journal.append(more)
+        value = change(entry.value) if entry.kind == kind else entry.value
+        journal.append(Entry(entry.kind, entry.number, value))
+    journal.finish()
+    journal.close()
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [refused_by_rerun, not_a_state, of_a_camera_that_is_not_there, of_another_version],
+)
+def test_one_that_cannot_be_an_episode_is_told_and_kept_and_the_others_are_made(
+    make_episode: Maker, tmp_path: Path, broken: Callable[[Maker, Path], None]
+) -> None:
+    broken(make_episode, tmp_path)
+    left(make_episode(4), tmp_path, id="1")
+    before = descriptors()
+    for _ in range(2):
+        with pytest.raises(RecordingError, match="Cannot recover|Cannot write"):
+            recover(tmp_path)
+        (path,) = tmp_path.glob("*.json")
+        assert read_episode(path).length == 4
+        assert sorted(path.name for path in (tmp_path / FOLDER).iterdir()) == ["0.arrow", "0.scene"]
+    assert descriptors() == before
+
+
+def test_one_that_may_not_be_opened_is_told_and_kept_and_the_others_are_made(
+    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a folder that two users record to."""
+    others, opened = left(make_episode(), tmp_path, id="0"), os.open
+    left(make_episode(4), tmp_path, id="1")
+
+    def refuse(path: Path, *args: int, **kwargs: int) -> int:
+        if path == others:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, *args, **kwargs)
+
+    monkeypatch.setattr(os, "open", refuse)
+    for _ in range(2):
+        with pytest.raises(RecordingError, match="may not be written to"):
+            recover(tmp_path)
+        (path,) = tmp_path.glob("*.json")
+        assert read_episode(path).length == 4 and others.exists()
+    monkeypatch.undo()
+    recover(tmp_path)
+    assert lengths(tmp_path) == {"0": 3, "1": 4}

@@ -1,0 +1,464 @@
+"""The camera studio in a real session: cameras placed, undone, kept over reloads, written into the file, and judged."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false, reportOptionalOperand=false
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import start_over, step, wait_until
+from tests.drive.waiting import until
+from tests.session.studio import BASE, PEOPLE, camera, moved, said
+from workbench.core.camera_data import CameraKey, CameraSettings, differences
+from workbench.core.cameras.conventions import target_of
+from workbench.jobs.task import TaskOptions
+from workbench.session.cameras.file_edits import StudioFile
+from workbench.session.cameras.view import StudioView, Wish
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.protocol.messages import CameraRequest
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@dataclass
+class Copied:
+    """What a session said of an installed task, from its refusal to write it to the camera in the copy of it."""
+
+    folder: Path
+    refused: SessionView
+    planned: SessionView
+    ended: SessionView
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, Copied]]:
+    """A session that began with an installed task, and went on to the copy of it.
+
+    Its tests go on in that process: the shaders of another take 6 s.
+    """
+    folder = tmp_path_factory.mktemp("copied")
+    (folder / "push_cube.py").write_text("somebody's own")
+    options = TaskOptions(num_envs=2, env_kwargs={"obs_mode": "rgb"})
+    with pytest.MonkeyPatch.context() as patch:
+        # The copy goes to where the session was begun.
+        patch.chdir(folder)
+        session = Session("PushCube-v1", options, recordings=tmp_path_factory.mktemp("recordings"))
+    try:
+        wait_until(session, lambda view: view.task is not None, "the first load")
+        there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
+        session.studio.place(BASE, there)
+        session.studio.file.plan(Wish("edit", BASE))
+        refused = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
+        session.studio.file.copy_task()
+        planned = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
+        session.studio.file.write()
+        ended = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+        session.studio.file.drop_plan()
+        yield session, Copied(folder, refused, planned, ended)
+    finally:
+        session.close()
+
+
+@pytest.fixture(scope="module")
+def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
+    session, _ = opened
+    text = task_file.read_text()
+    # Small pictures: what is tested is where they are taken from.
+    task_file.write_text(text.replace("512", "64"))
+    session.studio.back_to_file(BASE)
+    session.set_clients(1)
+    session.versions.open_file(task_file, "PushCubeEnv")
+    wait_until(session, lambda view: view.task.file == str(task_file), "the example")
+    session.change(cameras=(CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
+    return session
+
+
+@pytest.fixture
+def session(studio_session: Session) -> Session:
+    """At rest, and every camera as the file has it; one of them is worked on."""
+    studio_session.pause()
+    studio_session.past.seek(None)
+    for one in studio_session.view().studio.cameras:
+        studio_session.studio.back_to_file(one.key)
+    wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
+    studio_session.studio.select(BASE)
+    return studio_session
+
+
+def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView], bool]:
+    """Whether the newest picture was taken from there, with that size."""
+
+    def reached(view: SessionView) -> bool:
+        picture = view.pictures.get(key)
+        return (
+            picture is not None
+            and picture.rgb.shape == (settings.height, settings.width, 3)
+            and np.allclose(picture.pose, [*settings.position, *settings.quaternion], atol=1e-6)
+        )
+
+    return reached
+
+
+def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_step_of_undo(
+    session: Session,
+) -> None:
+    start = camera(session, BASE).now
+    for k in range(30):
+        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), hand=1)
+    rest = replace(start, position=(0.29, 0.0, 0.8))
+    view = wait_until(session, seen_from(BASE, rest), "the picture from there")
+    assert moved(view) == {BASE} and view.studio.undo == "moved base_camera"
+    session.studio.undo()
+    view = wait_until(session, seen_from(BASE, start), "the picture from before")
+    assert not moved(view) and view.studio.redo == "moved base_camera"
+    session.studio.redo()
+    wait_until(session, seen_from(BASE, rest), "the placement again")
+
+
+def test_size_and_lens_change_the_live_camera_and_the_observation(session: Session) -> None:
+    start = camera(session, BASE).now
+    other = replace(start, width=40, height=30, fov=0.8)
+    session.studio.place(BASE, other)
+    view = wait_until(session, seen_from(BASE, other), "the picture of that size")
+    info = view.studio.camera(BASE).info
+    assert (info.width, info.height, round(info.fovy, 6)) == (40, 30, 0.8)
+    assert info.settings == start, "what the file says is no longer told"
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any() or v.problem is not None, "a step")
+    assert view.problem is None
+    people = camera(session, PEOPLE).now
+    session.studio.place(PEOPLE, replace(people, position=(1.0, 0.0, 1.0)))
+    wait_until(session, seen_from(PEOPLE, replace(people, position=(1.0, 0.0, 1.0))), "the other camera")
+    # One picture may be of the moment before; and both may be there before the reset has been looked at.
+    serial = session.view().pictures_serial
+    session.reset()
+    wait_until(session, lambda v: not v.step.elapsed_steps.any(), "the reset")
+    wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
+
+
+def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.studio.set_quick_scale(0.25)
+    there = replace(start, position=(0.31, 0.02, 0.55))
+    session.studio.place(BASE, there)
+
+    def looked(view: SessionView) -> bool:
+        session.studio.look()  # as the page does
+        picture = view.studio.quick
+        return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
+
+    view = wait_until(session, looked, "the look from there")
+    size = (start.width, start.height)
+    assert view.studio.quick.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.quick.rgb.std() > 5
+    depth, bodies = view.studio.quick.depth, view.studio.quick.segmentation
+    assert depth is not None and bodies is not None
+    assert (
+        depth.shape == bodies.shape == (size[1] // 4, size[0] // 4)
+        and np.ptp(depth) > 0.1
+        and np.ptp(bodies) > 0
+    )
+    assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
+    session.studio.set_quick_scale(1.0)
+    view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
+    assert view.studio.quick is None
+
+
+def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps.any() and BASE in v.pictures, "a step")
+    session.past.seek_by(-1)
+    wait_until(session, lambda v: v.timeline.shown is not None, "the past")
+    there = replace(start, position=(0.4, 0.1, 0.7))
+    session.studio.place(BASE, there)
+    wait_until(session, lambda v: v.timeline.wants_pictures, "the old picture being outdated")
+
+    def drawn(view: SessionView) -> bool:
+        # As the page does: what was on its way when the camera stood there at last is wanted once more.
+        if view.timeline.wants_pictures:
+            session.past.draw()
+        return seen_from(BASE, there)(view)
+
+    wait_until(session, drawn, "the past seen from there")
+
+
+def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.studio.place(BASE, replace(start, near=5.0, far=1.0))
+    view = wait_until(session, said(lambda s: "near must be" in s.problem), "the reason")
+    assert not moved(view)
+    session.studio.place(BASE, replace(start, shader_pack="nonsense"))
+    view = wait_until(session, said(lambda s: "there is no shader pack" in s.problem), "the worker's reason")
+    assert not moved(view)
+    session.studio.place(("sensor", "nobody"), start)
+    wait_until(session, said(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
+
+
+def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
+    studio, saved = session.studio, task_file.read_bytes()
+    before = saved.replace(b"\n", b"\r\n")  # as an editor on Windows saves it
+    task_file.write_bytes(before)
+    start = camera(session, BASE).now
+    studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
+    studio.file.plan(Wish("edit", BASE))
+    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
+    assert view.studio.writing.stage == "planned", view.studio.writing.message
+    assert task_file.read_bytes() == before and "+" in view.studio.writing.edit.diff
+    studio.file.write()
+    view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+    assert view.studio.writing.stage == "checked", view.studio.writing.message
+    assert view.reload.level == "cameras" and not moved(view)
+    now = camera(session, BASE)
+    assert now.now == now.info.settings and not differences(now.now, view.studio.writing.edit.settings)
+    assert task_file.read_bytes() == view.studio.writing.edit.new_text.encode()
+    studio.file.undo_write()
+    view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    assert task_file.read_bytes() == before
+    task_file.write_bytes(saved)
+    # Taken back is the placement too, and one step of undo brings it again.
+    assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
+    assert view.studio.writing.message.endswith(
+        "base_camera stands as it says; Undo puts it where you placed it."
+    )
+    wait_until(session, seen_from(BASE, start), "the camera where the file has it")
+    assert view.studio.undo == "took back the change of base_camera"
+    session.studio.undo()
+    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
+    assert not differences(view.studio.camera(BASE).now, now.now)
+
+
+def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_made(
+    session: Session, task_file: Path, tmp_path: Path
+) -> None:
+    good, waits = task_file.read_text(), tmp_path / "waits"
+    (hook,) = (line for line in good.splitlines(keepends=True) if "def _default_sensor_configs(" in line)
+    asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
+    studio = session.studio
+    file = StudioFile(
+        studio._cameras,
+        lambda: None,
+        lambda *_: None,
+        studio.file._asker,
+        studio.file._load,
+        session.past.shown_moment,
+        patience=0.5,
+    )
+    try:
+        task_file.write_text(good.replace(hook, hook + asks))
+        wait_until(session, lambda v: asks in v.task.source[str(task_file)], "the version with it")
+        studio.place(BASE, replace(camera(session, BASE).now, fov=1.2))
+        waits.touch()
+        file.plan(Wish("edit", BASE))
+        until(lambda: file.view.stage == "refused", "the end of waiting")
+        assert "the task did not answer" in file.view.message
+        waits.unlink()
+        studio.file.plan(Wish("edit", BASE))
+        wait_until(session, said(lambda v: v.writing.stage == "planned"), "the plan of who waits longer")
+        studio.file.drop_plan()
+    finally:
+        waits.unlink(missing_ok=True)
+        file.close()
+        task_file.write_text(good)
+    wait_until(session, lambda v: asks not in v.task.source[str(task_file)], "the version without it")
+
+
+def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
+    session: Session, task_file: Path
+) -> None:
+    studio, before = session.studio, task_file.read_text()
+    there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
+    studio.place(BASE, there)
+    studio.file.plan(Wish("remove", BASE))
+    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
+    assert view.studio.writing.stage == "planned", view.studio.writing.message
+    studio.file.write()
+    wait_until(session, said(lambda s: s.writing.stage == "checked"), "the version without it")
+    studio.file.undo_write()
+    wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    assert task_file.read_text() == before
+    assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
+    wait_until(session, seen_from(BASE, there), "the camera where it was placed")
+    studio.file.drop_plan()
+
+
+def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Path) -> None:
+    good = task_file.read_text()
+
+    def target(view: SessionView) -> object:
+        """Of the file."""
+        return pytest.approx(target_of(view.studio.camera(BASE).info.settings), abs=1e-6)
+
+    assert target(session.view()) == (0.08, 0, 0)
+    task_file.write_text(good.replace("target=[0.08, 0, 0]", "target=[0.08, 0, 0.2]"))
+    view = wait_until(session, lambda v: target(v) == (0.08, 0, 0.2), "the other")
+    session.studio.place(BASE, replace(view.studio.camera(BASE).now, position=(0.2, 0.1, 0.7)))
+    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement")
+    assert target(view) == (0.08, 0, 0.2)
+    task_file.write_text(good)
+    wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
+    wait_until(
+        session, said(lambda s: "stands where the file says" in s.problem), "that the placement is dropped"
+    )
+    session.studio.undo()
+    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
+    assert view.studio.problem == "", "what was said before a person did something about it"
+    session.studio.back_to_file(BASE)
+    wait_until(session, lambda v: not moved(v), "as the file says")
+
+
+def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
+    """The studio once its work in the background is done."""
+    view = wait_until(session, said(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what)
+    assert not view.studio.problem, view.studio.problem
+    return view.studio
+
+
+def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
+    session.studio.judging.judge()
+    report = settled(session, lambda s: s.looked.report_of == BASE, "the judgement").looked.report
+    assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
+    (cube,) = report.wanted_objects(("cube",))
+    assert cube.summary().seen == 1.0
+    session.studio.judging.make_sheet()
+    sheet = settled(session, lambda s: len(s.looked.sheet) == 2, "the pictures of all envs").looked.sheet
+    assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
+    # Turned to the sky.
+    start = camera(session, BASE).now
+    away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
+    session.studio.place(BASE, away)
+    assert session.view().studio.report_stale
+    session.studio.judging.judge()
+    studio = settled(session, lambda s: s.looked.report is not report, "the judgement of the placement")
+    assert studio.looked.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
+    session.studio.judging.compare(start)
+    pair = settled(session, lambda s: s.looked.compared is not None, "the comparison").looked.compared
+    assert pair is not None
+    here, there = pair
+    assert np.allclose(here.pose[3:], away.quaternion) and np.allclose(there.pose[3:], start.quaternion)
+    wait_until(session, seen_from(BASE, away), "the camera where it was placed, after the comparison")
+
+
+def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
+    start_over(session, 0)
+    step(session, 4)
+    session.studio.judging.judge_steps()
+    studio = settled(session, lambda s: len(s.looked.report_moments) == 5, "five moments")
+    assert [moment.step for moment in studio.looked.report_moments] == [0, 1, 2, 3, 4]
+    assert {moment.env for moment in studio.looked.report_moments} == {0} == set(studio.looked.report.envs)
+    (cube,) = studio.looked.report.wanted_objects(("cube",))
+    assert cube.summary().seen == 1.0
+    session.past.seek(studio.looked.report_moments[2].serial)
+    assert session.view().step.elapsed_steps[0] == 2
+    session.studio.judging.judge_steps(2)
+    moments = settled(session, lambda s: len(s.looked.report_moments) == 2, "its ends").looked.report_moments
+    assert [moment.step for moment in moments] == [0, 4], (
+        "of the whole episode, also where a moment in it is shown"
+    )
+    session.reset()
+    wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
+    session.past.seek(None)
+    session.studio.judging.judge_steps()
+    settled(session, lambda s: len(s.looked.report_moments) == 1, "the episode that has just begun")
+
+
+def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
+    view = session.view()
+    cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
+    # From the side that the robot does not stand on, level with the cube.
+    x, y, z = (float(v) for v in cube[:3])
+    beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
+    session.studio.place(BASE, beside)
+    session.studio.judging.pick(0.5, 0.5)
+    picked = settled(session, lambda s: s.looked.picked is not None, "the pixel").looked.picked
+    assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
+    assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
+
+
+def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
+    studio = session.studio
+    studio.judging.judge(3)
+    assert session.view().studio.progress is not None
+    found = settled(session, lambda s: s.looked.report_seeds == 3, "three seeds")
+    assert len(found.looked.report.envs) == 3 and found.looked.report_of == BASE and not found.looked.judging
+    studio.judging.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+    offered = settled(session, lambda s: len(s.looked.suggestions) > 0, "suggestions").looked.suggestions
+    assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
+    studio.take_suggestion(0)
+    wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
+    studio.judging.judge(500)
+    wait_until(
+        session,
+        said(lambda s: s.looked.judging and s.looked.report is not None),
+        "what is known, as from before",
+    )
+    wait_until(
+        session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
+    )
+    studio.judging.stop()
+    wait_until(session, said(lambda s: s.progress is None and not s.looked.judging), "its end")
+    studio.judging.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
+    wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
+
+
+def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
+    start = camera(session, BASE).now
+    text = session.studio.export([BASE, PEOPLE], "json")
+    session.studio.place(BASE, replace(start, position=(0.0, 0.0, 1.0)))
+    session.studio.import_pose(BASE, text, None, None)
+    assert not camera(session, BASE).moved
+    for form in ("opencv", "ros"):
+        assert session.studio.export([BASE, PEOPLE], form)
+    session.studio.import_pose(BASE, "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1", "camera_to_world", "maniskill")
+    assert camera(session, BASE).now.position == (5.0, 6.0, 7.0)
+    in_millimetres = "1 0 0 500\n0 1 0 -60\n0 0 1 700\n0 0 0 1"
+    session.studio.import_pose(BASE, in_millimetres, "camera_to_world", "opencv", 0.001)
+    assert camera(session, BASE).now.position == pytest.approx((0.5, -0.06, 0.7))
+    session.studio.import_pose(BASE, text, None, None, 0.001)
+    assert not camera(session, BASE).moved, "our own file is in metres whatever is chosen"
+    with pytest.raises(ValueError, match="no pose is in it"):
+        session.studio.import_pose(BASE, "{}", None, None)
+
+
+def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
+    session: Session, task_file: Path
+) -> None:
+    start, people = camera(session, BASE).now, camera(session, PEOPLE).now
+    there, aside = replace(start, position=(0.2, 0.2, 0.9)), replace(people, fov=0.5)
+    session.studio.place(BASE, there)
+    session.studio.place(PEOPLE, aside)
+    task_file.write_text(task_file.read_text().replace("width=128", "width=96", 1))
+    view = wait_until(
+        session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
+    )
+    assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
+    assert view.studio.undo == "took base_camera from the file"
+    session.studio.undo()
+    wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
+    serial = view.task_serial
+    session.versions.restart_worker()
+    wait_until(session, lambda v: v.task_serial > serial, "another worker")
+    wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
+    assert moved(session.view()) == {BASE, PEOPLE}
+
+
+def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(
+    opened: tuple[Session, Copied],
+) -> None:
+    _, copied = opened
+    view = copied.refused
+    assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
+    view, file = copied.planned, copied.folder / "push_cube_2.py"
+    assert view.task.file == str(file) == view.studio.writing.edit.file
+    assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
+    assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
+    assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This changes")
+    assert moved(view) == {BASE}, "the placement is lost"
+    view = copied.ended
+    assert view.studio.writing.stage == "checked", view.studio.writing.message
+    assert (copied.folder / "push_cube.py").read_text() == "somebody's own"

@@ -1,0 +1,144 @@
+"""Every kind of outlier, provoked in a real task by a real worker; and the quiet of a task that is well."""
+
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.drive.session import TASKS, live_session, wait_until
+from workbench.session.history.env_table import Kind, Outcome
+from workbench.session.history.history import NOT_A_NUMBER
+from workbench.session.live.session import Session
+
+BROKEN = '''
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.building.ground import build_ground
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Pose
+
+
+@register_env("OneOfEach-v1", max_episode_steps=200)
+class OneOfEachEnv(BaseEnv):
+    """Env 0 is well; each of the others does one thing wrong."""
+
+    SUPPORTED_REWARD_MODES = ("normalized_dense", "none")
+
+    def __init__(self, *args, robot_uids="panda", **kwargs):
+        super().__init__(*args, robot_uids=robot_uids, **kwargs)
+
+    def _load_agent(self, options):
+        super()._load_agent(options, sapien.Pose(p=[-0.6, 0, 0]))
+
+    def _load_scene(self, options):
+        build_ground(self.scene)
+        builder = self.scene.create_actor_builder()
+        builder.add_box_collision(half_size=[0.03] * 3)
+        builder.add_box_visual(half_size=[0.03] * 3)
+        builder.initial_pose = sapien.Pose(p=[0.3, 0, 0.03])
+        self.cube = builder.build(name="cube")
+        # What collides of it is 50 m over its visual: it falls through the ground.
+        builder = self.scene.create_actor_builder()
+        builder.add_sphere_collision(pose=sapien.Pose([0, 0, 50]), radius=0.01)
+        builder.add_box_visual(half_size=[0.03] * 3)
+        builder.initial_pose = sapien.Pose(p=[0.3, 0.5, 0.03])
+        builder.set_scene_idxs([3])
+        self.ghost = builder.build(name="ghost")
+
+    def _initialize_episode(self, env_idx, options):
+        self.agent.reset(self.agent.keyframes["rest"].qpos)
+        p = torch.tensor([[0.3, 0.0, 0.03]]).repeat(len(env_idx), 1)
+        p[env_idx == 4, 2] = 1.0
+        self.cube.set_pose(Pose.create_from_pq(p=p))
+        thrown = torch.zeros(len(env_idx), 3)
+        thrown[env_idx == 1, 2] = 60.0
+        self.cube.set_linear_velocity(thrown)
+
+    def evaluate(self):
+        distance = torch.linalg.norm(self.cube.pose.p[:, :2], dim=1)
+        late = self.elapsed_steps >= 3
+        distance[2] = torch.where(late[2], torch.nan, distance[2])
+        return {"success": torch.zeros(self.num_envs, dtype=torch.bool), "distance": distance}
+
+    def compute_dense_reward(self, obs, action, info):
+        reward = torch.zeros(self.num_envs)
+        reward[6] = torch.nan
+        reward[5] = 1.5 * (self.elapsed_steps[5] >= 3)
+        return reward
+
+    compute_normalized_dense_reward = compute_dense_reward
+
+    def _get_obs_extra(self, info):
+        seen = self.cube.pose.p.clone()
+        seen[7, 1] = torch.inf if self.elapsed_steps[7] >= 2 else 0.0
+        return {"seen": seen}
+'''
+
+
+@pytest.fixture(scope="module")
+def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    folder: Path = tmp_path_factory.mktemp("author")
+    (folder / "one_of_each.py").write_text(BROKEN)
+    with live_session(folder / "one_of_each.py", folder / "kept", num_envs=8) as session:
+        session.change(action_source="hold")
+        for count in range(1, 13):
+            session.step()
+            view = wait_until(
+                session, lambda v, n=count: v.step.elapsed_steps[0] == n or v.problem is not None, "a step"
+            )
+            assert view.problem is None, view.problem
+        yield session
+
+
+def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each: Session) -> None:
+    found = {env: {o.kind for o in outliers} for env, outliers in one_of_each.env_rows().outliers.items()}
+    assert found == {
+        1: {Kind.FAST},
+        2: {Kind.NOT_A_NUMBER},
+        3: {Kind.UNDER_FLOOR, Kind.DROPPED},
+        4: {Kind.DROPPED},
+        5: {Kind.REWARD},
+        6: {Kind.NOT_A_NUMBER},
+        7: {Kind.NOT_A_NUMBER},
+    }
+
+
+def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
+    outliers = one_of_each.env_rows().outliers
+    assert outliers[1][0].reason.startswith("cube moved at ") and outliers[1][0].step == 1
+    assert outliers[2][0].reason == "distance is NaN" and outliers[2][0].step == 3
+    assert any(o.reason == "ghost is under the floor" for o in outliers[3])
+    assert outliers[4][0].reason.startswith("cube dropped 0.")
+    assert outliers[5][0].reason == "the reward is 1.5, above 1"
+    assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is NaN", 1)
+    assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is NaN or infinite", 2)
+    one_of_each.change(selected_env=6)
+    [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
+    assert odd[0] == one_of_each.view().timeline.first + 1
+
+
+def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_each: Session) -> None:
+    before = one_of_each.env_rows()
+    one_of_each.reset((2,))
+    wait_until(one_of_each, lambda v: v.step.elapsed_steps[2] == 0, "the reset")
+    rows = one_of_each.env_rows()
+    assert 2 not in rows.outliers and rows.last.outliers[2] == before.outliers[2]
+    assert rows.last.outcome[2] == Outcome.RUNNING and rows.last.steps[2] == before.steps[2]
+    assert rows.outliers.keys() == before.outliers.keys() - {2}
+
+
+def test_a_healthy_task_played_hard_has_none(child_process: None, tmp_path: Path) -> None:
+    with live_session(TASKS / "push_cube.py", tmp_path, num_envs=4) as session:
+        session.change(speed=math.inf)
+        session.play()
+        wait_until(session, lambda v: session.env_rows().ended.sum() >= 8, "eight episodes")
+        rows = session.env_rows()
+        assert not rows.outliers and not rows.last.outliers
+        assert session.view().curves.terms.keys() == {"reach", "push", "end"}

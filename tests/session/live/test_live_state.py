@@ -1,0 +1,262 @@
+"""What each event means for what is seen, without a worker."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.drive.scripted import scripted
+from tests.drive.waiting import until
+from tests.session.moments import DEATH
+from tests.ui.scenes import description, problem, step_of, table_scene
+from workbench.authoring.loading.reference import RecordedTask
+from workbench.core.camera_data import Picture
+from workbench.jobs.task import Stepped, TaskOptions
+from workbench.session.live.live_state import LiveState
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.process.supervisor import KeptWorker
+from workbench.session.protocol.messages import (
+    CameraRequest,
+    Failed,
+    Loaded,
+    Loading,
+    Pictures,
+    ReloadReport,
+    Request,
+    Settings,
+    Status,
+)
+
+N = 3
+
+
+def view(state: LiveState) -> SessionView:
+    return state.view()
+
+
+def loaded(report: ReloadReport | None = None, num_envs: int = N, source_hash: str = "a") -> Loaded:
+    geometry, poses = table_scene(num_envs)
+    task = replace(description(geometry), source_hash=source_hash)
+    return Loaded(task, replace(step_of(poses), elapsed_steps=np.zeros(num_envs, np.int32)), {}, report)
+
+
+def stepped(number: int, jumped: bool = False, num_envs: int = N) -> Stepped:
+    step = replace(
+        step_of(table_scene(num_envs)[1]), elapsed_steps=np.full(num_envs, 0 if jumped else number, np.int32)
+    )
+    return Stepped(step, np.full(num_envs, jumped), snapshot=b"body", part_keys=(), number=number)
+
+
+def running(steps: int = 3) -> LiveState:
+    """It was loaded, plays, and took some steps."""
+    state = LiveState("push.py", TaskOptions(), 10**8)
+    state.loaded(loaded(), restored=False, stale=False)
+    for number in range(steps + 1):
+        state.stepped(stepped(number, jumped=number == 0))
+    state.take(Status(True, 20.0, 1.0))
+    return state
+
+
+def report(level: str) -> ReloadReport:
+    return ReloadReport(level, "")  # type: ignore[arg-type]
+
+
+def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on() -> None:
+    state = LiveState("push.py", TaskOptions(), 10**8)
+    assert view(state).state == "starting" and view(state).curves is None and state.newest_moment() is None
+    state.take(Loading("importing"))
+    assert (view(state).state, view(state).activity) == ("loading", "importing")
+    shown = view(running())
+    assert (shown.state, shown.activity, shown.playing) == ("running", "", True)
+    assert (shown.timeline.last, shown.step_serial, shown.timeline.moments) == (3, 3, 4)
+    assert shown.curves is not None and shown.curves.tick.tolist() == [1, 2, 3]
+
+
+def test_curves_are_not_copied_for_a_look() -> None:
+    state = running()
+    state.stepped(stepped(4, jumped=True))
+    first = view(state).curves
+    state.stepped(stepped(5))
+    now = view(state).curves
+    assert first is not None and first.tick.tolist() == [1, 2, 3] and len(first.reward) == 3
+    assert now is not None and now.tick.tolist() == [1, 2, 3, 4]
+    assert np.shares_memory(first.reward, now.reward)
+
+
+def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> None:
+    state = running()
+    state.change(selected_env=2)
+    before = view(state)
+    state.loaded(loaded(report("patched"), source_hash="b"), restored=False, stale=False)
+    after = view(state)
+    assert after.task is not None and before.task is not None
+    assert after.task.source_hash == "b" and after.task.geometry is before.task.geometry
+    assert (after.task_serial, after.scene_serial, after.cameras_serial) == (2, 1, 1)
+    assert (after.selected_env, after.timeline.moments, after.step_serial) == (2, 4, 3)
+
+
+def test_another_scene_begins_another_past_whose_moments_count_on() -> None:
+    state = running()
+    state.change(selected_env=2)
+    state.change(sliders=(1.0,))
+    state.loaded(loaded(report("rebuilt"), num_envs=2), restored=False, stale=False)
+    state.stepped(stepped(0, jumped=True, num_envs=2))
+    after = view(state)
+    assert (after.scene_serial, after.cameras_serial) == (2, 2)
+    assert (after.selected_env, after.settings.sliders) == (1, ())
+    assert (after.timeline.first, after.timeline.moments) == (4, 1)
+
+
+def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it() -> None:
+    state = running()
+    told = state.died(DEATH, while_loading=False, printed="pushing")
+    assert told is not None and "SIGSEGV" in told.message and "pushing" in told.traceback
+    assert (view(state).state, view(state).playing) == ("starting", False)
+    state.loaded(loaded(), restored=True, stale=True)
+    state.stepped(stepped(0, jumped=True))
+    after = view(state)
+    assert after.timeline.moments == 5 and after.stale and after.state == "paused"
+    assert after.problem == told
+    state.loaded(loaded(source_hash="b"), restored=False, stale=False)
+    assert view(state).problem is None and view(state).timeline.moments == 0
+
+
+def test_what_failed_while_running_stands_until_a_step_follows() -> None:
+    state = running()
+    state.take(Failed(problem(), kept=True))
+    assert (view(state).state, view(state).stale) == ("error", False)
+    state.stepped(stepped(4))
+    assert view(state).state == "running" and view(state).problem is None
+
+
+def test_the_reset_that_a_new_scene_begins_with_mends_no_failure_at_run() -> None:
+    state = LiveState("push.py", TaskOptions(), 10**8)
+    state.loaded(loaded(), restored=False, stale=False)
+    state.take(Failed(problem(), kept=True))
+    state.stepped(stepped(0, jumped=True))
+    assert view(state).problem is not None
+    state.stepped(stepped(1))
+    assert view(state).problem is None
+
+
+def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on() -> None:
+    state = running()
+    state.take(Loading("importing"))
+    state.take(Failed(problem(), kept=True))
+    state.stepped(stepped(4))
+    assert view(state).stale and view(state).problem is not None and view(state).state == "error"
+
+
+def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
+    state = LiveState("push.py", TaskOptions(), 10**8, wants_play=True)
+    state.died(DEATH, while_loading=True, printed="")
+    state.waits_for_the_file()
+    assert (view(state).state, state.wants_play) == ("error", False)
+    assert state.died(replace(DEATH, asked=True, gives_up=True), while_loading=True, printed="") is None
+    state.waits_for_the_file()
+    assert view(state).state == "stopped" and view(state).problem is not None
+
+
+def test_pictures_are_those_of_the_env_that_is_looked_at() -> None:
+    def pictures(env: int) -> Pictures:
+        rgb = np.zeros((2, 2, 3), np.uint8)
+        return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, 0)
+
+    state = running()
+    state.change(cameras=(CameraRequest("eye", "sensor"),))
+    state.take(pictures(0))
+    assert set(view(state).pictures) == {("sensor", "eye")}
+    assert state.change(selected_env=99) and view(state).selected_env == N - 1 and view(state).pictures == {}
+    state.take(pictures(0))
+    assert view(state).pictures == {}
+    assert not state.change(selected_env=N - 1)
+    assert state.settings().cameras == (), "no page is open"
+
+
+def test_a_moment_of_the_past_is_shown_in_place_of_the_newest() -> None:
+    state = running()
+    assert state.timeline is not None
+    state.timeline.seek(1)
+    shown = view(state)
+    assert shown.step_serial == 1 and shown.step is not None and shown.step.elapsed_steps[0] == 1
+
+
+def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
+    state = running()
+    assert not state.choose_class("Other")
+    task = state.now.task
+    assert task is not None
+    state.set(task=replace(task, others=("Other",)), choices=("PushEnv", "Other"))
+    assert state.choose_class("Other")
+    state.set(seed=7)
+    load = state.load_request(None, b"moment", "rebuilt")
+    assert str(load.task).endswith("push.py:Other") and load.options == TaskOptions(seed=7)
+    assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")
+
+
+def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for() -> None:
+    state = running()
+    assert state.now.task is not None and state.now.step is not None
+    task = replace(
+        state.now.task,
+        chosen="One",
+        others=("Two",),
+        file="/home/me/push.py",
+        source_files=("/home/me/push.py",),
+    )
+    state.reference, state.own_file = "/home/me/push.py", Path("/home/me/push.py")
+    state.loaded(Loaded(task, state.now.step, {}), restored=False, stale=False)
+    assert state.now.choices == ("One", "Two")
+    assert state.choose_class("Two") and state.now.choices == ("Two", "One")
+    assert state.load_request(None).task == "/home/me/push.py:Two"
+    assert state.load_request({"/home/me/push.py": "text"}).task == "/home/me/push.py:One"
+    state.loaded(Loaded(task, state.now.step, {}), restored=True, stale=True)
+    assert state.now.choices == ("Two", "One"), "it is still what saves bring in"
+    assert state.choose_class("One")
+
+    tried = replace(task, in_place_of="Two")
+    state.reference = "/home/me/push.py"
+    state.loaded(Loaded(tried, state.now.step, {}), restored=False, stale=False)
+    assert state.load_request(None).task == "/home/me/push.py:One"
+
+
+def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved() -> None:
+    agreed = RecordedTask("Push-v1", "/home/me/push.py", "Push", {"/home/me/push.py": "text"})
+    state = LiveState(agreed, TaskOptions(), 2**20)
+    assert state.own_file == Path("/home/me/push.py")
+    assert state.load_request(None).task is agreed
+    state.file_is_edited()
+    assert state.load_request(None).task == "/home/me/push.py:Push"
+
+
+def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path: Path) -> None:
+    sent: list[Settings] = []
+
+    def overtaken(*arguments: Any, **named: Any) -> KeptWorker:
+        worker = scripted(2)(*arguments, **named)
+        send = worker.send
+
+        def send_slowly(request: Request) -> None:
+            if isinstance(request, Settings):
+                if request.speed == 2.0 and not other.ident:
+                    other.start()
+                    other.join(timeout=0.3)  # as long as the other may take to come in between
+                sent.append(request)
+            send(request)
+
+        worker.send = send_slowly
+        return worker
+
+    session = Session("push.py", TaskOptions(), recordings=tmp_path, make_worker=overtaken)
+    other = threading.Thread(target=lambda: session.change(episode_end="continue"))
+    try:
+        session.change(speed=2.0)
+        until(lambda: other.ident is not None and not other.is_alive(), "the other's choice")
+        assert (sent[-1].speed, sent[-1].episode_end) == (2.0, "continue")
+    finally:
+        session.close()

@@ -1,0 +1,94 @@
+"""A task in a package, opened by its module's name: followed like a file, and imported by nobody but the worker."""
+
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.drive.session import TASKS, wait_until
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+COMMAND = Path(sys.executable).with_name("workbench")
+PLAIN = {"render_backend": "none"}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with a package in it, and files with the names of libraries beside that."""
+    folder = tmp_path_factory.mktemp("project").resolve()
+    package = folder / "lab_with_tasks"
+    (package / "tasks").mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "tasks" / "__init__.py").write_text("from .minimal import *\n")
+    (package / "sizes.py").write_text("HALF = 0.02\n")
+    text = (TASKS / "minimal.py").read_text()
+    (package / "tasks" / "minimal.py").write_text(
+        text.replace("import torch\n", "import torch\nfrom ..sizes import HALF\n", 1)
+    )
+    for name in ("numpy", "json", "torch", "sapien"):
+        (folder / f"{name}.py").write_text("raise SystemExit('a file in the current folder ran')\n")
+    before = Path.cwd()
+    os.chdir(folder)
+    yield folder
+    os.chdir(before)
+
+
+def test_a_task_of_a_package_opens_and_is_followed(project: Path) -> None:
+    class_name = "MinimalEnv"
+    session = Session(
+        f"lab_with_tasks.tasks:{class_name}",
+        TaskOptions(2, env_kwargs=PLAIN),
+        recordings=project / "recordings",
+    )
+    try:
+        view = wait_until(session, lambda v: v.task is not None or v.problem is not None, "the task")
+        assert view.problem is None
+        file = project / "lab_with_tasks" / "tasks" / "minimal.py"
+        assert (view.task.file, view.task.class_name) == (str(file), class_name)
+        for changed, text in (
+            (file, file.read_text() + "\n# seen\n"),
+            (project / "lab_with_tasks" / "sizes.py", "HALF = 0.03\n"),
+        ):
+            before = session.view().task_serial
+            changed.write_text(text)
+            view = wait_until(session, lambda v, s=before: v.task_serial > s, f"the new {changed.name}")
+            assert view.problem is None and view.task.source[str(changed)] == text
+        assert not [name for name in sys.modules if name.startswith("lab_with_tasks")]
+    finally:
+        session.close()
+
+
+def test_an_id_that_a_package_registers_is_recorded_with_import(project: Path) -> None:
+    plain = (
+        "--episodes",
+        "2",
+        "--num-envs",
+        "2",
+        "--max-steps",
+        "2",
+        "--no-pictures",
+        "--env",
+        "render_backend=none",
+    )
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [str(COMMAND), *arguments], cwd=project, capture_output=True, text=True, timeout=300,
+            env={**os.environ, "COLUMNS": "500"},
+        )  # fmt: skip
+
+    said = run("record", "WorkbenchMinimal-v1", *plain, "--import", "lab_with_tasks.tasks")
+    assert said.returncode == 0, said.stdout + said.stderr
+    assert len(list((project / "recordings").glob("*.json"))) == 2
+    said = run("record", "WorkbenchMinimal-v1", *plain, "--import", "lab_with_task")
+    assert said.returncode != 0 and "there is no module lab_with_task " in said.stderr

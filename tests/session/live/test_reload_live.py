@@ -1,0 +1,230 @@
+"""Saves of every kind under a running session: what comes in, how, and what stays."""
+
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import wait_until
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+
+DRAWS = True
+
+SECOND_TASK = '''
+
+@register_env("PushTheOther-v1", max_episode_steps=30)
+class PushTheOtherEnv(PushCubeEnv):
+    """The same with a shorter time."""
+'''
+
+
+@pytest.fixture(scope="module")
+def good(task_file: Path, session: Session) -> str:
+    return task_file.read_text()
+
+
+@pytest.fixture(autouse=True)
+def good_again(session: Session, task_file: Path, good: str) -> Iterator[None]:
+    yield
+    session.pause()
+    task_file.write_text(good)
+    arrived(session, good)
+
+
+def arrived(session: Session, text: str) -> SessionView:
+    """The view as soon as this text is what runs."""
+
+    def runs(view: SessionView) -> bool:
+        return text in view.task.source.values() and view.problem is None and not view.stale
+
+    return wait_until(session, runs, "the saved version")
+
+
+def reward_plus(good: str, number: float) -> str:
+    assert good.count("return reward\n") == 1
+    return good.replace("return reward\n", f"return reward + {number}\n")
+
+
+def played(session: Session, steps: int) -> SessionView:
+    """The view after some steps of the player, paused."""
+    session.change(speed=8.0)
+    session.play()
+    count = session.view().curves.serial
+    wait_until(session, lambda v: v.curves.serial >= count + steps, "some steps")
+    session.pause()
+    wait_until(session, lambda v: not v.playing and v.state == "paused", "the pause")
+    settled = session.view()
+    time.sleep(0.3)
+    wait_until(session, lambda v: v.step_serial == settled.step_serial, "rest")
+    return session.view()
+
+
+def test_a_patch_keeps_moment_past_and_selection_and_shows_new_numbers_while_paused(
+    session: Session, task_file: Path, good: str
+) -> None:
+    session.change(selected_env=1)
+    before = played(session, 5)
+    task_file.write_text(reward_plus(good, 3))
+    view = arrived(session, task_file.read_text())
+    assert (view.reload.level, view.reload.reason) == ("patched", "only compute_dense_reward changed")
+    assert (view.scene_serial, view.cameras_serial) == (before.scene_serial, before.cameras_serial)
+    assert view.task.geometry is before.task.geometry
+    np.testing.assert_array_equal(view.step.poses, before.step.poses)
+    if view.step.action is not None:
+        np.testing.assert_allclose(view.step.reward, before.step.reward + 1, rtol=1e-5)
+    assert view.curves.serial == before.curves.serial and len(view.curves.reward) == len(before.curves.reward)
+    assert view.selected_env == 1 and not view.playing
+    session.step()
+    after = wait_until(session, lambda v: v.curves.serial > view.curves.serial, "the next step")
+    assert after.curves.serial == view.curves.serial + 1
+
+
+def test_playing_goes_on_through_a_patch(session: Session, task_file: Path, good: str) -> None:
+    session.play()
+    wait_until(session, lambda v: v.state == "running", "play")
+    task_file.write_text(reward_plus(good, 4))
+    view = arrived(session, task_file.read_text())
+    assert view.reload.level == "patched"
+    wait_until(session, lambda v: v.step_serial > view.step_serial + 3 and v.state == "running", "more steps")
+
+
+def test_a_rebuilt_scene_begins_a_new_past_at_the_same_moment(
+    session: Session, task_file: Path, good: str
+) -> None:
+    before = played(session, 4)
+    task_file.write_text(good.replace("base_color=[0.05,", "base_color=[0.6,"))
+    view = arrived(session, task_file.read_text())
+    assert view.reload.level == "rebuilt" and view.scene_serial == before.scene_serial + 1
+    np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-4)
+    np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
+
+
+def test_edited_cameras_come_in_without_a_new_scene(session: Session, task_file: Path, good: str) -> None:
+    before = session.view()
+    task_file.write_text(good.replace("width=128, height=128", "width=96, height=64"))
+    view = arrived(session, task_file.read_text())
+    assert view.reload.level == "cameras"
+    assert (view.scene_serial, view.cameras_serial) == (before.scene_serial, before.cameras_serial + 1)
+    camera = next(camera for camera in view.task.cameras if camera.name == "base_camera")
+    assert (camera.width, camera.height) == (96, 64)
+
+
+def test_a_level_can_be_asked_for_without_a_change(session: Session, good: str) -> None:
+    before = session.view()
+    session.versions.reload("rebuilt")
+    view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the load")
+    assert view.reload.level == "rebuilt" and view.scene_serial == before.scene_serial + 1
+    session.versions.reload()
+    view = wait_until(session, lambda v: v.task_serial > view.task_serial, "the load")
+    assert (view.reload.level, view.reload.reason) == ("same", "nothing changed")
+
+
+# --- editors -------------------------------------------------------------------------------------------
+
+
+def test_an_editor_that_writes_beside_and_renames_is_followed(
+    session: Session, task_file: Path, good: str
+) -> None:
+    for number in (5, 6):
+        temporary = task_file.with_suffix(".py.tmp")
+        temporary.write_text(reward_plus(good, number))
+        os.replace(temporary, task_file)
+        assert arrived(session, task_file.read_text()).reload.level == "patched"
+
+
+def test_of_several_saves_in_50_ms_the_last_wins(session: Session, task_file: Path, good: str) -> None:
+    loads = session.view().task_serial
+    for number in range(10, 20):
+        task_file.write_text(reward_plus(good, number))
+        time.sleep(0.005)
+    view = arrived(session, reward_plus(good, 19))
+    assert view.task_serial - loads <= 3
+
+
+def test_a_save_while_a_reload_runs_wins(session: Session, task_file: Path, good: str) -> None:
+    task_file.write_text(good.replace("base_color=[0.05,", "base_color=[0.7,"))
+    wait_until(session, lambda v: v.activity.startswith("building"), "the slow reload")
+    last = reward_plus(good, 21)
+    task_file.write_text(last)
+    view = arrived(session, last)
+    assert view.task.source[str(task_file)] == last
+    time.sleep(0.5)
+    assert session.view().task.source[str(task_file)] == last, "the older one came after it"
+
+
+def test_a_file_that_is_deleted_and_brought_back_is_followed(
+    session: Session, task_file: Path, good: str
+) -> None:
+    task_file.unlink()
+    view = wait_until(session, lambda v: v.problem is not None, "the missing file")
+    assert "does not exist" in view.problem.message and view.stale
+    task_file.write_text(reward_plus(good, 23))
+    assert arrived(session, task_file.read_text()).reload.level == "patched"
+
+
+def test_other_line_ends_are_no_change_and_an_edit_in_such_a_file_is_one(
+    session: Session, task_file: Path, good: str
+) -> None:
+    before = session.view().task_serial
+    task_file.write_bytes(good.replace("\n", "\r\n").encode())
+    time.sleep(0.8)
+    assert session.view().task_serial == before
+    edited = reward_plus(good, 25)
+    task_file.write_bytes(edited.replace("\n", "\r\n").encode())
+    assert arrived(session, edited).reload.level == "patched"
+
+
+# --- several tasks ---------------------------------------------------------------------------------------
+
+
+def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
+    session: Session, task_file: Path, good: str
+) -> None:
+    task_file.write_text(good + SECOND_TASK)
+    view = arrived(session, good + SECOND_TASK)
+    assert (view.task.class_name, view.task.others) == ("PushTheOtherEnv", ("PushCubeEnv",))
+    assert view.reload.level == "rebuilt" and "another task" in view.reload.reason
+    session.versions.choose_class("NobodysEnv")
+    session.versions.choose_class("PushCubeEnv")
+    view = wait_until(session, lambda v: v.task.class_name == "PushCubeEnv", "the other task")
+    assert view.task.others == ("PushTheOtherEnv",) and view.task.max_episode_steps == 50
+    edited = reward_plus(good, 31) + SECOND_TASK
+    task_file.write_text(edited)
+    view = arrived(session, edited)
+    assert view.task.class_name == "PushCubeEnv" and view.reload.level == "patched"
+
+
+def test_the_same_id_twice_is_told_with_both_lines(session: Session, task_file: Path, good: str) -> None:
+    task_file.write_text(good + SECOND_TASK.replace("PushTheOther-v1", "WorkbenchPushCube-v1"))
+    view = wait_until(session, lambda v: v.problem is not None, "the problem")
+    assert "registered twice" in view.problem.message and "PushTheOtherEnv" in view.problem.message
+    assert view.task.class_name == "PushCubeEnv"
+
+
+# --- recording ---------------------------------------------------------------------------------------------
+
+
+def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
+    session: Session, task_file: Path, good: str
+) -> None:
+    session.start_recording((0,))
+    before = played(session, 5)
+    assert before.recording.steps > 0
+    task_file.write_text(reward_plus(good, 41))
+    view = arrived(session, task_file.read_text())
+    np.testing.assert_array_equal(view.step.poses, before.step.poses)
+    view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the episode of the old version")
+    assert view.recording.active and view.recording.steps == 0
+    session.reset((0,))
+    played(session, 3)
+    assert session.view().recording.steps >= 3
+    session.stop_recording()

@@ -1,0 +1,254 @@
+"""A page's wishes, carried out by a real worker on the example task."""
+
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import start_over, step, wait_until
+from tests.recording.verify_rrd import verify_rrd
+from workbench.recording.rerun.read import read_properties
+from workbench.session.live.session import Session
+from workbench.session.protocol.messages import CameraRequest
+
+DRAWS = True
+
+
+def settle(session: Session) -> None:
+    session.change(action_source="random")
+    session.change(episode_end="reset")
+    start_over(session, 0)
+
+
+def test_a_single_step_moves_every_env_once(session: Session) -> None:
+    settle(session)
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert view.step.elapsed_steps.tolist() == [1, 1]
+    assert view.step.poses.shape == (2, len(view.task.geometry.body_names), 7)
+    assert {"success", "fail"} <= view.step.evaluate.keys()
+    assert view.curves.reward.shape[1] == 2
+
+
+def test_playing_goes_on_until_paused(session: Session) -> None:
+    settle(session)
+    session.change(speed=4.0)
+    session.play()
+    wait_until(session, lambda v: v.step.elapsed_steps.max() >= 10 and v.state == "running", "ten steps")
+    session.pause()
+    view = wait_until(session, lambda v: v.state == "paused", "the pause")
+    session.change(speed=1.0)
+    settled = view.step_serial
+    session.reset((1,))
+    after = wait_until(session, lambda v: v.step_serial > settled, "the reset")
+    assert after.step.elapsed_steps[1] == 0
+
+
+def test_resetting_one_env_leaves_the_other(session: Session) -> None:
+    settle(session)
+    step(session, 3)
+    before = session.view().step
+    session.reset((1,))
+    after = wait_until(session, lambda v: v.step.elapsed_steps[1] == 0, "the reset of env 1").step
+    assert after.elapsed_steps.tolist() == [3, 0]
+    assert np.array_equal(after.poses[0], before.poses[0], equal_nan=True)
+    assert not np.array_equal(after.poses[1], before.poses[1], equal_nan=True)
+
+
+def test_the_same_seed_gives_the_same_start(session: Session) -> None:
+    settle(session)
+    first = session.view().step.poses
+    session.set_seed(7)
+    other = wait_until(
+        session, lambda v: not np.allclose(v.step.poses, first, equal_nan=True), "another start"
+    )
+    session.set_seed(0)
+    again = wait_until(
+        session, lambda v: np.array_equal(v.step.poses, first, equal_nan=True), "the first start again"
+    )
+    assert other.step_serial < again.step_serial
+
+
+def test_sliders_are_the_action_of_every_env_and_are_kept_in_bounds(session: Session) -> None:
+    settle(session)
+    count = len(session.view().task.actions)
+    session.change(action_source="sliders")
+    session.change(sliders=(5.0,) + (0.25,) * (count - 1))
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert view.step.action.shape == (2, count)
+    assert np.allclose(view.step.action[:, 0], view.task.actions[0].high)
+    assert np.allclose(view.step.action[:, 1:], 0.25)
+
+
+def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
+    settle(session)
+    session.change(action_source="hold")
+    names = session.view().task.geometry.body_names
+    hand = next(i for i, name in enumerate(names) if name.endswith("panda_hand"))
+    start = session.view().step.poses[:, hand, :3]
+    for count in range(1, 6):
+        session.step()
+        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, "a step")
+    assert np.abs(session.view().step.poses[:, hand, :3] - start).max() < 2e-3
+
+
+def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, tmp_path) -> None:
+    settle(session)
+    policy, imports = tmp_path / "policy.py", tmp_path / "imports.txt"
+    counted = f"open({str(imports)!r}, 'a').write('x')\n"
+    policy.write_text(f"{counted}def act(obs):\n    return obs[:, :8] * 0 + 0.5\n")
+    session.change(action_source="policy", policy=f"{policy}:act")
+    session.change(speed=2.0)
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert np.allclose(view.step.action, 0.5)
+    session.change(speed=1.0)
+    assert imports.read_text() == "x", "another setting leaves the policy as it is"
+
+
+@pytest.mark.parametrize(
+    ("text", "reference", "says", "line"),
+    [
+        ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError", 2),
+        (
+            "\ndef act(obs):\n    return obs[:, :3]\n",
+            "act",
+            "it is 3 wide, and the control mode pd_joint_delta_pos takes 8",
+            2,
+        ),
+        ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN", 1),
+        ("def act(obs):\n    return None\n", "missing", "no function missing", None),
+        ("def act(obs):\n    return obs[\n", "act", "SyntaxError", 2),
+        ("import torch\nimport no_such_module\n", "act", "ModuleNotFoundError", 2),
+    ],
+)
+def test_a_policy_that_fails_says_so_and_the_session_goes_on(
+    session: Session, tmp_path, text: str, reference: str, says: str, line: int | None
+) -> None:
+    settle(session)
+    policy = tmp_path / "policy.py"
+    policy.write_text(text)
+    session.change(action_source="policy", policy=f"{policy}:{reference}")
+    if reference == "act":
+        session.step()
+    view = wait_until(session, lambda v: v.problem is not None, "a problem")
+    assert view.problem.stage == "policy" and says in view.problem.message
+    if "wide" in says:
+        assert f"what {policy}:act returned has shape (2, 3), expected (2, 8)" in view.problem.message
+    assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
+    # No other action takes its place: whoever plays or steps hears the same.
+    for again in (session.play, session.step):
+        said = session.view().problem_serial
+        again()
+        view = wait_until(
+            session, lambda v, n=said: v.problem_serial > n and not v.playing, "the problem again"
+        )
+        assert says in view.problem.message and not view.step.elapsed_steps.any()
+    session.change(action_source="random")
+    session.step()
+    wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
+    session: Session, tmp_path: Path
+) -> None:
+    settle(session)
+    policy, text = tmp_path / "policy.py", "def act(obs):\n    return obs[:, :8] * 0 + {}\n"
+    policy.write_text(text.format("0.50"))
+    session.change(action_source="policy", policy=f"{policy}:act")
+    session.play()
+    wait_until(session, lambda v: v.step.action is not None and np.allclose(v.step.action, 0.5), "its action")
+    # Of the same length and in the same second as the one before.
+    for action in ("0.25", "0.75"):
+        policy.write_text(text.format(action))
+        wait_until(session, lambda v, a=float(action): np.allclose(v.step.action, a), "the new one's action")
+    assert sum("it is read anew" in text for text in session.view().printed.texts) >= 2
+    policy.write_text(text.format("0.25 +"))
+    view = wait_until(session, lambda v: v.problem is not None and not v.playing, "the problem")
+    assert (view.problem.stage, view.problem.file, view.problem.line) == ("policy", str(policy), 2)
+    session.wait(-1, 0.5)
+    assert session.view().problem is not None, "it stands for as long as the file is broken"
+    policy.write_text(text.format("0.10"))
+    view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the mended one")
+    assert view.problem is None
+    # Somebody who has paused is left alone.
+    session.pause()
+    wait_until(session, lambda v: not v.playing, "the pause")
+    policy.write_text(text.format("0.30 +"))
+    wait_until(session, lambda v: v.problem is not None, "the problem while paused")
+    policy.write_text(text.format("0.30"))
+    wait_until(session, lambda v: v.problem is None, "its end")
+    session.step()
+    view = wait_until(session, lambda v: np.allclose(v.step.action, 0.3), "a step")
+    assert not view.playing and view.problem is None
+
+
+def test_a_policy_that_is_not_named_does_not_step(session: Session) -> None:
+    settle(session)
+    session.change(action_source="policy", policy=None)
+    session.step()
+    view = wait_until(session, lambda v: v.problem is not None, "a problem")
+    assert "name a policy: module:function or file.py:function" in view.problem.message
+    assert not view.step.elapsed_steps.any()
+    session.change(action_source="random")
+    session.step()
+    wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
+    session: Session, task_file
+) -> None:
+    settle(session)
+    session.change(action_source="policy", policy="pol.py:act")
+    view = wait_until(session, lambda v: v.problem is not None, "a problem")
+    for folder in (Path.cwd(), task_file.parent):
+        assert str(folder) in view.problem.message
+    (task_file.parent / "pol.py").write_text("def act(obs):\n    return obs[:, :8] * 0 + 0.25\n")
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert np.allclose(view.step.action, 0.25) and view.problem is None
+
+
+def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session: Session) -> None:
+    settle(session)
+    sensor = next(c for c in session.view().task.cameras if c.kind == "sensor")
+    wanted = CameraRequest(sensor.name, "sensor", ("rgb", "depth", "segmentation"))
+    session.change(cameras=(wanted,))
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
+    assert not session.view().pictures, "nobody looks yet"
+    session.set_clients(1)
+    session.change(selected_env=1)
+    view = wait_until(session, lambda v: bool(v.pictures), "a picture")
+    picture = view.pictures["sensor", sensor.name]
+    assert picture.env == 1
+    assert picture.rgb.shape == (sensor.height, sensor.width, 3) and picture.rgb.std() > 5
+    assert picture.depth.shape == (sensor.height, sensor.width) and picture.depth.max() > 0.1
+    assert set(np.unique(picture.segmentation)) - {0} <= view.task.segmentation.keys()
+    session.set_clients(0)
+    session.change(selected_env=0)
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
+    assert not session.view().pictures, "nobody looks any more"
+    session.change(cameras=())
+
+
+def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:
+    settle(session)
+    session.start_recording((1,))
+    wait_until(session, lambda v: v.recording.active and v.step.elapsed_steps[1] == 0, "a fresh episode")
+    for count in (1, 2, 3, 4):
+        session.step()
+        wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
+    session.stop_recording()
+    view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
+    assert not view.recording.active and view.recording.problem is None
+    assert verify_rrd(view.recording.last_file) is None
+    assert "WorkbenchPushCube-v1" in str(read_properties(view.recording.last_file))

@@ -1,0 +1,263 @@
+"""Looking at the past and going on from it, with a real worker on the example task."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.drive.session import live_session, start_over, step, wait_until
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.protocol.messages import CameraRequest, Request
+
+N = 3
+
+
+@pytest.fixture(scope="module")
+def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    with live_session("PickCube-v1", tmp_path_factory.mktemp("recordings"), num_envs=N, draw=True) as session:
+        yield session
+
+
+def fresh(session: Session) -> int:
+    """Paused at the first moment of episodes of seed 0, live; its serial."""
+    session.pause()
+    session.change(episode_end="reset")
+    session.change(action_source="sliders")
+    session.change(sliders=(0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0))
+    return start_over(session, 0).timeline.last
+
+
+def after(session: Session, ask) -> SessionView:
+    """The view once the jump that `ask` asks for has come."""
+    last = session.view().timeline.last
+    ask()
+    return wait_until(session, lambda v: v.timeline.last > last, "the jump")
+
+
+def poses(session: Session, serial: int) -> np.ndarray:
+    return session._state.timeline.history.at(serial).step.poses
+
+
+def is_close(poses: np.ndarray, others: np.ndarray) -> bool:
+    """Equal but for the last bits: PhysX works out the links anew from root and joints."""
+    return np.allclose(poses, others, rtol=0, atol=1e-6, equal_nan=True)
+
+
+@pytest.fixture
+def sent(session: Session, monkeypatch: pytest.MonkeyPatch) -> list[Request]:
+    """Every request that goes to the worker, which still gets it."""
+    requests: list[Request] = []
+    send = session._worker.send
+    monkeypatch.setattr(session._worker, "send", lambda request: (requests.append(request), send(request)))
+    return requests
+
+
+def test_scrubbing_shows_what_was_and_sends_nothing_to_the_worker(session: Session, sent) -> None:
+    start = fresh(session)
+    step(session, 5)
+    sent.clear()
+    for serial in (*range(start, start + 6), *range(start + 5, start - 1, -1)):
+        session.past.seek(serial)
+        view = session.view()
+        assert np.array_equal(view.step.poses, poses(session, serial), equal_nan=True)
+        assert view.step.elapsed_steps[0] == serial - start
+        assert view.timeline.shown == (serial if serial < start + 5 else None)
+    session.past.seek_by(2)
+    assert session.view().step.elapsed_steps[0] == 2
+    session.past.seek_event(-1)
+    assert session.view().timeline.shown == start
+    session.past.seek(None)
+    assert session.view().timeline.shown is None
+    assert sent == []
+
+
+def test_a_step_or_play_shows_what_is_live_again(session: Session) -> None:
+    start = fresh(session)
+    step(session, 2)
+    session.past.seek(start)
+    view = step(session, 1)
+    assert view.timeline.shown is None and view.step.elapsed_steps[0] == 3
+
+
+def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session) -> None:
+    start = fresh(session)
+    step(session, 8)
+    branches = []
+    for _ in range(2):
+        session.past.seek(start + 3)
+        view = after(session, lambda: session.past.go_on("all"))
+        assert view.step.elapsed_steps.tolist() == [3] * N
+        assert is_close(view.step.poses, poses(session, start + 3))
+        step(session, 5)
+        last = session.view().timeline.last
+        branches.append(np.stack([poses(session, serial) for serial in range(last - 4, last + 1)]))
+    assert np.array_equal(branches[0], branches[1], equal_nan=True)
+    first_run = np.stack([poses(session, serial) for serial in range(start + 4, start + 9)])
+    # Though PhysX does not give out its contacts: the steps up to the moment were made again.
+    assert np.array_equal(branches[0], first_run, equal_nan=True)
+
+
+def test_one_env_goes_back_alone(session: Session) -> None:
+    start = fresh(session)
+    step(session, 4)
+    before = session.view().step
+    session.change(selected_env=1)
+    session.past.seek(start + 1)
+    view = after(session, lambda: session.past.go_on("this"))
+    assert view.step.elapsed_steps.tolist() == [4, 1, 4]
+    assert is_close(view.step.poses[1], poses(session, start + 1)[1])
+    assert is_close(view.step.poses[[0, 2]], before.poses[[0, 2]])
+    assert session.past.strip(0, 10**6).branches[-1] == (view.timeline.last, start + 1)
+    session.change(selected_env=0)
+
+
+def test_one_envs_moment_is_put_into_all(session: Session) -> None:
+    start = fresh(session)
+    step(session, 3)
+    session.change(selected_env=2)
+    session.past.seek(start + 2)
+    view = after(session, lambda: session.past.go_on("into all"))
+    assert view.step.elapsed_steps.tolist() == [2] * N
+    was = poses(session, start + 2)[2]
+    for env in range(N):
+        assert is_close(view.step.poses[env], was)
+    session.change(selected_env=0)
+
+
+def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
+    start = fresh(session)
+    step(session, 6)
+    left = session.view().step
+    session.past.seek(start + 2)
+    after(session, lambda: session.past.go_on("all"))
+    step(session, 2)
+    assert session.view().timeline.undo == "going back of all"
+    view = after(session, session.past.undo)
+    assert is_close(view.step.poses, left.poses)
+    assert view.step.elapsed_steps.tolist() == [6] * N
+
+
+def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -> None:
+    fresh(session)
+    step(session, 3)
+    first = session.view().step
+    after(session, lambda: session.reset((0, 1)))
+    step(session, 2)
+    second = session.view().step
+    after(session, lambda: session.reset(None))
+    view = after(session, session.past.undo)
+    assert is_close(view.step.poses, second.poses)
+    view = after(session, session.past.undo)
+    assert is_close(view.step.poses[:2], first.poses[:2])
+    assert view.step.elapsed_steps.tolist() == [3, 3, 5]
+
+
+def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
+    fresh(session)
+    step(session, 3)
+    after(session, lambda: session.reset((0, 1)))
+    step(session, 2)
+    after(session, lambda: session.reset((1,)))
+    view = step(session, 1)
+    assert view.step.elapsed_steps.tolist() == [3, 1, 6]
+    assert view.timeline.undo == "reset of env 0"
+    view = after(session, session.past.undo)
+    assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of 2 envs"
+    session.change(selected_env=1)
+    assert session.view().timeline.undo == "reset of env 1"
+    assert after(session, session.past.undo).step.elapsed_steps.tolist() == [3, 2, 6]
+    assert session.view().timeline.undo == "reset of env 1", (
+        "of the two that were moved by it the other is back"
+    )
+    view = after(session, session.past.undo)
+    assert view.step.elapsed_steps.tolist() == [3, 3, 6] and view.timeline.undo == "reset of all"
+    session.change(selected_env=0)
+
+
+def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session: Session) -> None:
+    start = fresh(session)
+    assert np.isnan(session.view().step.reward).all()
+    rewards = [step(session, 1).step.reward for _ in range(4)]
+    view = after(session, lambda: session.reset((1,)))
+    assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
+    session.past.seek(start + 2)
+    view = after(session, lambda: session.past.go_on("all"))
+    assert np.array_equal(view.step.reward, rewards[1])
+    assert not view.timeline.not_carried
+    strip = session.past.strip(start, view.timeline.last)
+    kept = [np.nan, *(reward[0] for reward in rewards), rewards[3][0], rewards[1][0]]
+    assert np.array_equal(strip.reward, kept, equal_nan=True)
+    session.past.seek(start + 2)
+    assert not after(session, lambda: session.past.go_on("into all")).timeline.not_carried
+
+
+def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
+    start = fresh(session)
+    written = session.view().recording.episodes_written
+    step(session, 1)
+    last = session.view().timeline.last
+    session.start_recording((0,))
+    wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
+    step(session, 3)
+    session.past.seek(start + 1)
+    after(session, lambda: session.past.go_on("this"))
+    view = wait_until(session, lambda v: v.recording.episodes_written == written + 1, "the file")
+    assert view.recording.active and view.recording.problem is None
+    step(session, 1)
+    assert session.view().recording.steps == 0, "what was not begun by a reset is not recorded"
+    session.stop_recording()
+
+
+def test_the_newest_snapshot_is_a_plain_pickle(session: Session) -> None:
+    fresh(session)
+    step(session, 2)
+    snapshot = pickle.loads(session._state.newest_moment())
+    assert snapshot.num_envs == N and snapshot.memory.elapsed_steps.tolist() == [2] * N
+
+
+def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None:
+    start = fresh(session)
+    view = step(session, 12)
+    human = next(c for c in view.task.cameras if c.kind == "human")
+    wanted = CameraRequest(human.name, "human", ("rgb",))
+    session.change(cameras=(wanted,))
+    session.set_clients(1)
+    key = ("human", human.name)
+    now = wait_until(session, lambda v: key in v.pictures, "the live picture").pictures[key]
+    session.past.seek(start)
+    assert session.view().pictures == {} and session.view().timeline.wants_pictures
+    session.past.draw()
+    then = wait_until(session, lambda v: key in v.pictures, "the picture of the past").pictures[key]
+    assert not session.view().timeline.wants_pictures
+    live = session.view().timeline.last
+    assert live == start + 12, "drawing is no step"
+    assert np.abs(then.rgb.astype(int) - now.rgb).mean() > 0.5, "the arm stood elsewhere"
+    # The same moment, gone back to, looks the same.
+    last = session.view().timeline.last
+    session.past.go_on("all")
+    wait_until(session, lambda v: v.timeline.last > last and v.timeline.shown is None, "the jump")
+    serial = session.view().pictures_serial
+    again = wait_until(session, lambda v: v.pictures_serial > serial and key in v.pictures, "its picture")
+    assert np.abs(then.rgb.astype(int) - again.pictures[key].rgb).max() <= 2
+    session.change(cameras=())
+    session.set_clients(0)
+
+
+def test_the_episodes_go_on_as_they_stand_with_a_worker_that_takes_over(session: Session) -> None:
+    fresh(session)
+    step(session, 4)
+    before, rows = session.view(), session.env_rows()
+    view = after(session, session.versions.restart_worker)
+    now = session.env_rows()
+    assert view.reload.level == "restarted" and view.timeline.first == before.timeline.first
+    assert np.array_equal(view.step.reward, before.step.reward)
+    assert now.followed.all() and now.steps.tolist() == [4] * N
+    assert now.total.tolist() == rows.total.tolist()
+    assert np.array_equal(now.rewards, rows.rewards, equal_nan=True)

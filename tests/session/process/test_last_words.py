@@ -1,0 +1,75 @@
+"""Stacks of real processes, read by another."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from workbench.session.process.heartbeat import (
+    as_traceback,
+    author_place,
+    busy_at,
+    death_problem,
+    fatal_error,
+    hook_of,
+    parse_stack,
+)
+
+TASK = """import faulthandler, sys, ctypes
+def deep():
+    {what}
+def evaluate():
+    deep()
+evaluate()
+"""
+
+
+def dump_of(file: Path, what: str) -> str:
+    file.write_text(TASK.format(what=what))
+    done = subprocess.run([sys.executable, "-X", "faulthandler", str(file)], capture_output=True, text=True)
+    return done.stderr
+
+
+@pytest.mark.parametrize("name", ["task.py", "Äufgabe 工 'x'.py"])
+def test_the_authors_line_is_found_whatever_the_file_is_called(
+    child_process: None, tmp_path: Path, name: str
+) -> None:
+    file = tmp_path / name
+    frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
+    assert [frame.name for frame in frames] == ["deep", "evaluate", "<module>"]
+    assert author_place(frames, [str(file)])[:2] == (str(file), 3)
+    assert hook_of(frames) == "evaluate"
+    assert author_place(frames, ["/elsewhere.py"]) == (None, None, None)
+
+
+def test_a_crash_says_what_it_was(child_process: None, tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    dump = dump_of(file, "ctypes.string_at(0)")
+    assert fatal_error(dump) == "Segmentation fault"
+    problem = death_problem("was killed by SIGSEGV", "stepping", dump, [str(file)], "last words", {})
+    assert problem.message == "the worker process was killed by SIGSEGV (Segmentation fault) in evaluate"
+    assert (problem.file, problem.line, problem.code) == (str(file), 3, "ctypes.string_at(0)")
+    assert problem.traceback.startswith("Traceback") and problem.traceback.endswith("last words")
+
+
+def test_a_death_without_words_says_what_was_being_done() -> None:
+    problem = death_problem("was killed by SIGKILL", "loading", "", ["/a/task.py"], "", {})
+    assert problem.message == "the worker process was killed by SIGKILL while loading"
+    assert (problem.file, problem.line, problem.traceback) == (None, None, "")
+
+
+def test_lines_are_those_of_the_version_that_ran(child_process: None, tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
+    ran = file.read_text()
+    file.write_text("\n" * 10)
+    assert "    faulthandler.dump_traceback" in as_traceback(frames, {str(file): ran})
+    assert "faulthandler.dump_traceback" not in as_traceback(frames, {str(file): "\n"})
+
+
+def test_a_stack_that_could_not_be_had_leaves_what_is_known() -> None:
+    busy = busy_at(3.0, "loading", "", ["/a/task.py"], deaf=False)
+    assert (busy.doing, busy.file, busy.traceback) == ("loading", None, "")

@@ -1,0 +1,460 @@
+"""One worker after the other, and a reason for each end: real processes, which hold no task and begin at once."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.drive.waiting import until
+from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.wire import Call
+from workbench.session.process import supervisor, worker_process
+from workbench.session.process.heartbeat import Busy
+from workbench.session.process.supervisor import Death, KeptWorker, SpareWorker, WorkerOptions
+from workbench.session.protocol.messages import Event, Load, Loading, Request, WarmUp
+from workbench.session.protocol.questions import RunCameras
+
+pytestmark = pytest.mark.usefixtures("child_process")
+SMALL_WORKER = Path(__file__).parents[1] / "small_worker.py"
+OPTIONS = TaskOptions(num_envs=1)
+
+
+class Minded:
+    """A `KeptWorker`, and all that it told."""
+
+    def __init__(self, options: WorkerOptions) -> None:
+        self.events: list[Event] = []
+        self.deaths: list[Death] = []
+        self.busy: list[Busy | None] = []
+        self.greeted = 0
+        self.greeting: list[Request] = []
+        self.fails = 0
+        """So many events cannot be taken."""
+        self.taking: Callable[[Event], None] = lambda event: None
+        self.worker = KeptWorker(
+            options,
+            WarmUp(OPTIONS),
+            greet=self._greet,
+            on_event=self._take,
+            on_death=self.deaths.append,
+            on_busy=self.busy.append,
+            own_files=lambda: [str(SMALL_WORKER)],
+            output=lambda stream, piece: False,
+        )
+
+    def _greet(self) -> list[Request]:
+        self.greeted += 1
+        return [do(f"say hello {self.greeted}"), *self.greeting]
+
+    def _take(self, event: Event) -> None:
+        self.taking(event)
+        if self.fails:
+            self.fails -= 1
+            raise ValueError("no such step")
+        self.events.append(event)
+
+    @property
+    def said(self) -> list[str]:
+        return [event.activity for event in self.events if isinstance(event, Loading)]
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < deadline, (what, self.said, self.deaths, self.busy)
+            time.sleep(0.01)
+
+    def until_greeted(self, times: int) -> None:
+        self.until(lambda: f"hello {times}" in self.said, f"greeting {times}")
+
+    def until_dead(self, times: int = 1) -> Death:
+        self.until(lambda: len(self.deaths) >= times, f"death {times}")
+        return self.deaths[times - 1]
+
+
+def do(what: str) -> Call:
+    """A question that `small_worker` reads another way; none of it takes the place of another."""
+    return Call(0, RunCameras(what, {}))
+
+
+def load(name: str) -> Load:
+    return Load(name, OPTIONS)  # type: ignore[arg-type]
+
+
+@contextmanager
+def minded(options: WorkerOptions | None = None, **attributes: Any) -> Iterator[Minded]:
+    one = Minded(options or WorkerOptions())
+    vars(one).update(attributes)
+    one.worker.start()
+    try:
+        one.until_greeted(1)
+        yield one
+    finally:
+        one.worker.stop()
+
+
+@pytest.fixture(autouse=True)
+def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def command(dash_m: str, module: str, *arguments: str) -> list[str]:
+        assert (dash_m, module) == ("-m", "workbench.session.worker.start")
+        return [sys.executable, "-P", str(SMALL_WORKER), *arguments]
+
+    monkeypatch.setattr(worker_process, "python_command", command)
+    # What takes seconds for the sake of slow machines takes tenths here.
+    for name, seconds in (("_BUSY", 0.8), ("_STACK_EVERY", 0.3), ("_DEAF", 0.3), ("_HEADLESS", 0.8)):
+        monkeypatch.setattr(supervisor, name, seconds)
+    for name, seconds in (("_LOAD_WAITS", 0.3), ("_LONGEST_SILENCE", 1.2), ("_AFTER_A_FAILURE", 0.05)):
+        monkeypatch.setattr(supervisor, name, seconds)
+
+
+def test_each_worker_is_greeted_and_what_it_says_arrives_in_order() -> None:
+    with minded(greeting=[do("say I am new")]) as one:
+        assert one.worker.pid is not None and one.worker.pid != os.getpid()
+        for number in range(20):
+            one.worker.send(do(f"say {number}"))
+        one.until(lambda: "19" in one.said, "the last")
+        assert one.said == ["hello 1", "I am new", *map(str, range(20))]
+        first = one.worker.pid
+        one.worker.replace()
+        death = one.until_dead()
+        assert (death.why, death.asked, death.file_waits, death.gives_up) == (
+            "was ended by hand",
+            True,
+            False,
+            False,
+        )
+        one.until_greeted(2)
+        assert one.worker.pid not in (first, None)
+    assert one.worker.pid is None or not Path(f"/proc/{one.worker.pid}/task").exists()
+    assert len(one.deaths) == 1, "its end for good is no death"
+
+
+def test_what_was_sent_before_a_sudden_end_is_taken_first() -> None:
+    with minded() as one:
+        one.worker.send(do("last_steps 300"))
+        death = one.until_dead()
+        assert one.said[1:301] == [f"step {number}" for number in range(300)]
+        assert (death.why, death.asked, death.doing, death.stack) == (
+            "was killed by SIGKILL",
+            False,
+            None,
+            "",
+        )
+
+
+def test_the_end_says_what_it_was_at_and_where() -> None:
+    with minded() as one:
+        one.worker.send(do("leave 7"))
+        death = one.until_dead()
+        assert (death.why, death.doing) == ("ended with exit code 7", "stepping")
+        assert "in leave" in death.stack
+
+
+def test_the_third_death_in_a_row_is_the_last_until_somebody_asks() -> None:
+    with minded() as one:
+        for times in (1, 2, 3):
+            one.until_greeted(times)
+            one.worker.send(do("leave 1"))
+            assert one.until_dead(times).gives_up is (times == 3)
+        one.until(lambda: one.worker.pid is None, "no worker")
+        one.worker.replace()
+        one.until_greeted(4)
+        one.worker.send(do("leave 1"))
+        fourth = one.until_dead(4)
+        assert (fourth.asked, fourth.gives_up) == (False, False), "it waited to be asked, and begins anew"
+
+
+def test_a_task_that_was_loaded_forgives_earlier_deaths() -> None:
+    with minded() as one:
+        for times in (1, 2, 3, 4):
+            one.until_greeted(times)
+            one.worker.ran()
+            one.worker.send(do("leave 1"))
+            assert one.until_dead(times).gives_up is False
+
+
+def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
+    with minded() as one:
+        one.worker.send(do("work 2.0"))
+        one.until(lambda: None in one.busy, "its end")
+        told = [busy for busy in one.busy if busy is not None]
+        assert len(told) >= 2, "once in the time between two looks"
+        assert told[0].seconds >= supervisor._BUSY and told[-1].seconds > told[0].seconds
+        assert told[-1].file == str(SMALL_WORKER) and not told[-1].deaf and not told[-1].held
+        assert one.deaths == []
+        one.worker.send(do("work 0.05"))
+        one.worker.send(do("say over"))
+        one.until(lambda: "over" in one.said, "short work")
+        assert one.busy[-1] is None and one.busy.count(None) == 1
+
+
+def test_drawing_may_take_longer() -> None:
+    with minded() as one:
+        one.worker.send(do("draw 1.2"))
+        one.worker.send(do("say drawn"))
+        one.until(lambda: "drawn" in one.said, "the picture")
+        assert one.busy == []
+
+
+def test_an_interrupt_leaves_work_and_nothing_that_is_idle_or_held() -> None:
+    with minded() as one:
+        one.worker.interrupt()
+        one.worker.send(do("held_by_a_debugger 1.0"))
+        one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "that it is held")
+        one.worker.interrupt()
+        one.until(lambda: one.busy[-1] is None, "that it goes on")
+        assert "interrupted" not in one.said
+        one.worker.send(do("work 60"))
+        one.until(lambda: one.busy[-1] is not None, "that it is busy")
+        one.worker.interrupt()
+        one.until(lambda: "interrupted" in one.said, "the interrupt")
+        assert one.deaths == []
+
+
+def test_who_does_not_listen_to_an_interrupt_is_told_deaf() -> None:
+    with minded() as one:
+        one.worker.send(do("work_on 3"))
+        one.until(lambda: one.busy and one.busy[-1] is not None, "that it is busy")
+        assert one.busy[-1] is not None and not one.busy[-1].deaf
+        one.worker.interrupt()
+        one.until(lambda: one.busy[-1] is not None and one.busy[-1].deaf, "that it is deaf")
+
+
+def test_a_load_waits_for_short_work_only() -> None:
+    with minded() as one:
+        one.worker.send(do("work 60"))
+        one.until(lambda: one.busy, "that it is busy")
+        assert not one.worker.load_waits
+        one.worker.send(load("mended"))
+        assert one.worker.load_waits
+        one.until(lambda: "mended" in one.said, "the load")
+        assert "interrupted" in one.said and one.deaths == []
+        one.until(lambda: not one.worker.load_waits, "that it was taken up")
+
+
+def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
+    with minded() as one:
+        for times in (1, 2, 3):
+            one.until_greeted(times)
+            one.worker.send(do("work_on 60"))
+            one.until(lambda: one.busy and one.busy[-1] is not None, "that it is busy")
+            one.worker.send(load("mended"))
+            death = one.until_dead(times)
+            assert death.file_waits and not death.asked
+            # Not before the interrupt was given its time: 0.3 s until it was sent and 1.2 s after it.
+            waited = re.fullmatch(r"did not answer for (\d+) s", death.why)
+            assert waited is not None and int(waited[1]) >= 2, death.why
+            assert not death.gives_up, "it was not the worker's fault"
+            assert death.doing == "stepping" and "in _pass_time" in death.stack
+        assert one.busy[-1] is None
+
+
+def test_while_a_debugger_holds_it_no_load_ends_it() -> None:
+    with minded() as one:
+        one.worker.send(do("held_by_a_debugger 2.5"))
+        one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "that it is held")
+        one.worker.send(load("mended"))
+        one.until(lambda: "mended" in one.said, "the load")
+        assert one.deaths == [] and "interrupted" not in one.said
+
+
+def test_what_is_no_event_ends_the_worker_with_a_reason() -> None:
+    with minded() as one:
+        one.worker.send(do("nonsense x"))
+        death = one.until_dead()
+        assert death.why == "sent what cannot be read (it was a str, which is no message) and was ended"
+
+
+def test_an_event_that_cannot_be_taken_ends_the_worker_and_not_the_thread(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with minded() as one:
+        one.fails = 1
+        one.worker.send(do("say this"))
+        death = one.until_dead()
+        assert death.why == "sent what cannot be used (ValueError: no such step) and was ended"
+        one.until_greeted(2)
+    assert "no such step" in caplog.text
+
+
+def test_of_the_last_that_a_worker_sent_what_cannot_be_taken_is_told_and_a_new_one_comes(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with minded() as one:
+        pid = one.worker.pid
+
+        def taking(event: Event) -> None:
+            if event.activity == "step 0":  # type: ignore[union-attr]
+                one.until(lambda: not Path(f"/proc/{pid}").exists(), "its end")  # all that it said is there
+                one.worker.replace()
+                time.sleep(supervisor._LOOK)  # a look is due now, which finds that it is to be replaced
+            if event.activity == "step 2":  # type: ignore[union-attr]
+                raise ValueError("no such step")
+
+        one.taking = taking
+        one.worker.send(do("last_steps 5"))
+        assert one.until_dead().why == "was ended by hand"
+        assert one.said == ["hello 1", "step 0", "step 1"]
+        one.until_greeted(2)
+    assert "The last that a worker sent could not be taken" in caplog.text and "no such step" in caplog.text
+
+
+def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
+    with minded() as one:
+        greet = one.worker._greet
+        failures = iter(range(2))
+
+        def fails() -> list[Request]:
+            if next(failures, None) is not None:
+                raise RuntimeError("nothing to say")
+            return greet()
+
+        one.worker._greet = fails
+        one.worker.replace()
+        one.until_dead(3)
+        assert [death.why for death in one.deaths[1:]] == [
+            "was lost by the thread that minds it (RuntimeError: nothing to say)"
+        ] * 2
+        assert [death.gives_up for death in one.deaths] == [False, False, False]
+        one.until_greeted(2)
+    assert "nothing to say" in caplog.text
+
+
+def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody_asks() -> None:
+    with minded() as one:
+        greet = one.worker._greet
+        failures = iter(range(3))
+
+        def fails() -> list[Request]:
+            if next(failures, None) is not None:
+                raise RuntimeError("nothing to say")
+            return greet()
+
+        one.worker._greet = fails
+        one.worker.replace()
+        one.until_dead(4)
+        assert [death.gives_up for death in one.deaths] == [False, False, False, True]
+        assert one.worker.pid is None
+        one.worker.replace()
+        one.until_greeted(2)
+        assert len(one.deaths) == 4
+
+
+def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    command, failures = worker_process.python_command, iter(range(4))
+
+    def fails(*arguments: str) -> list[str]:
+        if next(failures, None) is not None:
+            raise OSError("no more processes")
+        return command(*arguments)
+
+    monkeypatch.setattr(worker_process, "python_command", fails)
+    one = Minded(WorkerOptions())
+    one.worker.start()
+    try:
+        one.until_dead(3)
+        one.worker.replace()
+        one.until_greeted(1)
+        assert [death.gives_up for death in one.deaths] == [False, False, True, False]
+        assert {death.why for death in one.deaths} == {
+            "was lost by the thread that minds it (OSError: no more processes)"
+        }
+    finally:
+        one.worker.stop()
+
+
+def test_a_worker_without_its_main_thread_is_ended() -> None:
+    with minded() as one:
+        one.worker.send(do("without_a_main_thread 60"))
+        death = one.until_dead()
+        assert death.why.startswith("was ended because its main thread had ended")
+
+
+def test_one_that_is_about_to_end_without_its_main_thread_is_left_to_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(supervisor, "_HEADLESS", 60.0)
+    with minded() as one:
+        one.worker.send(do("ends_soon_without_a_main_thread 0.5"))
+        assert one.until_dead().why == "ended with exit code 7"
+
+
+def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> None:
+    limit = 600 << 20
+    with minded(WorkerOptions(memory_limit=limit)) as one:
+        one.until(lambda: one.worker.vitals.memory > 0, "a look")
+        vitals = one.worker.vitals
+        assert (vitals.memory_limit, vitals.spare_memory, vitals.spare_ready) == (limit, None, False)
+        one.worker.send(do("fill_memory 700"))
+        death = one.until_dead()
+        assert death.why.startswith("was ended because it and what it started had ")
+        assert "--memory-limit" in death.why and not death.asked
+
+
+def test_every_worker_listens_for_a_debugger_and_only_the_first_waits_for_it() -> None:
+    with minded(WorkerOptions(debug_port=1234, debug_wait=True)) as one:
+        assert one.events[0] == Loading("debugger at 1234, waits: True")
+        one.worker.replace()
+        one.until_greeted(2)
+        listens = [e.activity for e in one.events if isinstance(e, Loading) and "debugger" in e.activity]
+        assert listens == ["debugger at 1234, waits: True", "debugger at 1234, waits: False"]
+
+
+def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
+    with minded() as one:
+        one.worker.send(do("work_on 60"))
+        one.until(lambda: one.busy, "that it is busy")
+        pid = one.worker.pid
+    assert pid is not None
+    one.until(lambda: not Path(f"/proc/{pid}").exists(), "its end")
+    assert [thread.name for thread in threading.enumerate() if thread.name == "session"] == []
+
+
+def test_nothing_is_kept_beside_the_worker_that_nobody_asked_for() -> None:
+    kept = WorkerOptions()
+    assert (kept.spare, kept.memory_limit, kept.debug_port, kept.debug_wait) == (False, None, None, False)
+
+
+def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.process.supervisor._SPARE_DELAY", 0.0)
+    with minded(WorkerOptions(spare=True)) as one:
+        assert one.worker.vitals.spare_memory is None
+        one.worker.send(do("loaded"))
+        one.until(lambda: one.worker.vitals.spare_ready, "the spare")
+        assert (one.worker.vitals.spare_memory or 0) > 0
+        os.kill(one.worker.pid or 0, signal.SIGKILL)
+        one.until_greeted(2)
+        assert not one.worker.vitals.spare_ready
+
+
+def test_a_spare_that_dies_of_its_warming_up_is_tried_once_more_and_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(supervisor, "_SPARE_DELAY", 0.0)
+    spare = SpareWorker(WarmUp(OPTIONS))
+
+    def attended() -> worker_process.WorkerProcess | None:
+        spare.attend()
+        return spare._process
+
+    try:
+        spare.begin_soon()
+        for _ in range(2):
+            first = until(attended, "a spare")
+            spare.kill()
+            until(lambda first=first: attended() is not first, "its end")
+        spare.begin_soon()
+        assert attended() is None and spare.memory == 0 and not spare.ready
+    finally:
+        spare.stop()

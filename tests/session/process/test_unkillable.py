@@ -1,0 +1,313 @@
+"""Whatever the author's code does to its process, the session goes on and says what happened."""
+
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from tests.drive.session import live_session, step, wait_until
+from tests.recording.verify_rrd import verify_rrd
+from tests.session.hazards import calm, edit, line_of, provoke, write_task
+from workbench.jobs.task import TaskOptions
+from workbench.recording.rerun.read import read_properties
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.process import supervisor
+from workbench.session.process.interrupts import INTERRUPT_SIGNAL
+from workbench.session.process.supervisor import WorkerOptions
+from workbench.session.process.worker_process import signal_main_thread
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+LIMIT = 2 * 2**30
+
+
+@pytest.fixture(scope="module", autouse=True)
+def soon() -> Iterator[None]:
+    """What takes seconds for the sake of slow machines takes about one here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, seconds in (("_BUSY", 1.0), ("_STACK_EVERY", 0.3), ("_DEAF", 0.5)):
+            patch.setattr(supervisor, name, seconds)
+        for name, seconds in (("_LOAD_WAITS", 0.7), ("_LONGEST_SILENCE", 2.0)):
+            patch.setattr(supervisor, name, seconds)
+        yield
+
+
+@pytest.fixture(scope="module")
+def risky_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_task(tmp_path_factory.mktemp("author"))
+
+
+@pytest.fixture(scope="module")
+def risky_session(
+    soon: None, risky_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Session]:
+    limited = WorkerOptions(memory_limit=LIMIT)
+    with live_session(risky_file, tmp_path_factory.mktemp("recordings"), worker=limited) as session:
+        yield session
+
+
+@pytest.fixture
+def session(risky_session: Session, risky_file: Path) -> Iterator[Session]:
+    """The session at rest at step 3 of an episode, with the file as it is on disk."""
+    session = risky_session
+    session.pause()
+    steps = session.view().step_serial
+    session.reset()
+    wait_until(session, lambda v: v.step_serial > steps and not v.step.elapsed_steps.any(), "the reset")
+    step(session, 3)
+    wait_until(session, lambda v: v.problem is None and v.busy is None, "calm")
+    yield session
+    calm(risky_file)
+
+
+def died_and_came_back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3)) -> SessionView:
+    """The first view of the version that has come back, at the moment that was last shown."""
+    view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
+    assert view.problem.stage == "worker"
+    assert view.task.source_hash == before.task.source_hash and not view.playing
+    np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-5)
+    assert view.step.elapsed_steps.tolist() == before.step.elapsed_steps.tolist() == [*steps]
+    return view
+
+
+@pytest.mark.parametrize("place", ["evaluate", "reward"])
+def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
+    session: Session, risky_file: Path, place: str
+) -> None:
+    before, worker = session.view(), session.worker_pid
+    provoke(risky_file, place, "loop")
+    session.step()
+    busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
+    assert busy.doing == f"in {place}" and busy.seconds >= supervisor._BUSY and not busy.deaf
+    assert busy.file == str(risky_file) and busy.code in ("while True:", "pass")
+    session.step()
+    session.step()
+    session.play()
+    session.interrupt()
+    view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
+    assert view.problem.stage == place and view.problem.interrupted
+    assert "Interrupted: stopped by hand after" in view.problem.message
+    assert view.problem.file == str(risky_file) and f'hazard("{place}")' in view.problem.traceback
+    calm(risky_file)
+    # Nothing of the step that was left remains: the next one is the one that it would have been.
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the fourth step")
+    assert view.problem is None and session.worker_pid == worker and view.task_serial == before.task_serial
+
+
+@pytest.mark.parametrize("place", ["import", "build", "reset"])
+def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
+    session: Session, risky_file: Path, place: str
+) -> None:
+    before = session.view()
+    provoke(risky_file, place, "loop")
+    edit(risky_file)
+    wait_until(session, lambda v: v.busy is not None and v.busy.file == str(risky_file), "busy")
+    session.interrupt()
+    view = wait_until(session, lambda v: v.problem is not None, "the interrupt")
+    assert view.problem.stage == place and view.problem.file == str(risky_file)
+    assert view.stale and view.task_serial == before.task_serial
+    calm(risky_file)
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
+    session.versions.reload()
+    wait_until(session, lambda v: v.problem is None and not v.stale, "the new version")
+
+
+def test_a_hang_that_a_save_waits_for_is_left_and_the_new_version_loaded_in_the_same_process(
+    session: Session, risky_file: Path
+) -> None:
+    before, worker = session.view(), session.worker_pid
+    provoke(risky_file, "evaluate", "loop")
+    session.step()
+    wait_until(session, lambda v: v.busy is not None, "busy")
+    calm(risky_file)
+    edit(risky_file)
+    view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the new version")
+    assert session.worker_pid == worker and not view.stale
+
+
+@pytest.mark.parametrize("what", ["native", pytest.param("catch", marks=pytest.mark.slow)])
+def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back(
+    session: Session, risky_file: Path, what: str
+) -> None:
+    before = session.view()
+    provoke(risky_file, "evaluate", what)
+    session.step()
+    wait_until(session, lambda v: v.busy is not None, "busy")
+    session.interrupt()
+    busy = wait_until(session, lambda v: v.busy is not None and v.busy.deaf, "that it is deaf").busy
+    assert (
+        busy.doing == "in evaluate"
+        and busy.file == str(risky_file)
+        and 'hazard("evaluate")' in busy.traceback
+    )
+    calm(risky_file)
+    session.versions.restart_worker()
+    view = died_and_came_back(session, before)
+    assert "ended by hand in evaluate" in view.problem.message
+    assert view.problem.file == str(risky_file) and view.problem.code
+
+
+WAYS = [
+    ("exit", "called os._exit(3) in evaluate", "_os._exit(3)"),
+    ("segfault", "was killed by SIGSEGV (Segmentation fault) in evaluate", "_ctypes.string_at(0)"),
+    ("abort", "was killed by SIGABRT (Aborted) in evaluate", "_os.abort()"),
+    ("kill", "was killed by SIGKILL while stepping", None),
+    ("children", "was killed by SIGKILL while stepping", None),
+    ("memory", "more than the 2.0 GB that --memory-limit allows, in evaluate", 'eaten.append(b"x" * 2**24)'),
+]
+
+
+QUICK = ("segfault",)
+"""The others end the process in the same way, or as a recording's worker is killed below, and each costs a new one."""
+
+
+@pytest.mark.parametrize(
+    ("what", "says", "code"),
+    [pytest.param(*way, id=way[0], marks=() if way[0] in QUICK else pytest.mark.slow) for way in WAYS],
+)
+def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
+    session: Session, risky_file: Path, what: str, says: str, code: str | None
+) -> None:
+    before, worker = session.view(), session.worker_pid
+    provoke(risky_file, "evaluate", what)
+    session.step()
+    wait_until(session, lambda v: v.problem is not None and v.problem.stage == "worker", "the death")
+    calm(risky_file)
+    view = died_and_came_back(session, before)
+    assert says in view.problem.message
+    assert view.problem.code == code
+    if code is not None:
+        assert view.problem.line == line_of(risky_file, code)
+    assert not view.stale
+    assert session.worker_pid != worker and not psutil.pid_exists(worker)
+
+
+def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(
+    session: Session, risky_file: Path
+) -> None:
+    before, good = session.view(), risky_file.read_text()
+    risky_file.write_text(good + "\n\n_ctypes.string_at(0)\n")
+    view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the last good version")
+    assert view.stale and "SIGSEGV" in view.problem.message
+    assert view.problem.line == len(good.splitlines()) + 3
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
+    assert view.problem is not None, "the file is still broken"
+    risky_file.write_text(good)
+    wait_until(session, lambda v: v.problem is None and not v.stale, "the mended version")
+
+
+def test_what_is_only_slow_is_told_and_left_alone(session: Session, risky_file: Path) -> None:
+    before, worker = session.view(), session.worker_pid
+    provoke(risky_file, "build", "slow")
+    edit(risky_file)
+    # For longer than a load waits for what cannot be interrupted.
+    long = supervisor._LOAD_WAITS + supervisor._LONGEST_SILENCE + 0.5
+    busy = wait_until(session, lambda v: v.busy is not None and v.busy.seconds > long, "busy").busy
+    assert busy.doing == "in build" and busy.code == "_time.sleep(0.1)"
+    calm(risky_file)
+    view = wait_until(
+        session, lambda v: v.task_serial > before.task_serial and v.busy is None, "the slow one"
+    )
+    assert view.problem is None and session.worker_pid == worker
+
+
+@pytest.mark.parametrize(("what", "says"), [("read", "EOFError"), ("leave", "SystemExit: enough")])
+def test_what_would_wait_or_leave_is_an_error_like_others(
+    session: Session, risky_file: Path, what: str, says: str
+) -> None:
+    worker = session.worker_pid
+    provoke(risky_file, "reward", what)
+    session.step()
+    view = wait_until(session, lambda v: v.problem is not None, "the problem")
+    assert view.problem.stage == "reward" and says in view.problem.message
+    assert session.worker_pid == worker
+
+
+def test_a_flood_of_prints_is_counted_and_its_end_kept(session: Session, risky_file: Path) -> None:
+    session.clear_printed()
+    provoke(risky_file, "evaluate", "flood")
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the step behind the flood")
+    # The slower it is drained the more lines are kept for a while; those are pushed out by newer ones, and not counted.
+    view = wait_until(session, lambda v: v.printed.dropped > 150_000, "most of the flood")
+    assert len(view.printed.lines) <= 1000
+    assert view.printed.lines[-1].stream == "stdout" and "no play" in view.printed.texts[-1]
+    assert view.problem is None
+
+
+def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, risky_file: Path) -> None:
+    written = session.view().recording.episodes_written
+    session.start_recording((1,))
+    for count in (1, 2, 3, 4, 5):
+        session.step()
+        wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
+    before, worker = session.view(), session.worker_pid
+    provoke(risky_file, "reward", "kill")
+    session.step()
+    view = wait_until(session, lambda v: v.recording.episodes_written > written, "the file")
+    calm(risky_file)
+    assert not view.recording.active and view.recording.problem is None
+    assert verify_rrd(view.recording.last_file) is None
+    assert "5" in str(read_properties(view.recording.last_file))
+    # A recording begins an episode of its own.
+    view = died_and_came_back(session, before, steps=(8, 5))
+    assert "was killed by SIGKILL while stepping" in view.problem.message and view.problem.code is None
+    assert not view.stale and session.worker_pid != worker and not psutil.pid_exists(worker)
+    wait_until(session, lambda v: v.state == "paused", "the version again")
+
+
+def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: Path) -> None:
+    file = write_task(tmp_path)
+    provoke(file, "import", "abort")
+    options = TaskOptions(num_envs=1, env_kwargs={"render_backend": "none"})
+    session = Session(str(file), options, recordings=tmp_path / "recordings")
+    view = wait_until(session, lambda v: v.state == "error" and session.worker_pid is not None, "the death")
+    assert "SIGABRT" in view.problem.message and view.problem.code == "_os.abort()" and view.task is None
+    waiting = session.worker_pid
+    calm(file)
+    edit(file)
+    wait_until(session, lambda v: v.task is not None and v.problem is None, "the mended file")
+    assert session.worker_pid == waiting
+    session.close()
+    assert not psutil.pid_exists(waiting)
+
+
+def test_a_worker_that_is_killed_while_it_waits_comes_back(session: Session) -> None:
+    before = session.view()
+    os.kill(session.worker_pid, signal.SIGKILL)
+    assert "was killed by SIGKILL" in died_and_came_back(session, before).problem.message
+
+
+def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None:
+    """The kernel may give a signal for the process to a thread of torch's, and then nothing leaves the loop."""
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    child.send_signal(signal.SIGSTOP)
+    os.waitpid(child.pid, os.WUNTRACED)  # it stops some time later, and until then a signal is delivered
+    try:
+        signal_main_thread(child.pid, INTERRUPT_SIGNAL)
+        status = Path(f"/proc/{child.pid}/status").read_text()
+        pending = {
+            line.split(":")[0]: int(line.split()[1], 16) for line in status.splitlines() if "Pnd" in line
+        }
+        bit = 1 << (INTERRUPT_SIGNAL - 1)
+        assert pending["SigPnd"] & bit and not pending["ShdPnd"] & bit
+    finally:
+        child.kill()
+        child.wait()
+    signal_main_thread(child.pid, INTERRUPT_SIGNAL)  # gone: nothing to interrupt

@@ -1,0 +1,234 @@
+"""Recording while the page runs, from the next reset, and after the fact: the same files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tests.drive.session import TASKS, live_session, start_over, step, wait_until
+from tests.session.studio import BASE
+from workbench.authoring.loading.load import load_task
+from workbench.core.camera_data import CameraSettings
+from workbench.core.cameras.report import ObjectSummary
+from workbench.recording.episode.episode import Episode
+from workbench.recording.reader.read_episode import read_episode
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    folder = tmp_path_factory.mktemp("task")
+    # Small pictures: drawn in software, those of 512 by 512 take most of the time.
+    (folder / "push_cube.py").write_text((TASKS / "push_cube.py").read_text().replace("512", "64"))
+    with live_session(folder / "push_cube.py", folder / "recordings", seed=5, draw=True) as session:
+        yield session
+
+
+def elapsed(view: SessionView) -> int:
+    return -1 if view.step is None else int(view.step.elapsed_steps[0])
+
+
+def written(session: Session, count: int) -> list[Episode]:
+    """The episodes that there are, oldest first, once there are so many."""
+    view = wait_until(session, lambda view: view.recording.episodes_written >= count, "the files")
+    paths = sorted(Path(view.recording.folder).glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
+    assert len(paths) == count and view.recording.problem is None
+    return [read_episode(path) for path in paths]
+
+
+def assert_same(one: Episode, other: Episode) -> None:
+    """All of it, to the last bit, but for who and when."""
+    assert (one.info.seed, one.info.env_index) == (other.info.seed, other.info.env_index)
+    assert one.info.acted_by == other.info.acted_by
+    assert one.poses is not None and other.poses is not None
+    for name in ("poses", "action", "reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for group in ("env_states", "obs", "evaluate"):
+        ours, theirs = getattr(one, group), getattr(other, group)
+        assert ours.keys() == theirs.keys() and ours
+        for name, values in ours.items():
+            np.testing.assert_array_equal(values, theirs[name], err_msg=f"{group}/{name}")
+    assert len(one.cameras) == len(other.cameras) > 0
+    for track, again in zip(one.cameras, other.cameras, strict=True):
+        np.testing.assert_array_equal(track.pose, again.pose)
+        for modality in ("rgb", "depth", "segmentation"):
+            pictures, others = getattr(track, modality), getattr(again, modality)
+            assert (pictures is None) == (others is None)
+            for i in range(len(pictures or ())):
+                np.testing.assert_array_equal(pictures[i], others[i], err_msg=f"{modality} {i}")
+
+
+@pytest.mark.slow
+def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session) -> None:
+    session.start_recording()
+    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    step(session, STEPS)
+    view = wait_until(session, lambda view: view.recording.steps == 2 * STEPS, "the steps")
+    assert view.recording.bytes_written > 0
+    session.stop_recording()
+    live = written(session, 2)
+    session.keep_past()
+    wait_until(session, lambda view: bool(view.recording.keeping.said), "the keeping")
+    said = f"kept 2 episodes, {2 * STEPS} steps; none of them had ended"
+    assert session.view().recording.keeping.said == said
+    every = written(session, 4)
+    kept = {episode.info.env_index: episode for episode in every[2:]}
+    assert kept.keys() == {0, 1}
+    load_task(str(TASKS / "push_cube.py"))  # registers it
+    stock: Any = gym.make("WorkbenchPushCube-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
+    for episode in live:
+        stock.reset(seed=episode.info.seed)
+        start = stock.unwrapped.get_state_dict()["actors"]["cube"][0].numpy()
+        # The seed that a person reads of it starts it again, though the page reset both envs.
+        np.testing.assert_allclose(episode.env_states["actors/cube"][0], start, rtol=0, atol=1e-6)
+    stock.close()
+    for episode in live:
+        assert episode.length == STEPS
+        assert episode.info.acted_by == ((0, "random"),)
+        assert_same(episode, kept[episode.info.env_index])
+
+
+def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> None:
+    count = session.view().recording.episodes_written
+    for steps in (3, 1):
+        session.reset()
+        for made in range(steps):
+            session.change(action_source="random" if made == 0 else "hold")
+            session.step()
+        wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
+    session.keep_past((0,), before=True)
+    kept = written(session, count + 1)[-1]
+    assert kept.length == 3 and kept.info.env_index == 0
+    # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
+    said = session.view().recording.keeping.said
+    assert kept.info.seed == 5 and "no seed" not in said
+    session.keep_past((1,), before=True)
+    kept = written(session, count + 2)[-1]
+    assert kept.info.env_index == 1 and kept.info.seed == -1
+    said = wait_until(
+        session, lambda view: bool(view.recording.keeping.said), "what came of it"
+    ).recording.keeping.said
+    assert "its start was drawn for several envs at once" in said
+    assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
+    session.change(action_source="random")
+
+
+def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(session: Session) -> None:
+    """A keep to a camera that is judged over seeds; that, and a search, to a keep."""
+    judging = session.studio.judging
+    session.studio.select(BASE)
+
+    def keep(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
+        session.keep_past((0,))
+        wait_until(session, lambda view: bool(view.recording.keeping.said) or begun(view), "a keep")
+
+    def kept() -> Episode:
+        wait_until(session, lambda view: bool(view.recording.keeping.said), "what was kept")
+        return written(session, session.view().recording.episodes_written)[-1]
+
+    def drawing(view: SessionView) -> bool:
+        progress = view.recording.keeping.progress
+        return progress is not None and progress.what == "drawing it again" and progress.done > 0
+
+    def judge() -> None:
+        judging.judge(60)
+
+    def judged() -> tuple[tuple[int, ...], ObjectSummary]:
+        view = wait_until(session, lambda view: view.studio.progress is None, "the judgement")
+        report = view.studio.looked.report
+        assert report is not None and view.studio.looked.report_seeds == 60 and not view.studio.problem
+        return report.envs, report.wanted_objects(("cube",))[0].summary()
+
+    def search() -> None:
+        judging.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+
+    def found() -> list[tuple[float, CameraSettings]]:
+        view = wait_until(session, lambda view: view.studio.progress is None, "the search")
+        return [(offer.score, offer.settings) for offer in view.studio.looked.suggestions]
+
+    def is_at_it(view: SessionView) -> bool:
+        return view.studio.progress is not None and view.studio.progress.done > 0
+
+    start_over(session, 5)
+    step(session, 20)
+    keep()
+    episode = kept()
+    assert episode.length == 20
+    judge()
+    alone = judged()
+    search()
+    offers = found()
+    assert offers and not session.view().studio.problem
+
+    keep(drawing)
+    judge()
+    assert judged() == alone and not session.view().recording.keeping.said, "the keep came first"
+    assert_same(kept(), episode)
+    for begin, came, of in ((judge, judged, alone), (search, found, offers)):
+        begin()
+        wait_until(session, is_at_it, "its beginning")
+        keep()
+        assert_same(kept(), episode)
+        assert session.view().studio.progress is not None, "the keep came last"
+        assert came() == of
+
+
+def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
+    before = session.view().recording.episodes_written
+    session.start_recording((1,), next_episode=True)
+    step(session, 1)
+    view = wait_until(session, lambda view: view.recording.waiting == 1, "the waiting")
+    assert view.recording.active and view.recording.steps == 0
+    session.reset((1,))
+    wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
+    step(session, 1)
+    session.change(action_source="zero")
+    step(session, 1)
+    session.reset((1,))
+    wait_until(session, lambda view: not view.recording.active, "its end")
+    session.change(action_source="random")
+    step(session, 1)
+    (*_, episode) = written(session, before + 1)
+    assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
+
+
+def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Session) -> None:
+    session.reset()
+    wait_until(session, lambda view: view.step is not None and not view.step.elapsed_steps.any(), "a reset")
+    first = session.view().timeline.first
+    session.past.seek(session.view().timeline.last)
+    assert first == 0  # the history is whole, so what is refused is an episode without a step
+    session._state.timeline.history.limit = 1  # type: ignore[union-attr]
+    step(session, 2)
+    session.keep_past((0,))
+    view = wait_until(session, lambda view: view.recording.keeping.failed, "the refusal")
+    assert "its beginning is no longer in memory" in view.recording.keeping.said
+    session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
+    session: Session, tmp_path: Path
+) -> None:
+    view = session.view()
+    folder = Path(view.recording.folder)
+    aside = folder.rename(folder.with_name("aside"))
+    folder.write_text("in the way")
+    session.start_recording((0,))
+    view = wait_until(session, lambda view: view.recording.problem is not None, "the problem")
+    assert not view.recording.active and "is not a folder" in str(view.recording.problem)
+    step(session, 2)
+    assert session.view().problem is None
+    folder.unlink()
+    aside.rename(folder)
+    session.start_recording((0,))
+    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    assert session.view().recording.problem is None
+    session.stop_recording()

@@ -1,0 +1,269 @@
+"""The past judged again, with real processes on the example task: one that plays and one that judges."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalOperand=false
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import TASKS, live_session, wait_until
+from tests.drive.waiting import until
+from workbench.session.history.history import Moment
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.rescore.background import JudgedView, StoppedBy
+
+N = 3
+ORIGINAL = (
+    (TASKS / "push_cube.py")
+    .read_text()
+    .replace("from typing import Any", "import os\nimport time\nfrom typing import Any", 1)
+)
+REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
+SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
+IN_THE_JUDGE = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
+"""True in the process that judges: it has a lower priority."""
+
+
+@dataclass
+class Desk:
+    session: Session
+    file: Path
+
+    def edit(self, old: str, new: str) -> None:
+        """The file as it was first, but for this."""
+        assert old in ORIGINAL
+        self.file.write_text(ORIGINAL.replace(old, new))
+
+    def record(self, steps: int) -> list[Moment]:
+        """Start anew with the original, play, and stop at the first moment of new episodes; the whole record."""
+        session = self.session
+        session.pause()
+        self.file.write_text(ORIGINAL)
+        wait_until(session, lambda v: v.task.source[str(self.file)] == ORIGINAL, "the original")
+        session.versions.reload("rebuilt")
+        first = session.view().timeline.last
+        wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
+        session.judge.stop()
+        wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
+        session.change(speed=math.inf)
+        session.play()
+        wait_until(session, lambda v: v.timeline.moments >= steps, "the steps")
+        session.pause()
+        wait_until(session, lambda v: not v.playing, "the pause")
+        last = session.view().timeline.last
+        session.reset()
+        wait_until(session, lambda v: v.timeline.last > last and v.step.elapsed_steps.max() == 0, "the reset")
+        history = session._state.timeline.history
+        return list(history.between(history.first, history.last))
+
+    def judged(self, *states: str) -> JudgedView:
+        before = self.serial
+
+        def reached(view: SessionView) -> bool:
+            return view.judgement.serial > before and view.judgement.state in (states or ("done",))
+
+        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").judgement
+
+    serial = 0
+
+    def note(self) -> None:
+        """From here on `judged` waits for something new."""
+        self.serial = self.session.view().judgement.serial
+
+
+@pytest.fixture(scope="module")
+def desk(child_process: None, task_file: Path) -> Iterator[Desk]:
+    recordings = task_file.parent / "recordings"
+    with live_session(task_file, recordings, num_envs=N) as session:
+        yield Desk(session, task_file)
+
+
+@pytest.fixture
+def record(desk: Desk) -> list[Moment]:
+    moments = desk.record(130)
+    desk.note()
+    return moments
+
+
+def steps_of(record: list[Moment]) -> list[Moment]:
+    return [moment for moment in record if not moment.jumped.any()]
+
+
+def episodes_of(record: list[Moment]) -> int:
+    """Those of all envs that have a step: how many a fast machine plays before it is paused is not known."""
+    begins = np.array([moment.jumped for moment in record])
+    return int((begins[:-1] & ~begins[1:]).sum())
+
+
+def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: Desk, record) -> None:
+    desk.edit(REWARD, f"{REWARD} * 2")
+    view = desk.judged()
+    rewards = np.array([moment.step.reward for moment in steps_of(record)])
+    assert (view.done, view.total) == (len(rewards), len(rewards))
+    for env in range(N):
+        curve = desk.session.judge.curve("reward", env)
+        np.testing.assert_array_equal(curve.old, rewards[:, env])
+        np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
+    assert all(verdict.metres == verdict.radians == 0 for verdict in view.verdicts)
+    assert len(view.verdicts) == episodes_of(record) >= 3 * N
+    for verdict in view.verdicts:
+        assert verdict.differing == ("reward",) and verdict.of.env in range(N)
+        assert verdict.returns[1] == pytest.approx(2 * verdict.returns[0])
+    assert view.differing_names == {"reward"}
+    assert not view.warnings
+
+
+def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
+    desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
+    view = desk.judged()
+    assert len(view.verdicts) == episodes_of(record) >= 3 * N
+    assert not any(verdict.differing or verdict.metres for verdict in view.verdicts)
+    assert view.differing_names == frozenset()
+
+
+def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk, record) -> None:
+    """Success becomes "the gripper is above a height", which the recorded poses tell by themselves."""
+    hand = desk.session.view().task.geometry.body_names.index("panda/panda_hand_tcp")
+    heights = np.array([moment.step.poses[:, hand, 2] for moment in record])
+    limit = float(np.float32(np.quantile(heights, 0.8)))
+    desk.edit(SUCCESS, f'"success": self.agent.tcp.pose.p[:, 2] > {limit!r},')
+    view = desk.judged()
+    wanted = {}
+    for env in range(N):
+        begins = [k for k, moment in enumerate(record) if moment.jumped[env]]
+        for begin, end in zip(begins, [*begins[1:], len(record)], strict=True):
+            above = [k for k in range(begin, end) if heights[k, env] > limit]
+            if above and end > begin + 1:
+                step = record[above[0]]
+                wanted[env, record[begin].serial] = (int(step.step.elapsed_steps[env]), step.serial)
+    assert len(wanted) > 2
+    found = {
+        (v.of.env, int(v.of.serials[0])): (v.success[1], v.of.at(v.look_at))
+        for v in view.verdicts
+        if v.success[1] is not None
+    }
+    assert found == wanted
+    assert all(verdict.success[0] is None for verdict in view.verdicts)
+
+
+def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
+    late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
+    # The process that judges now stands at the end of an episode, where the new code raises at once.
+    desk.edit(REWARD, f"{REWARD} * 2")
+    desk.judged()
+    desk.note()
+    desk.edit(REWARD, f"{late}\n        {REWARD}")
+    view = desk.judged("failed")
+    assert "KeyError: 'late'" in view.problem.message
+    assert Path(view.problem.file) == desk.file
+    assert desk.file.read_text().splitlines()[view.problem.line - 1].strip() == late
+    curve = desk.session.judge.curve("reward", 1)
+    rewards = np.array([moment.step.reward[1] for moment in steps_of(record)])
+    np.testing.assert_array_equal(curve.old, rewards)
+    assert np.isfinite(curve.new).sum() == view.done
+    assert 0 < view.done < view.total
+
+
+def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
+    calls = desk.file.with_name("calls")
+    slow = f"if {IN_THE_JUDGE}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
+    desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
+    desk.judged("judging")
+    session = desk.session
+    session.change(speed=1.0)
+    session.play()
+    last = session.view().timeline.last
+    view = wait_until(session, lambda v: v.timeline.last > last + 10, "the worker that plays")
+    assert view.judgement.state == "judging"
+    session.pause()
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 4")
+    # That the first is told as stopped is seen for as long as the process takes to come back, which may be no time.
+    view = desk.judged("done")
+    assert len(calls.read_text()) < view.done
+    for env in range(N):
+        curve = session.judge.curve("reward", env)
+        # What was played since the first of the two saves was rewarded twofold when it was recorded.
+        factor = np.where(curve.serial <= record[-1].serial, 4, 2)
+        np.testing.assert_array_equal(curve.new, factor * curve.old)
+
+
+def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
+    loops = desk.file.with_name("loops")
+    loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
+    desk.edit(REWARD, f"{loop}\n        {REWARD}")
+    desk.judged("judging")
+    until(loops.exists, "the loop")
+    desk.note()
+    process = desk.session._background.pid
+    desk.session.judge.stop()
+    view = desk.judged("stopped")
+    assert view.done < view.total and view.stopped_by is StoppedBy.HAND
+    wait_until(
+        desk.session, lambda v: desk.session._background.pid is None, "the end of the process that hangs"
+    )
+    assert not Path(f"/proc/{process}").exists()
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 2")
+    assert any(verdict.differs for verdict in desk.judged("done").verdicts)
+
+
+def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    desk.edit(REWARD, f"{slow}\n        {REWARD}")
+    desk.judged("judging")
+    first = desk.session._background.pid
+    desk.note()
+    os.kill(first, signal.SIGKILL)
+    view = desk.judged("failed")
+    assert "killed by SIGKILL" in view.why
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 2")
+    desk.judged("done")
+    second = desk.session._background.pid
+    assert second not in (None, first)
+    # The process is kept for the next time.
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 3")
+    desk.judged("stopped", "done")
+    assert desk.session._background.pid == second
+
+
+def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with_the_judgement(
+    desk: Desk, record
+) -> None:
+    """Keeping an episode goes first, and the judgement comes to what it comes to without it."""
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
+    desk.judged("judging")
+    process, session = desk.session._background.pid, desk.session
+    session.keep_past((0,), before=True)
+    wait_until(
+        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "what was kept"
+    )
+    view = session.view()
+    assert view.recording.keeping.said.startswith("kept 1 episode") and not view.recording.keeping.failed
+    assert view.judgement.state == "judging", "it has not ended meanwhile"
+    desk.note()
+    assert desk.judged("judging").done < view.judgement.total
+    session.keep_past((1,), before=True)
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 3")
+    rewards = np.array([moment.step.reward for moment in steps_of(record)])
+    assert desk.judged().stopped_by is None
+    wait_until(
+        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "the second"
+    )
+    assert not session.view().recording.keeping.failed
+    for env in range(N):
+        np.testing.assert_array_equal(session.judge.curve("reward", env).new, 3 * rewards[:, env])
+    assert session._background.pid == process

@@ -1,0 +1,74 @@
+"""Where two recordings part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.drive.episodes import BODY, geometry_of, made, poses_of
+from workbench.session.review.compare import ARM, Difference, difference, distances, source_changes
+
+
+def parts_at(found: Difference) -> int | None:
+    assert found.bodies is not None
+    return found.bodies.position
+
+
+def test_the_first_body_that_moves_elsewhere_and_when() -> None:
+    a, b = made(10), made(10)
+    poses_of(b)[6:, BODY["arm/hand"], 2] += 0.02
+    poses_of(b)[8:, BODY["cube"], 1] += 0.5
+    b.evaluate["success"][9:] = True
+    b.reward[3:] *= 2
+    found = difference(a, b, (0, 0))
+    assert found.bodies is not None and found.bodies.position == 6 and found.body == "arm/hand"
+    assert "2 cm" in found.bodies.first and "50 cm (cube)" in found.bodies.most
+    differing = [(p.name, p.position) for p in found.numbers if p.position is not None]
+    assert differing == [("reward", 4), ("success", 9)]
+    reward = found.numbers[0]
+    assert reward.first == "4 → 8" and reward.whole == "55 → 104"
+    assert found.same_seed and found.same_source and not found.source
+    assert parts_at(difference(a, b, (0, 0), tolerance=0.1)) == 8
+
+
+def test_nothing_differs_from_itself() -> None:
+    found = difference(made(10), made(10), (0, 0))
+    assert found.bodies is not None and found.bodies.position is None
+    assert all(p.position is None for p in found.numbers)
+
+
+def test_is_compared_as_they_are_aligned() -> None:
+    """The same motion, begun three states later: equal once the two are aligned at it."""
+    a, b = made(10), made(13)
+    poses_of(b)[:, BODY["cube"], 0] = np.maximum(np.arange(14) - 3, 0) * 0.01
+    assert parts_at(difference(a, b, (0, 0))) == 1
+    found = difference(a, b, (0, 3))
+    assert parts_at(found) is None and (found.begin, found.compared) == (0, 11)
+
+
+def test_other_bodies_lengths_and_entries_are_said() -> None:
+    a, b = made(10), made(4)
+    b.geometry = replace(geometry_of(b), body_names=("ground", "table", "arm/hand", "box"), visuals=())
+    del b.evaluate["distance"]
+    b.action = np.zeros((4, 3), np.float32)
+    found = difference(a, b, (0, 0))
+    assert found.not_in_both == ("cube (only in A)", "box (only in B)") and found.compared == 5
+    said = {p.name: p.first for p in found.numbers}
+    assert said["distance"] == "only in A" and said["action"] == "shape (2,) → (3,)"
+    b.geometry = None
+    assert difference(a, b, (0, 0)).bodies is None
+
+
+def test_turning_counts_and_either_sign_of_a_quaternion_is_the_same() -> None:
+    still, turned = np.array([0, 0, 0, 1, 0, 0, 0.0]), np.array([0, 0, 0, np.cos(0.1), np.sin(0.1), 0, 0])
+    assert np.isclose(distances(still, turned), 0.2 * ARM)
+    assert distances(still, -still) == 0
+    lacking = np.full(7, np.nan)
+    assert distances(still, lacking) == np.inf and distances(lacking, lacking) == 0
+
+
+def test_the_lines_that_changed() -> None:
+    ((name, lines),) = source_changes({"/old/push.py": "a\nb\nc\n"}, {"/new/push.py": "a\nB\nc\n"})
+    assert name == "push.py"
+    assert ("del", "-b") in lines and ("add", "+B") in lines and ("same", " a") in lines

@@ -1,0 +1,92 @@
+"""Scenes of ManiSkill's own recordings, made again by a process of their own: against the env that was recorded."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (registers the tasks)
+import numpy as np
+import pytest
+from mani_skill.utils.wrappers.record import RecordEpisode
+from numpy.typing import NDArray
+
+from workbench.core.scene.scene_index import read_poses, scene_index
+from workbench.recording.episode.episode import Episode
+from workbench.recording.reader.read_episode import read_maniskill
+from workbench.session.process.job_lane import Stopped
+from workbench.session.review.recorded_scene import SceneError, SceneProcess
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def recorded(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, list[NDArray[np.float32]], tuple[str, ...]]:
+    """The .h5 of two episodes, the poses of all bodies in each, and the names of the bodies."""
+    folder = tmp_path_factory.mktemp("theirs")
+    env: Any = gym.make("PushCube-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
+    env = RecordEpisode(env, str(folder), save_video=False, record_env_state=True)
+    env.action_space.seed(0)
+    base: Any = env.unwrapped
+    poses, names = [], ()
+    for seed in (4, 5):
+        env.reset(seed=seed)
+        names = scene_index(base).names
+        track = [read_poses(base)[0]]
+        for _ in range(STEPS):
+            env.step(env.action_space.sample())
+            track.append(read_poses(base)[0])
+        poses.append(np.stack(track))
+    env.close()
+    return next(folder.glob("*.h5")), poses, names
+
+
+def make(episodes: dict[int, Episode], files: tuple[Path, ...] = (), stop: bool = False) -> dict[int, Any]:
+    said: list[str] = []
+
+    def check() -> None:
+        if stop:
+            raise Stopped
+
+    made = SceneProcess(files)([*episodes.values()], check, lambda _, words: said.append(words))
+    ended: dict[int, Any] = {}
+    with suppress(Stopped):
+        for key, scene in zip(episodes, made, strict=True):
+            ended[key] = scene if isinstance(scene, SceneError) else scene[0]
+    assert said
+    return ended
+
+
+def test_has_every_body_where_it_was(recorded: Any) -> None:
+    file, poses, names = recorded
+    episodes = {k: read_maniskill(file, f"traj_{k}") for k in (0, 1)}
+    assert episodes[0].geometry is None
+    lost = Episode(**vars(read_maniskill(file, "traj_0")))
+    lost.info = type(lost.info)(**{**vars(lost.info), "task": "NobodyHasThis-v1"})
+    ended = make({**episodes, 2: lost})
+    for key, track in enumerate(poses):
+        made = ended[key]
+        assert made.geometry.num_envs == 1 and len(made.geometry.visuals) > 10
+        rows = [made.geometry.body_names.index(name) for name in names]
+        assert made.poses.shape == (STEPS + 1, len(made.geometry.body_names), 7)
+        assert np.abs(made.poses[:, rows, :3] - track[..., :3]).max() < 1e-5
+    assert isinstance(ended[2], SceneError)
+    assert "no env NobodyHasThis-v1" in str(ended[2]) and "--task FILE" in str(ended[2])
+
+
+def test_stops_when_it_is_told(recorded: Any) -> None:
+    assert make({0: read_maniskill(recorded[0], "traj_0")}, stop=True) == {}
+
+
+def test_what_the_process_sends_and_cannot_be_read_is_told(recorded: Any, tmp_path: Path) -> None:
+    file = tmp_path / "sends.py"
+    file.write_text("import os, sys, time\nos.write(int(sys.argv[1]), b'print(1)\\n')\ntime.sleep(3600)\n")
+    ended = make({0: read_maniskill(recorded[0], "traj_0")}, (file,))
+    assert isinstance(ended[0], SceneError)
+    assert "sent what cannot be read (it says that it is 1886546286 bytes long)" in str(ended[0])

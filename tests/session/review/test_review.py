@@ -1,0 +1,370 @@
+"""Opened recordings and the one position that they share: opening, playing, aligning, files that change."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.episodes import made, poses_of, write
+from tests.drive.waiting import until
+from workbench.core.scene.shapes import SharedShapes
+from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.library.library import Library
+from workbench.session.protocol.messages import CameraRequest
+from workbench.session.review.events import ACTION, TERMS, curves, happenings, success_words
+from workbench.session.review.pictures import PictureReader
+from workbench.session.review.review import MOST_OPEN, Review
+from workbench.session.review.view import ReviewView, column_at
+
+
+@dataclass(frozen=True)
+class Row:
+    id: str
+    paths: tuple[Path, ...] = ()
+    kind: str = "workbench"
+    trajectory: str | None = None
+    date: datetime | None = None
+
+    @property
+    def name(self) -> str:
+        return f"file {self.id}"
+
+
+@dataclass
+class Shelf:
+    """Recordings in memory, by id; what is an exception is raised when it is read."""
+
+    episodes: dict[str, Episode | Exception]
+    now: float = 0.0
+    extra: dict[str, tuple[Path, ...]] = field(default_factory=dict)
+
+    def rows(self) -> list[Row]:
+        return [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
+
+    def read(self, row: Row, shapes: SharedShapes) -> Episode:
+        found = self.episodes[row.id]
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def clock(self) -> float:
+        return self.now
+
+
+def _date(episode: Episode | Exception) -> datetime | None:
+    written = "" if isinstance(episode, Exception) else episode.info.written_at
+    return datetime.fromisoformat(written) if written else None
+
+
+def review_of(**episodes: Episode | Exception) -> tuple[Review, Shelf]:
+    shelf = Shelf(episodes)
+    return Review(shelf, shelf.read, clock=shelf.clock), shelf  # type: ignore[arg-type]
+
+
+def reach(review: Review, reached: Callable[[ReviewView], bool], what: str) -> ReviewView:
+    until(lambda: reached(review.view()), what, seen=review.view)
+    return review.view()
+
+
+def opened(review: Review, *ids: str) -> ReviewView:
+    review.open(ids)
+    return reach(
+        review, lambda view: [o.id for o in view.opened] == list(ids) and not view.loading, "opening"
+    )
+
+
+def test_plays_at_the_control_rate_and_stops_at_the_end() -> None:
+    review, shelf = review_of(a=made(10))
+    assert opened(review, "a").last == 10
+    review.toggle_play()
+    shelf.now += 0.26
+    assert review.view().position == 5 and review.view().playing
+    review.set_speed(2.0)
+    shelf.now += 0.11
+    assert review.view().position == 9
+    shelf.now += 10
+    view = review.view()
+    assert view.position == 10 and not view.playing
+    review.toggle_play()
+    assert review.view().position == 0, "from the end it begins anew"
+    review.set_loop(True)
+    shelf.now += 0.05 * 11 / 2 + 1e-3
+    assert review.view().position == 0 and review.view().playing
+
+
+def test_goes_frame_by_frame_and_from_event_to_event() -> None:
+    review, _ = review_of(a=made(10, success_from=7))
+    opened(review, "a")
+    review.seek_by(1)
+    assert review.view().position == 1
+    review.seek_event(1)
+    assert review.view().position == 7
+    review.seek_event(1)
+    assert review.view().position == 10, "the end is where the last jump leads"
+    review.seek_event(-1)
+    review.seek_event(-1)
+    assert review.view().position == 0
+    review.seek(10**9)
+    assert review.view().position == 10
+
+
+def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
+    review, _ = review_of(a=made(10, success_from=7), b=made(6, success_from=2), c=made(4))
+    view = opened(review, "a", "b", "c")
+    assert view.states == (0, 0, 0)
+    review.seek(5)
+    review.align("first success")
+    view = review.view()
+    assert view.states == (5, 0, 0), "what is shown of the selected one stays"
+    assert (view.first, view.last) == (-7, 4)
+    review.seek(0)
+    assert review.view().states == (7, 2, 0)
+    review.seek(2)
+    assert review.view().states == (9, 4, 2)
+    with pytest.raises(ValueError, match="align"):
+        review.align("first kiss")
+    review.close_one(0)
+    assert [o.id for o in review.view().opened] == ["b", "c"]
+    assert review.view().align == "first success"
+    review.close_one(0)
+    review.close_one(0)
+    assert review.view().opened == () and review.view().states == ()
+    review.toggle_play()
+    review.seek_by(1)
+    review.seek_event(1)
+
+
+def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "workbench.session.review.review.FIRST_SHOWN", 0.0
+    )  # it is seen before the other is read
+    review, _ = review_of(
+        new=made(4, written_at="2026-11-22T10:00:00+00:00"),
+        old=made(6, written_at="2026-11-21T10:00:00+00:00"),
+    )
+    review.open(["new", "old"])
+    view = reach(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
+    assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
+    review.select(1)
+    review.seek(3)
+    review.exchange(0, 1)
+    view = review.view()
+    assert [one.id for one in view.opened] == ["new", "old"]
+    assert view.chosen is not None and view.chosen.id == "new" and view.states == (3, 3)
+    review.exchange(0, 7)
+    assert [one.id for one in review.view().opened] == ["new", "old"]
+
+
+def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
+    review, _ = review_of(
+        a=made(3),
+        b=UnreadableRecording("it is a picture of a cat"),
+        c=ZeroDivisionError("oh"),
+        d=OSError("gone"),
+    )
+    review.open(["a", "b", "c", "d", "e"])
+    view = reach(review, lambda view: bool(view.opened) and not view.loading, "the one that can be read")
+    assert [o.id for o in view.opened] == ["a"]
+    said = " ".join(view.problems)
+    assert (
+        "file b: it is a picture of a cat" in said
+        and "ZeroDivisionError: oh" in said
+        and "file d: gone" in said
+    )
+    assert "not in the folder any more" in said
+    review.open(["b"])
+    view = reach(review, lambda view: not view.loading and len(view.problems) == 1, "its problem")
+    assert [o.id for o in view.opened] == ["a"], "what was open stays"
+
+
+def test_more_than_can_be_open_are_left_out_with_a_word() -> None:
+    review, _ = review_of(**{f"e{i}": made(2) for i in range(MOST_OPEN + 3)})
+    review.open([f"e{i}" for i in range(MOST_OPEN + 3)])
+    view = reach(review, lambda view: bool(view.opened), "opening")
+    assert len(view.opened) == MOST_OPEN and f"At most {MOST_OPEN}" in view.problems[0]
+
+
+def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
+    shelf, held = Shelf({f"e{i}": made(2) for i in range(6)}), []
+
+    def read(row: Row, shapes: SharedShapes) -> Episode:
+        held.append(64 * 2**20)
+        return shelf.read(row, shapes)
+
+    review = Review(
+        shelf,  # type: ignore[arg-type]
+        read,  # type: ignore[arg-type]
+        clock=shelf.clock,
+        most_bytes=100 * 2**20,
+        memory=lambda: 2**30 + sum(held),  # that of this process is of all tests before, and may fall
+    )
+    review.open([f"e{i}" for i in range(6)])
+    view = reach(review, lambda v: bool(v.problems) and not v.loading, "the word for it")
+    assert len(view.opened) == 2 == len(held)
+    assert "and 3 more were not opened: those before take 100 MB" in view.problems[0]
+    review.close()
+
+
+def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
+    changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
+    changed.write_text("1")
+    gone.write_text("1")
+    review, shelf = review_of(a=made(3))
+    shelf.extra["a"] = (changed, gone)
+    opened(review, "a")
+    shelf.now += 10
+    review.look_at_files()
+    assert review.view().problems == ()
+    changed.write_text("another")
+    gone.unlink()
+    shelf.now += 10
+    review.look_at_files()
+    said = " ".join(review.view().problems)
+    assert "a.rrd has changed" in said and "a.h5 was deleted" in said
+    assert len(review.view().opened) == 1
+
+
+def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.review.review.FIRST_SHOWN", 0.0)
+    review, shelf = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
+    reached, go_on = threading.Event(), threading.Event()
+
+    def read(row: Row, shapes: SharedShapes) -> Episode:
+        if row.id == "d":
+            reached.set()
+            assert go_on.wait(60)
+        return shelf.read(row, shapes)
+
+    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    review.open("abcde", state=4)
+    assert reached.wait(60)
+    view = reach(review, lambda view: len(view.opened) == 3, "the first three")
+    assert view.loading == "opening 4 of 5: file d" and view.position == 4
+    review.select(1)
+    review.seek(15)
+    review.toggle_play()
+    review.close_one(0)
+    view = review.view()
+    assert [o.id for o in view.opened] == ["b", "c"] and view.selected == 0
+    review.seek(15)
+    review.toggle_play()
+    go_on.set()
+    view = reach(review, lambda view: not view.loading, "the others")
+    assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
+    assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
+    assert "first success" in view.alignments
+
+
+def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.review.review.FIRST_SHOWN", 0.0)
+    shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
+    reached, go_on = threading.Event(), threading.Event()
+
+    def read(row: Row, shapes: SharedShapes) -> Episode:
+        if row.id == "b":
+            reached.set()
+            assert go_on.wait(60)
+        return shelf.read(row, shapes)
+
+    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    before = set(threading.enumerate())
+    review.open("ab")
+    assert reached.wait(60)
+    (first,) = set(threading.enumerate()) - before
+    opened(review, "c")
+    go_on.set()
+    first.join(60)
+    assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
+
+
+def test_waits_for_the_next_position_while_it_plays() -> None:
+    _, shelf = review_of(a=made(100))
+    real = Review(shelf, shelf.read)  # type: ignore[arg-type]
+    opened(real, "a")
+    real.toggle_play()
+    seen = real.view()
+    serial = real.wait(seen.serial, timeout=30.0)
+    assert serial > seen.serial and real.view().position > seen.position
+
+
+def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: None, tmp_path: Path) -> None:
+    write(tmp_path, made(4, success_from=3))
+    library = Library(tmp_path)
+    library.refresh()
+    review = Review(library)
+    view = opened(review, library.rows()[0].id)
+    one = view.opened[0]
+    assert one.has_scene and one.length == 4 and one.first("success") == 3
+    assert np.allclose(poses_of(one.episode)[:, 3, 0], np.arange(5) * 0.01)
+    reader = PictureReader()
+    assert [camera.modalities for camera in reader.cameras(one.episode)] == [("rgb", "depth", "segmentation")]
+    wanted = (CameraRequest("base_camera", "sensor", ("rgb", "depth")),)
+    seen = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
+    assert seen.rgb is not None and seen.depth is not None
+    assert abs(int(seen.rgb.mean()) - 40) <= 2 and np.allclose(seen.depth, 0.2) and seen.segmentation is None
+    again = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
+    assert again is seen, "the same state is not decoded again"
+    library.close()
+
+
+def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) -> None:
+    """Without its .rrd there is neither scene nor picture; with half of one a sentence."""
+    half = write(tmp_path, made(4, seed=1))
+    half.with_suffix(".rrd").unlink()
+    broken = write(tmp_path, made(4, seed=2))
+    rrd = broken.with_suffix(".rrd")
+    rrd.write_bytes(b"RRF2" + b"\0" * 1000)
+    broken.with_suffix(".h5").write_bytes(b"")
+    library = Library(tmp_path)
+    library.refresh()
+    rows = {row.seed: row for row in library.rows()}
+    review = Review(library)
+    review.open([rows[1].id, rows[2].id])
+    view = reach(review, lambda view: bool(view.opened) and not view.loading, "the half one")
+    assert [o.id for o in view.opened] == [rows[1].id]
+    assert not view.opened[0].has_scene and view.opened[0].length == 4
+    reach(review, lambda view: "no scene" in view.opened[0].scene, "the word for it")
+    assert len(view.problems) == 1 and rows[2].name in view.problems[0]
+    library.close()
+
+
+def test_events_and_curves_of_an_episode() -> None:
+    episode = made(10, success_from=4)
+    episode.evaluate["grasped"] = np.array([0, 0, 1, 1, 0, 0, 1, 0, 0, 0, np.nan])
+    episode.reward[8] = np.nan
+    found = [(h.state, h.name) for h in happenings(episode)]
+    assert found == [
+        (0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped"), (9, "reward is NaN or infinite"),
+    ]  # fmt: skip
+    lines = curves(episode)
+    assert list(lines[ACTION]) == ["arm/joint1", "gripper"] and list(lines[TERMS]) == ["reach"]
+    states, values = lines["reward"]["reward"]
+    assert states[0] == 1 and values[0] == 1
+    assert success_words(episode) == ("success", "good")
+    assert success_words(made(3)) == ("no success", "bad")
+
+
+@given(
+    length=st.integers(0, 30),
+    anchor=st.integers(0, 30),
+    first=st.integers(-40, 0),
+    last=st.integers(0, 40),
+)
+def test_a_line_over_positions_has_each_number_at_its_place(
+    length: int, anchor: int, first: int, last: int
+) -> None:
+    states = np.arange(length + 1)
+    axis = np.arange(first, last + 1)
+    line = column_at(states, states.astype(np.float64) * 1.5, anchor, axis)
+    for place, value in zip(axis, line, strict=True):
+        state = place + anchor
+        assert value == state * 1.5 if 0 <= state <= length else np.isnan(value)

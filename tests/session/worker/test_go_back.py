@@ -1,0 +1,148 @@
+"""Going back to a moment: lived up to again to the last byte, and put there where that does not come out."""
+
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from workbench.authoring.loading.load import load_task
+from workbench.core.env import actions
+from workbench.core.snapshots.snapshot import Snapshot
+from workbench.jobs.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
+from workbench.jobs.task import TaskOptions
+from workbench.session.protocol.messages import Restore, WayBack
+from workbench.session.worker import go_back
+
+N = 3
+T = 12
+
+
+class Lived:
+    """A humanoid's fall: what was, moment by moment."""
+
+    def __init__(self, opened: OpenedTask) -> None:
+        self.opened, self.told = opened, []
+        task, rng = opened.env, np.random.default_rng(0)
+        reset_checked(task, opened.loaded, 2)
+        self.snapshots: list[Snapshot] = [task.snapshot()]
+        self.actions: list[np.ndarray] = []
+        self.packs: list[list[bytes]] = [self.packed()]
+        for _ in range(2 * T):
+            self.step(actions.random_action(task.parts, N, rng))
+            self.snapshots.append(task.snapshot())
+
+    def packed(self) -> list[bytes]:
+        scene: Any = self.opened.env.env.scene
+        return list(scene.px.packs())
+
+    def step(self, action: np.ndarray) -> None:
+        step_checked(self.opened.env, self.opened.loaded, action)
+        self.actions.append(action)
+        self.packs.append(self.packed())
+
+    def back(
+        self, moment: int, begins: dict[int, int], source: dict[int, int] | None = None
+    ) -> go_back.Restored:
+        """To `moment`, from where each env begins."""
+        source = source or {i: i for i in begins}
+        ways = {
+            i: WayBack(at, source[i], np.stack([a[source[i]] for a in self.actions[at:moment]]))
+            for i, at in begins.items()
+        }
+        starts = {at: pickle.dumps(self.snapshots[at]) for at in set(begins.values())}
+        request = Restore(
+            pickle.dumps(self.snapshots[moment]),
+            tuple(begins),
+            tuple(source.values()),
+            moment,
+            None,
+            ways,
+            starts,
+        )
+        self.told.clear()
+        return go_back.go_back(self.opened, request, lambda *done: self.told.append(done))[1]
+
+
+@pytest.fixture(scope="module")
+def lived() -> Iterator[Lived]:
+    options = TaskOptions(num_envs=N, env_kwargs={"obs_mode": "state", "render_backend": "none"})
+    opened = build_task(
+        load_task("MS-HumanoidStand-v1"), options, Opening(on_finding=lambda finding: None, begins_anew=True)
+    )
+    yield Lived(opened)
+    opened.env.close()
+
+
+def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: Lived) -> None:
+    did = lived.back(T, dict.fromkeys(range(N), 0))
+    assert did.lived_through == tuple(range(N)) and not did.not_carried
+    assert did.how == f"{T} steps were made again, and every body is where it was, to the last bit."
+    assert lived.told == [(done, T) for done in range(1, T + 1)]
+    assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N
+    for after in range(T, 2 * T):
+        assert lived.packed() == lived.packs[after]
+        step_checked(lived.opened.env, lived.opened.loaded, lived.actions[after])
+    assert lived.packed() == lived.packs[2 * T]
+
+
+def test_one_env_alone_and_as_another_while_the_others_notice_nothing(lived: Lived) -> None:
+    before = lived.packed()
+    did = lived.back(T, {1: 0}, {1: 2})
+    assert did.lived_through == (1,)
+    now = lived.packed()
+    assert now[1] == lived.packs[T][2]
+    assert [now[0], now[2]] == [before[0], before[2]]
+
+
+def test_ways_of_several_lengths_end_together(lived: Lived) -> None:
+    """Moment T put there is an exact point: what follows it is another run, and repeats itself."""
+    go_back.go_back(
+        lived.opened, Restore(pickle.dumps(lived.snapshots[T]), (0,), (0,), T), lambda *done: None
+    )
+    middle = lived.opened.env.snapshot()
+    assert lived.back(T, {1: 0, 2: 0}).lived_through == (1, 2)
+    for after in range(T, T + 3):
+        step_checked(lived.opened.env, lived.opened.loaded, lived.actions[after])
+    wanted, end = lived.packed(), lived.opened.env.snapshot()
+    ways = {
+        0: WayBack(100, 0, np.stack([a[0] for a in lived.actions[T : T + 3]])),
+        1: WayBack(0, 1, np.stack([a[1] for a in lived.actions[: T + 3]])),
+        2: WayBack(0, 2, np.stack([a[2] for a in lived.actions[: T + 3]])),
+    }
+    starts = {100: pickle.dumps(middle), 0: pickle.dumps(lived.snapshots[0])}
+    every = tuple(range(N))
+    request = Restore(pickle.dumps(end), every, every, 0, None, ways, starts)
+    _, did = go_back.go_back(lived.opened, request, lambda *done: None)
+    assert did.lived_through == every and lived.packed() == wanted
+
+
+def test_where_it_does_not_come_out_the_moment_is_put_there(lived: Lived) -> None:
+    kept = lived.actions[3]
+    lived.actions[3] = kept * np.array([[1.0], [0.5], [1.0]], np.float32)  # as an edited hook would
+    try:
+        did = lived.back(T, dict.fromkeys(range(N), 0))
+    finally:
+        lived.actions[3] = kept
+    assert did.lived_through == (0, 2) and "in 2 of 3 envs" in did.how
+    wanted, now = lived.packs[T], lived.packed()
+    assert [now[0], now[2]] == [wanted[0], wanted[2]]
+    np.testing.assert_allclose(
+        np.frombuffer(now[1], np.float32), np.frombuffer(wanted[1], np.float32), atol=1e-6
+    )
+
+
+def test_a_way_that_takes_too_long_is_given_up(lived: Lived, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(go_back, "MOST_SECONDS", 0.0)
+    did = lived.back(T, dict.fromkeys(range(N), 0))
+    assert did.lived_through == () and did.how == "" and len(lived.told) == 1
+    np.testing.assert_allclose(
+        np.frombuffer(b"".join(lived.packed()), np.float32),
+        np.frombuffer(b"".join(lived.packs[T]), np.float32),
+        atol=1e-6,
+    )

@@ -1,0 +1,92 @@
+"""Moments of the past lived through again by the code that a worker has, to the last bit."""
+
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.drive.session import TASKS
+from workbench.authoring.loading.load import load_task
+from workbench.core.env import actions
+from workbench.core.env.step_result import StepResult
+from workbench.jobs.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
+from workbench.jobs.task import TaskOptions
+from workbench.session.protocol.questions import Judged, JudgeMoments, MomentToJudge
+from workbench.session.worker.go_back import judge_moments
+
+N = 3
+SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
+DRAWS = f'{SUCCESS} "noise": torch.rand(self.num_envs) + torch.randn(()),'
+"""By torch's own generator, which no env has to itself."""
+
+
+@pytest.fixture(scope="module")
+def draws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenedTask]:
+    file = tmp_path_factory.mktemp("draws") / "push_cube.py"
+    text = (TASKS / "push_cube.py").read_text()
+    assert SUCCESS in text
+    file.write_text(text.replace(SUCCESS, DRAWS))
+    options = TaskOptions(N, "cpu", 0, {"render_backend": "none"})
+    opening = Opening(on_finding=lambda finding: None, begins_anew=True)
+    opened = build_task(load_task(str(file)), options, opening)
+    yield opened
+    opened.env.close()
+
+
+class Record:
+    """A session's record: a reset of all, steps, and resets of some of them in between."""
+
+    def __init__(self, opened: OpenedTask) -> None:
+        task, rng = opened.env, np.random.default_rng(0)
+        self.moments: list[MomentToJudge] = []
+        self.steps: list[StepResult] = []
+
+        def jump(step: StepResult, envs: tuple[int, ...]) -> None:
+            self.moments.append(MomentToJudge(None, pickle.dumps(task.snapshot()), envs))
+            self.steps.append(step)
+
+        jump(reset_checked(task, opened.loaded, 5), tuple(range(N)))
+        for envs in ((1,), (0, 2), (1,), ()):
+            for _ in range(4):
+                action = actions.random_action(task.parts, N, rng)
+                self.steps.append(step_checked(task, opened.loaded, action))
+                self.moments.append(MomentToJudge(action))
+            if envs:
+                jump(reset_checked(task, opened.loaded, [90 + i for i in envs], envs), envs)
+
+
+def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_the_last_bit(
+    draws: OpenedTask,
+) -> None:
+    """Also behind a reset of some envs, at which nobody's generator is put back but those envs' own."""
+    record = Record(draws)
+    made = [step for moment, step in zip(record.moments, record.steps, strict=True) if not moment.snapshot]
+    assert len({step.evaluate["noise"].tobytes() for step in made}) == len(made) == 16
+    for _ in range(2):
+        step_checked(draws.env, draws.loaded, np.zeros((N, 8), np.float32))  # it draws on meanwhile
+        judged = judge_moments(draws, JudgeMoments(tuple(record.moments)))
+        assert judged.problem is None and judged.not_carried == {}
+        for moment, was, now in zip(record.moments, record.steps, judged.steps, strict=True):
+            np.testing.assert_array_equal(now.poses, was.poses)
+            if moment.snapshot is None:
+                np.testing.assert_array_equal(now.evaluate["noise"], was.evaluate["noise"])
+                np.testing.assert_array_equal(now.reward, was.reward)
+
+
+def test_in_pieces_it_comes_to_what_it_comes_to_at_once(draws: OpenedTask) -> None:
+    record = Record(draws)
+    whole = judge_moments(draws, JudgeMoments(tuple(record.moments)))
+    pieces: list[Judged] = [
+        judge_moments(draws, JudgeMoments(tuple(record.moments[at : at + 3])))
+        for at in range(0, len(record.moments), 3)
+    ]
+    parts = [step for piece in pieces for step in piece.steps]
+    for one, other in zip(whole.steps, parts, strict=True):
+        for name in one.evaluate:
+            np.testing.assert_array_equal(one.evaluate[name], other.evaluate[name])
+        np.testing.assert_array_equal(one.reward, other.reward)

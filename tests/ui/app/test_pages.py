@@ -1,0 +1,121 @@
+"""The live page and the review on one server, swapped over and over; nothing is left behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import viser
+
+from tests.drive.episodes import begin, made, write
+from tests.drive.panels import Panels, held_by
+from tests.drive.session import wait_until
+from tests.drive.waiting import until
+from tests.ui.tabs import tabs_of
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+from workbench.ui.app.workplace import Workplace
+from workbench.ui.server.gated_server import Door
+
+SWAPS = 20
+
+
+@pytest.fixture
+def server(door: Door) -> viser.ViserServer:
+    """Of the pages that are swapped."""
+    return door.server
+
+
+def no_session(task: object, options: object) -> Session:
+    raise AssertionError("nobody goes live from a recording")
+
+
+@pytest.fixture
+def place(
+    child_process: None, tmp_path: Path, door: Door, scripted_session: Callable[..., Session]
+) -> Iterator[Workplace]:
+    write(tmp_path, made(5))
+    place = Workplace(door, tmp_path, no_session, TaskOptions(), scripted_session(2))
+    yield place
+    place.close()
+
+
+@pytest.mark.slow
+def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
+    place: Workplace, door: Door, server: viser.ViserServer, panels: Panels
+) -> None:
+    session = place.session
+    assert session is not None
+    place.pages.start("live")
+    session.play()
+    seen: dict[str, list[dict[str, int]]] = {"live": [], "review": []}
+    threads: list[int] = []
+    for number in range(SWAPS):
+        which = "review" if number % 2 == 0 else "live"
+        place.pages.show(which)
+        assert place.pages.wait_for(which, timeout=60)
+        with tabs_of(door.url) as tabs:
+            tab = tabs.open()
+            until(lambda tab=tab: tab.open and panels.html("wb-status"), f"the {which} page, drawn")
+            if number < 4 or number >= SWAPS - 2:
+                seen[which].append(drawn_whole(server))
+        threads.append(threading.active_count())
+    for found in seen.values():
+        for name, count in found[-1].items():
+            assert count <= found[1][name] + (40 if name == "messages" else 0), (name, found)
+    assert max(threads[4:]) <= max(threads[:4])
+    before = session.view().step_serial
+    wait_until(session, lambda view: view.step_serial > before, "a step of the env that plays on")
+
+
+def drawn_whole(server: viser.ViserServer) -> dict[str, int]:
+    """What it holds once nothing more comes: some parts are drawn moments after the page."""
+    looks: list[dict[str, int]] = []
+
+    def unchanged() -> bool:
+        looks.append(held_by(server))
+        time.sleep(0.5)
+        return len(looks) > 1 and {**looks[-1], "messages": 0} == {**looks[-2], "messages": 0}
+
+    until(unchanged, "a page that is drawn whole", seen=lambda: looks)
+    return looks[-1]
+
+
+def test_an_episode_whose_writer_was_killed_is_mended_and_said(
+    child_process: None, tmp_path: Path, door: Door
+) -> None:
+    begin(tmp_path, made(5, seed=8))
+    place = Workplace(door, tmp_path, no_session, TaskOptions())
+    place.pages.start("review")
+    try:
+        until(lambda: "can be seen again" in " ".join(place.shelf.review.view().problems), "the word for it")
+        until(lambda: [row.seed for row in place.shelf.library.rows()] == [8], "its row")
+    finally:
+        place.close()
+
+
+def test_serving_the_pages_needs_no_simulator(child_process: None) -> None:
+    said = subprocess.run(
+        [sys.executable, "-c", "import sys, workbench.cli.page; print(*sys.modules)"],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.split()
+    assert not {"torch", "sapien", "mani_skill"} & set(said)
+
+
+def test_what_is_open_in_the_review_is_open_when_one_comes_back(place: Workplace) -> None:
+    place.pages.start("review")
+    review, library = place.shelf.review, place.shelf.library
+    library.refresh()
+    review.open([library.rows()[0].id])
+    place.pages.show("live")
+    assert place.pages.wait_for("live", timeout=60)
+    place.pages.show("review")
+    assert place.pages.wait_for("review", timeout=60)
+    assert place.shelf.review is review

@@ -1,0 +1,160 @@
+"""The window that asks whether code may run, on a real server without a browser."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+
+import pytest
+
+from tests.drive.panels import Panels
+from tests.drive.waiting import until
+from workbench.session.clearance import AskedFile, Consent, Since, TrustQuestion
+from workbench.ui.app import trust_dialog
+from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
+
+PUSH = AskedFile("/home/me/push.py", "0123456789ab", "import helper\n")
+HELPER = AskedFile("helper.py", "ba9876543210", "A = 1\n")
+PLAIN = TrustQuestion("Push-v1", False, (PUSH, HELPER))
+
+
+def about(name: str) -> TrustQuestion:
+    return replace(PLAIN, files=(replace(PUSH, name=name),))
+
+
+def asked(
+    dialog: TrustDialog, question: TrustQuestion = PLAIN, stopped: Callable[[], bool] = lambda: False
+) -> Future[Consent]:
+    """Ask on a thread of its own, as whatever wants to run code does."""
+    future: Future[Consent] = Future()
+    threading.Thread(target=lambda: future.set_result(dialog.ask(question, stopped)), daemon=True).start()
+    return future
+
+
+def window_with(panels: Panels, text: str) -> None:
+    until(lambda: text in panels.html() and panels.shows(ALWAYS), f"the window with {text}")
+
+
+@pytest.fixture
+def dialog(panels: Panels) -> TrustDialog:
+    return TrustDialog(panels.server)
+
+
+@pytest.mark.parametrize(
+    ("label", "answer"), [(DO_NOT, Consent.NO), (ONCE, Consent.ONCE), (ALWAYS, Consent.ALWAYS)]
+)
+def test_a_press_is_the_answer_and_the_window_goes(
+    dialog: TrustDialog, panels: Panels, label: str, answer: Consent
+) -> None:
+    future = asked(dialog)
+    window_with(panels, "/home/me/push.py")
+    panels.press(label)
+    assert future.result(20) is answer
+    assert not panels.shows(label) and panels.html() == ""
+    assert panels.commands() == [], "Escape is free again"
+
+
+def test_only_the_first_answer_counts_and_none_comes_before_its_question(
+    dialog: TrustDialog, panels: Panels
+) -> None:
+    future = asked(dialog)
+    window_with(panels, "/home/me/push.py")
+    refuse, allow, allow_again = (panels.press_late(label) for label in (DO_NOT, ALWAYS, ALWAYS))
+    refuse()
+    allow()
+    assert future.result(20) is Consent.NO
+    second = asked(dialog, about("/home/me/other.py"))
+    window_with(panels, "/home/me/other.py")
+    allow_again()
+    assert not second.done()
+    panels.press(DO_NOT)
+    assert second.result(20) is Consent.NO
+
+
+def test_escape_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
+    future = asked(dialog)
+    window_with(panels, "/home/me/push.py")
+    panels.command(DO_NOT)
+    assert future.result(20) is Consent.NO
+
+
+def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:
+    futures = {name: asked(dialog, about(name)) for name in ("a.py", "b.py", "c.py")}
+    order = []
+    for _ in futures:
+        (name,) = until(lambda: [name for name in futures if name in panels.html()], "the next question")
+        order.append(name)
+        window_with(panels, name)
+        panels.press(ONCE)
+        assert futures[name].result(20) is Consent.ONCE
+    assert set(order) == set(futures)
+
+
+def test_a_page_that_is_rebuilt_shows_the_question_again(dialog: TrustDialog, panels: Panels) -> None:
+    future = asked(dialog)
+    window_with(panels, "/home/me/push.py")
+    with panels.server.atomic():
+        panels.server.gui.reset()
+    window_with(panels, "/home/me/push.py")
+    panels.press(ONCE)
+    assert future.result(20) is Consent.ONCE
+
+
+def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
+    stop = threading.Event()
+    future = asked(dialog, PLAIN, stop.is_set)
+    window_with(panels, "/home/me/push.py")
+    stop.set()
+    assert future.result(20) is Consent.NO and not panels.shows(ALWAYS)
+    future = asked(dialog)
+    window_with(panels, "/home/me/push.py")
+    dialog.close()
+    assert future.result(20) is Consent.NO and asked(dialog).result(20) is Consent.NO
+
+
+def test_the_window_says_what_would_run_and_escapes_it() -> None:
+    many = tuple(AskedFile(f"m{k}.py", f"{k:012}", f"# {k}\n") for k in range(300))
+    evil = AskedFile("/w/<script>.py", "0123456789ab", "x = '</pre><script>alert(1)</script>\u202e'\n")
+    said = question_html(TrustQuestion("Push-v1", False, (evil, *many), ("<b>",)))
+    assert "<script>" not in said and "<b><" not in said and "&lt;script&gt;.py" in said
+    assert "&lt;/pre&gt;" in said and "\\u202e" in said, "the text, escaped"
+    assert all(one.name in said and one.hash in said and one.text in said for one in many)
+    assert "It imports from beside it (300)" in said and "trusted" not in said and "every save" not in said
+    held = (AskedFile("push.py", "0" * 12, ""), HELPER)
+    said = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
+    assert "&lt;i&gt;Push" in said and "hold the text of their task" in said
+    assert "what it may import (1)" in said and "It imports" not in said
+
+
+def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
+    other = AskedFile("new.py", "1" * 12, "", Since.NEW)
+    files = (PUSH, replace(HELPER, since=Since.CHANGED), other)
+    said = question_html(replace(PLAIN, files=files, trusted_before=True, gone=("old.py",)))
+    main, helper, new = said.split("<details>")[1:]
+    assert "wb-tag" not in main and ">changed<" in helper and ">new<" in new
+    assert "What has changed since is marked; gone since: old.py" in said
+    said = question_html(replace(PLAIN, trusted_before=True))
+    assert "Which of them has changed since is not known" in said
+
+
+def test_what_going_live_means_is_said_before() -> None:
+    said = question_html(replace(PLAIN, followed=True))
+    assert "every save of this file and of the modules beside it runs without asking" in said
+    assert "Judge again takes the file as it is" in said
+    assert "Its text may run already" in question_html(replace(PLAIN, followed=True, agreed=True))
+    assert "until the workbench ends" in ONCE
+
+
+def test_where_imports_are_computed_no_module_is_said_to_be_imported() -> None:
+    assert "it may import all that lies beside it (1)" in question_html(replace(PLAIN, computed=True))
+
+
+def test_what_of_a_text_is_not_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trust_dialog, "MOST_OF_ONE", 10)
+    monkeypatch.setattr(trust_dialog, "MOST_OF_ALL", 12)
+    said = question_html(PLAIN)
+    assert "The last 4 characters are not shown here: read the file itself" in said
+    assert "import hel" in said and "import help" not in said and "read the recording" not in said
+    assert "read the recording's .json" in question_html(replace(PLAIN, recorded_text=True))

@@ -1,0 +1,138 @@
+"""What the folders beside placing a camera say and show, without a page."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.ui.scenes import description, table_scene
+from workbench.core.camera_data import CameraInfo, CameraSettings
+from workbench.core.cameras.conventions import matrix_of, pose_of
+from workbench.core.cameras.report import ObjectToSee
+from workbench.session.cameras.view import StudioCamera
+from workbench.ui.cameras.compare import what_differs
+from workbench.ui.cameras.export import as_lists, file_name, matrices_html
+from workbench.ui.cameras.suggest import box_edges, choices_of
+from workbench.ui.widgets.inputs import Arrival
+
+SETTINGS = CameraSettings(
+    position=(0.3, 0.0, 0.6),
+    quaternion=(0.6, 0.0, 0.8, 0.0),
+    fov=math.pi / 2,
+    intrinsic=None,
+    width=128,
+    height=128,
+    near=0.01,
+    far=100.0,
+    shader_pack="minimal",
+)
+TURNED = np.array([1.0, 2.0, 3.0, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)], np.float32)
+"""A mount, turned by 90 degrees about z."""
+
+
+def camera(mount_pose: np.ndarray | None = None, mount: str = "panda/panda_hand") -> StudioCamera:
+    info = CameraInfo(
+        name="base_camera",
+        kind="sensor",
+        width=128,
+        height=128,
+        fovy=math.pi / 2,
+        near=0.01,
+        far=100.0,
+        intrinsic=np.eye(3, dtype=np.float32),
+        mount=None if mount_pose is None else mount,
+        modalities=("rgb",),
+        settings=SETTINGS,
+    )
+    return StudioCamera(("sensor", "base_camera"), info, SETTINGS, False, mount_pose)
+
+
+def test_two_placements_differ_by_how_far_and_how_much_they_were_turned() -> None:
+    assert what_differs(SETTINGS, SETTINGS) == []
+    half = math.radians(5) / 2
+    new = replace(SETTINGS, position=(0.3, 0.02, 0.6), quaternion=(math.cos(half), 0.0, math.sin(half), 0.0))
+    old = replace(SETTINGS, quaternion=(1.0, 0.0, 0.0, 0.0))
+    assert what_differs(old, new) == ["moved 20.0 mm", "turned 5.00°"]
+    # The same orientation, said by the opposite quaternion.
+    opposite = tuple(-number for number in SETTINGS.quaternion)
+    assert what_differs(SETTINGS, replace(SETTINGS, quaternion=opposite)) == []
+    assert what_differs(SETTINGS, replace(SETTINGS, fov=1.0, far=2.0, width=64)) == [
+        "fov 90.0° → 57.3°",
+        "128 × 128 → 64 × 128",
+        "far 100 → 2 m",
+    ]
+
+
+def test_the_box_of_the_bounds_has_four_edges_along_each_axis() -> None:
+    edges = box_edges((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    assert edges.shape == (12, 2, 3)
+    assert sorted(np.abs(edges[:, 0] - edges[:, 1]).sum(axis=1)) == [1] * 4 + [2] * 4 + [3] * 4
+
+
+def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves() -> None:
+    objects = (
+        ObjectToSee("cube", False),
+        ObjectToSee("goal", True),
+        ObjectToSee("left", False, ("left/hand", "left/arm"), robot=True),
+        ObjectToSee("right", False, ("right/hand",), robot=True),
+    )
+    task = replace(description(table_scene(1)[0]), objects=objects)
+    found = choices_of(task, "sensor")
+    assert [(c.name, c.first) for c in found] == [
+        ("cube", True),
+        ("left/hand", False),
+        ("right/hand", False),
+        ("left/arm", False),
+    ]
+    assert [c.label for c in choices_of(replace(task, objects=objects[:3]), "human")] == [
+        "cube",
+        "goal",
+        "hand",
+        "arm",
+    ]
+
+
+def test_what_was_asked_for_is_brought_into_sight_when_it_comes_and_only_then() -> None:
+    before, after, arrival = (object(),), (object(),), Arrival()
+    assert not arrival.just_came(before), "nobody asked"
+    arrival.asked(before)
+    assert not arrival.just_came(before) and not arrival.just_came(())
+    assert arrival.just_came(after) and arrival.just_came(after)
+
+
+def test_a_matrix_is_copied_with_more_digits_than_are_read() -> None:
+    matrix = matrix_of(pose_of(SETTINGS), "opencv", "world_to_camera")
+    np.testing.assert_allclose(json.loads(as_lists(matrix)), matrix, atol=1e-8)
+
+
+def test_the_matrices_say_which_way_they_go_and_where_a_mounted_camera_is() -> None:
+    html = matrices_html(camera(), "opencv", "world_to_camera")
+    assert "x right, y down, z forward" in html and "into the camera" in html
+    html = matrices_html(camera(TURNED), "maniskill", "camera_to_world")
+    assert "x forward, y left, z up" in html and "panda/panda_hand" in html
+    # 0.3 m ahead of a mount that looks along y.
+    assert "1.0000" in html and "2.3000" in html and "3.6000" in html
+
+
+def test_what_a_body_is_called_does_not_become_html() -> None:
+    html = matrices_html(camera(TURNED, "<script>"), "opencv", "world_to_camera")
+    assert "<script>" not in html and "script" in html
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("base_camera", "base_camera.json"),
+        ("../../etc/passwd", "etc_passwd.json"),
+        ("a/b\\c\n.html", "a_b_c_html.json"),
+        ("摄像机", "camera.json"),
+        ("x" * 500, "x" * 60 + ".json"),
+    ],
+)
+def test_a_download_is_named_by_plain_letters(name: str, wanted: str) -> None:
+    assert file_name(name, "json", "json") == wanted
+    assert file_name(name, "ros", "yaml") == wanted.replace(".json", "_ros.yaml")

@@ -1,0 +1,144 @@
+"""A camera's report in words: the worst first, and of an env what is worst in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
+from workbench.ui.cameras.report import env_words, headline, histogram, object_rows, percent
+
+
+def seen(
+    name: str,
+    pixels: list[float],
+    unhindered: list[float] | None = None,
+    alone: list[float] | None = None,
+    cut: tuple[int, ...] = (),
+    present: list[bool] | None = None,
+    scenery: bool = False,
+    never_drawn: bool = False,
+) -> ObjectSeen:
+    count = len(pixels)
+    unhindered = pixels if unhindered is None else unhindered
+    return ObjectSeen(
+        name=name,
+        never_drawn=never_drawn,
+        scenery=scenery,
+        present=np.array([True] * count if present is None else present),
+        pixels=np.array(pixels, np.float32),
+        unhindered=np.array(unhindered, np.float32),
+        alone=np.array(unhindered if alone is None else alone, np.float32),
+        margin=np.zeros(count, np.float32),
+        cut=np.isin(np.arange(count), cut),
+    )
+
+
+def depth_of(counts: dict[int, int], envs: int, farthest_object: float = 1.5) -> DepthReport:
+    """All pixels in these bins, and the objects end at a distance."""
+    rows = np.zeros((envs, len(DEPTH_EDGES) - 1), np.int64)
+    for place, count in counts.items():
+        rows[:, place] = count
+    share = np.full(envs, 0.25, np.float32)
+    metres = np.full(envs, farthest_object, np.float32)
+    return DepthReport(rows, share, share, metres, metres)
+
+
+def report_of(*objects: ObjectSeen) -> CameraReport:
+    envs = len(objects[0].pixels)
+    return CameraReport(
+        camera=("sensor", "base_camera"),
+        size=(128, 128),
+        judged_size=(64, 64),
+        envs=tuple(range(envs)),
+        objects=objects,
+        depth=depth_of({20: 10, 30: 5}, envs),
+        pictures=2 * envs,
+        milliseconds=100.0,
+    )
+
+
+def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidden_says_so() -> None:
+    report = report_of(
+        seen("bowl", [90, 80, 70, 60]),
+        seen("cube", [0, 50, 40, 30], unhindered=[20, 50, 80, 30], cut=(3,)),
+        seen("table", [999, 999, 999, 999], scenery=True),
+        seen("goal", [0, 0, 0, 0], never_drawn=True),
+    )
+    rows = object_rows(report)
+    assert [row["name"] for row in rows] == ["cube", "bowl", "goal"]
+    assert (rows[0]["seen"], rows[0]["pixels"], rows[0]["cut"]) == ("75 %", "35", "25 %")
+    assert rows[0]["bad"] == ["seen", "cut", "hidden"] and rows[1]["bad"] == []
+    assert rows[2]["seen"] == "" and "hides" in rows[2]["note"]
+
+
+def test_an_object_that_some_envs_lack_is_judged_where_it_is() -> None:
+    rows = object_rows(report_of(seen("can", [50, 0], present=[True, False])))
+    assert (rows[0]["seen"], rows[0]["note"]) == ("100 %", "in 1 of 2 envs")
+    rows = object_rows(report_of(seen("can", [0, 0], present=[False, False])))
+    assert (rows[0]["seen"], rows[0]["note"]) == ("", "in none of these envs")
+
+
+@pytest.mark.parametrize(
+    ("thing", "said"),
+    [
+        (seen("cube", [0, 90]), "cube is not seen in 1 of 2 envs."),
+        (seen("cube", [50, 90], cut=(1,)), "Everything is seen; the border cuts cube in 1 of 2 envs."),
+        (seen("cube", [50, 90]), "Everything is seen, and nothing is cut."),
+        (seen("table", [50, 90], scenery=True), "There is no object to be seen in these envs."),
+    ],
+)
+def test_the_headline_says_the_worst(thing: ObjectSeen, said: str) -> None:
+    assert headline(report_of(thing)) == said
+
+
+def test_an_env_is_called_by_what_is_worst_in_it() -> None:
+    free = [0.0, 30.0, 80.0, 90.0, 90.0, 20.0, 0.0, 45.0]
+    cube = seen("cube", [0, 0, 40, 90, 90, 20, 0, 45], free, alone=[*free[:6], 50, 90], cut=(3,))
+    report = report_of(cube, seen("bowl", [200] * 8))
+    assert [env_words(report, env) for env in range(8)] == [
+        "no cube",
+        "cube hidden",
+        "cube 50 % hidden",
+        "cube cut",
+        "cube 90 px",
+        "cube 20 px, small",
+        "cube hidden",
+        "cube 50 % behind things",
+    ]
+
+
+@given(st.floats(0, 1))
+def test_only_none_is_0_percent_and_only_all_is_100(share: float) -> None:
+    said = percent(share)
+    assert (said == "0 %") == (share == 0)
+    assert (said == "100 %") == (share == 1)
+
+
+def test_the_histogram_begins_and_ends_at_what_is_seen_and_marks_what_lies_behind_the_objects() -> None:
+    bars = histogram(
+        depth_of({20: 10, 30: 5}, 2, farthest_object=DEPTH_EDGES[25]), near=0.01, far=DEPTH_EDGES[31]
+    )
+    assert bars is not None
+    assert (bars.low, bars.high) == (DEPTH_EDGES[19], DEPTH_EDGES[32])
+    heights = [height for height, _ in bars.bars]
+    assert len(heights) == 13 and heights[1] == 1 and heights[11] == 0.5 and sum(heights) == 1.5
+    assert not bars.bars[1][1] and bars.bars[11][1]
+    assert bars.near is None and bars.far == pytest.approx(12)
+
+
+def test_a_picture_that_is_all_background_has_no_histogram() -> None:
+    nothing = depth_of({}, 2)
+    none = np.full(2, np.nan, np.float32)
+    assert histogram(replace(nothing, farthest_object=none), near=0.01, far=100.0) is None
+
+
+def test_over_steps_it_is_said_when_each_object_is_seen() -> None:
+    report = report_of(seen("cube", [50, 0, 10, 40], [50, 20, 40, 40], cut=(3,), present=[True] * 4))
+    (row,) = object_rows(report, "steps")
+    assert row["moods"] == ["good", "bad", "warn", "warn"]
+    assert headline(report, "steps") == "cube is not seen in 1 of 4 steps."

@@ -1,0 +1,75 @@
+"""The Cameras tab, drawn from views that are made by hand; of the session it only asks for pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.drive.panels import Clock, Panels
+from tests.ui.scenes import camera, description, running, table_scene
+from workbench.core.camera_data import CameraInfo, Picture
+from workbench.session.live.view import Seen
+from workbench.session.protocol.messages import CameraRequest
+from workbench.ui.cameras.panel import CamerasPanel
+
+POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
+
+
+class Asked:
+    """Of a session only this is needed: which pictures are wanted."""
+
+    def __init__(self) -> None:
+        self.cameras: tuple[CameraRequest, ...] = ()
+
+    def __call__(self, cameras: tuple[CameraRequest, ...]) -> None:
+        self.cameras = cameras
+
+
+BASE, TOP = "base · sensor", "top · sensor"
+
+
+def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> Seen | None:
+    pictures = {
+        (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
+    }
+    view = running(
+        1,
+        task=description(table_scene(1)[0], cameras),
+        cameras_serial=serial,
+        pictures=pictures if pictured else {},
+        pictures_serial=serial,
+    )
+    return view.seen
+
+
+def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
+    asked = Asked()
+    panel = CamerasPanel(panels.server, asked, clock=clock)
+    panel.draw(seen(1, (camera("base"), camera("hand"))))
+    base = panels.part(BASE)
+    base.set("depth", True)
+    (image,) = base.images()
+    clock.passes()
+    panel.draw(seen(2, (camera("top"), replace(camera("base"), width=640))))
+    assert panels.folders() == [TOP, BASE]
+    assert base.control("depth").value and base.images() == [image]
+    assert "640 × 6" in base.html()
+    assert asked.cameras == (
+        CameraRequest("top", "sensor", ("rgb",)),
+        CameraRequest("base", "sensor", ("rgb", "depth")),
+    )
+    # What it can show is another choice of ticks.
+    panel.draw(seen(3, (replace(camera("base"), modalities=("rgb",)),)))
+    assert panels.folders() == [BASE] and not base.shows("depth") and base.images() != [image]
+
+
+def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
+    panel = CamerasPanel(panels.server, Asked())
+    cameras = (camera("base"),)
+    panel.draw(seen(1, cameras))
+    assert "another moment" not in panels.html()
+    panel.draw(seen(1, cameras, pictured=False))
+    assert "another moment" in panels.html() and "wb-other-moment" in panels.html()
+    panel.draw(seen(1, cameras))
+    assert "another moment" not in panels.html()

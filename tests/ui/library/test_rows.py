@@ -1,0 +1,187 @@
+from __future__ import annotations
+
+import datetime
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.recording.episode.row import LibraryRow, clean_facts
+from workbench.ui.library.rows import (
+    COLUMNS,
+    SECOND_LINE,
+    Column,
+    cells,
+    chosen,
+    in_words,
+    newest_sources,
+    none_like_that,
+    ordered,
+)
+
+NOW = datetime.datetime(2026, 11, 21, 12, tzinfo=datetime.timezone.utc)
+
+
+def row(id: str, **facts: Any) -> LibraryRow:
+    kind = facts.pop("kind", "workbench")
+    paths = facts.pop("paths", (Path(f"{id}.json"), Path(f"{id}.h5")))
+    values = {"task": "Push-v1", "written": NOW.timestamp(), **facts}
+    return LibraryRow(kind, **values, id=id, name=f"name-{id}", place=(id, 0), paths=paths, size=1000)
+
+
+ROWS = (
+    row("a", seed=3, length=9, total_reward=1.0, success=True, success_once=True, written=100.0, tags=("x",)),
+    row(
+        "b", seed=1, length=5, total_reward=-2.0, success=False, success_once=True, written=300.0, note="Odd"
+    ),
+    row("c", seed=30, length=7, success=False, fail=True, written=200.0, tags=("good", "demo")),
+    row("d", task="Pick-v1", total_reward=8.0, success=False, written=50.0),
+    row("e", task="", kind="rrd only", written=None, problem="e.rrd is broken."),
+)
+
+
+def ids(rows: list[LibraryRow]) -> str:
+    return "".join(row.id for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("", "abcde"),
+        ("push", "abc"),
+        ("PUSH good", "c"),
+        ("odd", "b"),
+        ("seed:3", "a"),
+        ("seed:x", ""),
+        ("broken", "e"),
+        ("name-d", "d"),
+        ("good odd", ""),
+    ],
+)
+def test_every_word_must_be_found(words: str, found: str) -> None:
+    assert ids(chosen(ROWS, words)) == found
+
+
+def test_outcome_and_task_are_filters_too() -> None:
+    assert [ids(chosen(ROWS, outcome=o)) for o in ("all", "success", "failed", "broken")] == [
+        "abcde",
+        "a",
+        "bcd",
+        "e",
+    ]
+    assert ids(chosen(ROWS, "name", "failed", "Pick-v1")) == "d"
+
+
+@pytest.mark.parametrize(
+    ("column", "up", "down"),
+    [
+        ("date", "dacbe", "bcade"),
+        ("seed", "bacde", "cabde"),
+        ("return", "badce", "dabce"),
+        ("success", "cdbae", "abdce"),
+        ("tags", "cabde", "acbde"),
+        ("note", "bcade", "bcade"),
+        ("task", "dbcae", "bcade"),
+    ],
+)
+def test_rows_without_a_value_come_last_either_way_and_ties_newest_first(
+    column: Column, up: str, down: str
+) -> None:
+    assert ids(ordered(ROWS, column, False)) == up
+    assert ids(ordered(ROWS, column, True)) == down
+
+
+_facts = st.fixed_dictionaries(
+    {},
+    optional={
+        "task": st.sampled_from(["", "A-v1", "b-v1"]),
+        "seed": st.none() | st.integers(0, 3),
+        "total_reward": st.none() | st.floats(-1, 1),
+        "written": st.none() | st.floats(0, 10),
+        "success": st.none() | st.booleans(),
+        "tags": st.just(()) | st.just(("z", "B")),
+        "source_hash": st.sampled_from(["", "aa", "bb"]),
+    },
+)
+
+
+@given(st.lists(_facts, max_size=8), st.sampled_from([*COLUMNS, *SECOND_LINE]), st.booleans())
+def test_no_row_is_lost_by_sorting(facts: list[dict[str, Any]], column: Column, descending: bool) -> None:
+    rows = [row(str(k), **values) for k, values in enumerate(facts)]
+    assert sorted(ids(ordered(rows, column, descending))) == sorted(ids(rows))
+    for one in rows:
+        cells(one, newest_sources(rows), NOW)
+
+
+def test_another_version_of_the_source_than_the_newest_recordings_is_marked() -> None:
+    rows = [
+        row("a", source_hash="old0123456789", written=1.0),
+        row("b", source_hash="new", written=2.0),
+        row("c", source_hash="older", written=0.5, task="Pick-v1"),
+        row("d"),
+    ]
+    said = [cells(one, newest_sources(rows), NOW) for one in rows]
+    assert [one["other_version"] for one in said] == [True, False, False, False]
+    assert [one["version"] for one in said] == ["old0123", "new", "older", ""]
+
+
+def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
+    said = [cells(one, {}, NOW) for one in ROWS]
+    assert [one["outcome"] for one in said] == ["success", "once", "fail", "no", ""]
+    assert said[0]["total"] == "1"
+    assert [said[4][name] for name in ("task", "date", "when", "total", "remark")] == ["?", "", "", "", ""]
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        (NOW, "12:00:00"),
+        (NOW - datetime.timedelta(days=1), "20 Nov 12:00"),
+        (NOW - datetime.timedelta(days=400), "17 Oct 2025"),
+    ],
+)
+def test_dates_are_as_long_as_they_must_be(written: datetime.datetime, said: str) -> None:
+    assert cells(row("a", written=written.timestamp()), {}, NOW)["date"] == said
+
+
+def test_files_of_several_trajectories_are_counted_once() -> None:
+    both = (Path("x.json"), Path("x.h5"))
+    rows = [row("a", paths=both, trajectory="traj_0"), row("b", paths=both, trajectory="traj_1"), row("c")]
+    assert in_words(rows) == "3 recordings (4 files, 2 kB)"
+    assert in_words(rows[:1]) == "1 recording (2 files, 1 kB)"
+
+
+def test_an_empty_list_says_which_filter_emptied_it() -> None:
+    assert none_like_that(" zebra ", "all", None) == "No recording has “zebra”."
+    assert none_like_that("", "failed", "Push-v1") == "There is no failed recording of Push-v1."
+    assert none_like_that("x", "success", "Push-v1") == "No successful recording of Push-v1 has “x”."
+
+
+def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted() -> None:
+    kept = clean_facts(row("n", total_reward=float("nan")))
+    lost = row("n", total_reward=kept.total_reward)
+    assert kept == clean_facts(replace(kept, total_reward=float("nan")))
+    assert cells(lost, {}, NOW)["total"] == "NaN"
+    assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
+
+
+def test_a_row_is_read_from_the_file_that_holds_it() -> None:
+    ours = row("a", paths=(Path("x/a.json"), Path("x/a.h5"))).source
+    theirs = row("b", kind="maniskill", trajectory="traj_1", paths=(Path("x/b.json"), Path("x/b.h5"))).source
+    dataset = row("c", kind="lerobot", trajectory="3", paths=(Path("x/set/meta/info.json"),)).source
+    assert (ours.kind, ours.path, ours.part, ours.stem) == ("ours", Path("x/a.json"), None, "a")
+    assert (theirs.kind, theirs.path, theirs.part, theirs.stem) == (
+        "maniskill",
+        Path("x/b.h5"),
+        "traj_1",
+        "b_traj_1",
+    )
+    assert (dataset.kind, dataset.path, dataset.part, dataset.stem) == (
+        "lerobot",
+        Path("x/set"),
+        "3",
+        "set_3",
+    )

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.drive.panels import Panels
+from tests.ui.scenes import EMPTY, problem, running
+from workbench.ui.live.banners import DOING, Banner, banner_html
+
+RESTART = "Start a new worker"
+EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
+
+
+def test_first_says_what_failed_and_where() -> None:
+    html = banner_html(problem(), running(2))
+    title, rest = html.split("</div>", 1)
+    assert "PushEnv" in title and "failed in evaluate" in title and "push.py:88" in title
+    assert "KeyError" in rest and "return goal[&lt;0&gt;]" in rest
+    assert "The last good version keeps running." in rest
+
+
+def test_everything_of_the_author_s_is_escaped() -> None:
+    evil = replace(problem(EVIL), file=f"/tmp/{EVIL}.py", code=EVIL, traceback=EVIL, stage=EVIL)
+    html = banner_html(evil, EMPTY)
+    assert "<script" not in html and "<img" not in html
+
+
+@pytest.mark.parametrize("stage", list(DOING))
+def test_every_stage_has_words(stage: str) -> None:
+    assert DOING[stage] in banner_html(replace(problem(), stage=stage), EMPTY)
+
+
+def test_problem_without_file_line_or_traceback_is_shown_too() -> None:
+    html = banner_html(replace(problem(), file=None, line=None, code=None, traceback=""), EMPTY)
+    assert "The task" in html and "<details>" not in html and "<pre" not in html
+
+
+def test_comes_with_the_problem_and_leaves_with_it(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None)
+    part = panels.part("Problem")
+    banner.draw(running(2))
+    assert not part.seen
+    banner.draw(running(2, problem=problem(), problem_serial=1, state="error"))
+    assert part.seen
+    assert not panels.shows(RESTART)
+    banner.draw(running(2))
+    assert not part.seen
+
+
+def test_traceback_that_someone_opened_is_not_written_again(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None)
+    view = running(2, problem=problem(), problem_serial=1, state="error")
+    banner.draw(view)
+    panels.htmls()[0].content = "opened"
+    banner.draw(replace(view, step_serial=99))
+    assert panels.html() == "opened"
+    banner.draw(replace(view, problem=problem("ValueError: other"), problem_serial=2))
+    assert "ValueError: other" in panels.html()
+
+
+def test_dead_worker_can_be_started_again(panels: Panels) -> None:
+    asked: list[str] = []
+    banner = Banner(panels.server, lambda: None, lambda: asked.append("restart"))
+    banner.draw(replace(EMPTY, problem=problem(), problem_serial=1, state="stopped"))
+    panels.press(RESTART)
+    assert asked == ["restart"]

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tests.ui.env_rows import FELL, rows_of
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode, Outcome
+from workbench.ui.live.env_panel import (
+    FILTERS,
+    MOST_ENTRIES,
+    columns,
+    entry_names,
+    make_rows,
+    mask,
+    moment_of,
+    order,
+)
+
+
+def cells_of(rows: EnvRows, envs: NDArray[np.int64]) -> list[SimpleNamespace]:
+    return [SimpleNamespace(**row) for row in make_rows(rows, envs)]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "envs"),
+    [("all", [0, 1, 2, 3, 4, 5]), ("failed", [2, 3, 4]), ("running", [0, 4, 5]), ("flagged", [5])],
+)
+def test_filters(wanted: str, envs: list[int]) -> None:
+    assert np.flatnonzero(mask(rows_of(), wanted)).tolist() == envs  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("column", "up", "down"),
+    [
+        ("env", [0, 1, 2, 3, 4, 5], [5, 4, 3, 2, 1, 0]),
+        ("state", [2, 3, 0, 4, 5, 1], [1, 0, 4, 5, 3, 2]),
+        ("return", [4, 0, 5, 2, 1, 3], [1, 2, 5, 0, 4, 3]),
+        ("first near", [5, 0, 3, 1, 2, 4], [1, 3, 0, 5, 2, 4]),
+        ("last", [4, 0, 1, 2, 3, 5], [0, 4, 1, 2, 3, 5]),
+        ("flags", [5, 0, 1, 2, 3, 4], [5, 0, 1, 2, 3, 4]),
+    ],
+)
+def test_sorting_keeps_ties_in_the_order_of_envs_and_puts_envs_without_a_value_last(
+    column: str, up: list[int], down: list[int]
+) -> None:
+    assert order(rows_of(), column, False).tolist() == up
+    assert order(rows_of(), column, True).tolist() == down
+
+
+@given(
+    st.lists(st.one_of(st.just(math.nan), st.floats(-1e6, 1e6)), min_size=6, max_size=6),
+    st.booleans(),
+    st.sampled_from(sorted(FILTERS)),
+)
+def test_any_returns_are_sorted_and_none_is_lost(totals: list[float], descending: bool, wanted: str) -> None:
+    rows = rows_of(total=np.array(totals))
+    for column in columns(rows):
+        envs = order(rows, column, descending, wanted)  # type: ignore[arg-type]
+        assert sorted(envs) == np.flatnonzero(mask(rows, wanted)).tolist()  # type: ignore[arg-type]
+    shown = np.array(totals)[order(rows, "return", descending)]
+    known = shown[~np.isnan(shown)]
+    assert np.isnan(shown[len(known) :]).all()
+    assert known.tolist() == sorted(known, reverse=descending)
+
+
+def test_cells_say_how_an_env_stands() -> None:
+    rows = rows_of()
+    assert entry_names(rows) == ("success", "near")
+    running, solved, _, cut, after, odd = cells_of(rows, np.arange(6))
+    assert (running.state, running.steps, running.total, running.last) == ("running", "3", "1", "success 41")
+    assert running.tally == "3 of 5 episodes ended in success"
+    assert (solved.state, solved.first_true, solved.last) == ("success", ("33", "20"), "")
+    assert (cut.state, cut.total) == ("truncated", "")
+    assert after.last == "fail 9" and after.first_true == ("", "")
+    assert odd.flags == ("cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
+
+
+def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
+    last = LastEpisode(np.zeros(6, np.int8), np.full(6, 13, np.int32), np.zeros(6), {2: (FELL,)})
+    rows = rows_of(outliers={}, last=last)
+    row = cells_of(rows, np.array([2]))[0]
+    assert row.flags == ("cube dropped 0.90 m (episode before, step 12)",) and row.last == "cut short 13"
+    assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
+
+
+def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:
+    rows = rows_of()
+    assert [moment_of(rows, env) for env in range(6)] == [None, 33, 20, 50, None, 12]
+
+
+def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
+    lowest, *_, highest = (row.curve for row in cells_of(rows_of(), np.arange(6)))
+    points = [[float(n) for n in point.split(",")] for line in (*lowest, *highest) for point in line.split()]
+    assert len(points) == 6
+    assert points[0] == [0, 13] and points[-1] == [60, 1]
+    assert all(0 <= x <= 60 and 1 <= y <= 13 for x, y in points)
+
+
+def test_a_long_episode_has_no_more_points_than_can_be_seen() -> None:
+    rewards = np.random.default_rng(0).normal(size=(6, KEPT_REWARDS)).astype(np.float32)
+    rows = cells_of(rows_of(rewards=rewards), np.arange(6))
+    assert all(len(line.split()) <= 40 for row in rows for line in row.curve)
+
+
+def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> None:
+    rewards = rows_of().rewards.copy()
+    rewards[0, -2] = np.nan
+    rewards[1, -1] = np.inf
+    first, second, *_ = cells_of(rows_of(rewards=rewards), np.arange(6))
+    # Ends of one point each, drawn as a dot; and a line of the two that are left.
+    assert len(first.curve) == 2 and all(len(set(line.split())) == 1 for line in first.curve)
+    assert len(second.curve) == 1 and len(set(second.curve[0].split())) == 2
+    nothing = rows_of(rewards=np.full((6, KEPT_REWARDS), np.nan, np.float32))
+    assert all(row.curve == [] for row in cells_of(nothing, np.arange(6)))
+
+
+def test_a_task_with_many_entries_keeps_success_and_fail() -> None:
+    names = [f"a{i}" for i in range(9)] + ["success", "fail"]
+    rows = rows_of(first={name: np.zeros(6, np.int32) for name in names})
+    assert entry_names(rows)[:2] == ("success", "fail") and len(entry_names(rows)) == MOST_ENTRIES
+    assert Outcome.RUNNING == 0
+
+
+def test_a_return_that_is_nan_is_said_and_its_curve_has_a_gap() -> None:
+    rewards = np.full((6, KEPT_REWARDS), np.nan, np.float32)
+    rewards[:] = np.arange(KEPT_REWARDS)
+    rewards[0, 50] = np.nan
+    rows = rows_of(rewards=rewards, total=np.full(6, math.nan))
+    odd, other = cells_of(rows, np.array([0, 1]))
+    assert odd.total == "NaN" and len(odd.curve) == 2 and len(other.curve) == 1
+    assert cells_of(rows, np.array([3]))[0].total == ""

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.ui.scenes import running
+from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Touching
+from workbench.ui.live.inspect_panel import (
+    CHOICES,
+    LONGEST,
+    METRES_AT_ONE_NEWTON,
+    arrows_of,
+    inspect_html,
+    joint_rows,
+    leaf_rows,
+    number,
+    pose_rows,
+)
+
+
+def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
+    numbers = np.array(values, np.float32)
+    return Leaf(name, numbers.shape if shape is None else shape, "float32", numbers, 0.0, 255.0)
+
+
+def changed(leaves: list[Leaf], before: list[Leaf] | None) -> list[list[bool]]:
+    return [[n["changed"] for n in row["numbers"]] for row in leaf_rows(leaves, before)]
+
+
+def test_numbers_that_differ_from_the_reading_before_are_marked() -> None:
+    before = [leaf("a", 1, 2, np.nan), leaf("b", 1)]
+    now = [leaf("a", 1, 2.0000002, np.nan), leaf("b", 1, 1), leaf("c", 1)]
+    # Another length, and an entry that was not there, have nothing to differ from.
+    assert changed(now, before) == [[False, True, False], [False, False], [False]]
+    assert changed([leaf("a", np.nan)], [leaf("a", 0)]) == [[True]]
+    assert changed(now, None) == [[False] * 3, [False] * 2, [False]]
+
+
+def test_what_is_too_large_to_read_is_told_by_its_range() -> None:
+    [row] = leaf_rows([leaf("rgb", *range(64), shape=(128, 128, 3))], None)
+    assert (row["kind"], row["numbers"], row["note"]) == (
+        "float32 (128, 128, 3)",
+        (),
+        "49152 numbers from 0.000 to 255.000",
+    )
+
+
+JOINTS = JointReadings(
+    articulation="arm",
+    names=("turn", "free", "slide"),
+    kinds=("revolute", "revolute_unwrapped", "prismatic"),
+    position=np.array([0.5, 9.0, 0.04], np.float32),
+    velocity=np.zeros(3, np.float32),
+    target=np.array([0.0, np.nan, 0.02], np.float32),
+    low=np.array([-1, -np.inf, 0], np.float32),
+    high=np.array([1, np.inf, 0.04], np.float32),
+)
+
+
+def test_joints_stand_between_their_limits() -> None:
+    turn, free, slide = (SimpleNamespace(**row) for row in joint_rows(JOINTS))
+    assert (turn.place, turn.target_place, turn.at_limit) == (75.0, 50.0, False)
+    assert turn.limits == "-1.000 to 1.000 rad"
+    assert (free.place, free.target_place, free.at_limit, free.target) == (None, None, False, "")
+    assert free.limits == "no limits, rad"
+    assert (slide.place, slide.target_place, slide.at_limit) == (100.0, 50.0, True)
+    assert slide.limits == "0.000 to 0.040 m"
+
+
+PRESSED = Touching(
+    ("cube", "<i>table</i>"),
+    np.array([0, 3, 4], np.float32),
+    np.array([0, 0.03, 0.04], np.float32),
+    np.array([[0, 0, 0], [0.2, 0, 0]], np.float32),
+    np.array([[0, 0, 4], [0, 0, 0]], np.float32),
+    -0.001,
+)
+
+
+def test_a_contact_is_told_in_newtons_with_its_place() -> None:
+    html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(PRESSED,)), None)
+    for words in (
+        "<b>cube</b> by &lt;i&gt;table&lt;/i&gt;",
+        ">5 N<",
+        "force 0.000, 3.000, 4.000; impulse 0.05 N s",
+        "at 0.100, 0.000, 0.000; 2 points, 1.00 mm deep",
+    ):
+        assert words in html
+    apart = replace(PRESSED, separation=0.001, points=np.zeros((0, 3), np.float32))
+    html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(apart,)), None)
+    assert "<br>at ; 0 points<" in html
+
+
+def test_arrows_start_at_the_points_and_are_bounded() -> None:
+    hard = Touching(
+        ("a", "b"), PRESSED.force, PRESSED.impulse, np.ones((1, 3), np.float32), np.array([[1e6, 0, 0]]), 0.0
+    )
+    arrows = arrows_of(Inspection(0, 0, contacts=(PRESSED, hard)))
+    # The point without a force has no arrow.
+    four_newtons = 4 ** (1 / 3) * METRES_AT_ONE_NEWTON
+    np.testing.assert_allclose(
+        arrows, [[[0, 0, 0], [0, 0, four_newtons]], [[1, 1, 1], [1 + LONGEST, 1, 1]]], rtol=1e-6
+    )
+    assert arrows_of(Inspection(0, 0)).shape == (0, 2, 3)
+
+
+def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
+    poses = np.array([[0.1, -2, 0, 1, 0, 0, 0], [np.nan] * 7], np.float32)
+    [row] = pose_rows(("cube", "absent"), poses)
+    assert row["code"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0.000"), (1.23456, "1.235"), (1e-9, "0.000"), (2e-4, "2.0e-04"), (12345.0, "1.2e+04")]
+    + [(float("nan"), "NaN"), (True, "yes"), (7, "7")],
+)
+def test_numbers_are_short(value: object, text: str) -> None:
+    assert number(value) == text
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str) -> None:
+    now = Inspection(
+        1,
+        5,
+        observation=(leaf("<script>x", 1),),
+        state=(leaf("s", 1),),
+        joints=(JOINTS,),
+        contacts=(PRESSED,),
+    )
+    other = inspect_html(choice, running(3, selected_env=0), now, None)
+    own = inspect_html(choice, running(3, selected_env=1), now, None)
+    assert "step 5" not in other
+    assert "<script>x" not in own and "<i>table</i>" not in own
+    expected = {
+        "joints": "slide",
+        "contacts": "5 N",
+        "poses": "arm/hand",
+        "observation": "&lt;script",
+        "state": "s</b>",
+    }
+    if choice == "poses":
+        assert 'data-copy="sapien.Pose(p=[' in own
+    if choice in expected:
+        assert expected[choice] in own
+        assert choice == "poses" or expected[choice] not in other
+
+
+def test_contacts_are_said_to_be_unknown_before_a_step_and_none_to_be_none_after_one() -> None:
+    now = Inspection(0, 5, contacts=(PRESSED,))
+    html = inspect_html("contacts", running(1), now, None, no_step_yet=True)
+    assert "not known before the next step" in html and "5 N" not in html
+    assert "nothing touches anything" in inspect_html(
+        "contacts", running(1), Inspection(0, 5, contacts=()), None
+    )
+
+
+def test_a_section_that_was_refused_says_why() -> None:
+    now = Inspection(0, 5, refused=(("contacts", "PhysX on the GPU keeps no list"),))
+    assert "PhysX on the GPU keeps no list" in inspect_html("contacts", running(1), now, None)

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tests.drive.panels import Panels
+from tests.ui.env_rows import rows_of
+from tests.ui.scenes import EMPTY, problem, running
+from workbench.session.history.env_table import Kind, Outlier
+from workbench.ui.live.status_line import StatusLine, flagged_text, status_values
+from workbench.ui.widgets.templates import render
+
+
+def html(view) -> str:
+    return render("status_line", **status_values(view))
+
+
+def test_running_says_rates_envs_and_backend() -> None:
+    text = html(running(16))
+    assert all(
+        word in text
+        for word in ("running", "16 envs", "cpu (batched)", "<b>20</b> steps/s", "1.00 × real time")
+    )
+
+
+def test_one_env_is_one_env() -> None:
+    assert "1 env on" in html(running(1))
+
+
+def test_first_load_says_what_is_being_done() -> None:
+    text = html(replace(EMPTY, state="loading", activity="building 16 envs"))
+    assert "loading" in text and "building 16 envs" in text and "real time" not in text
+
+
+def test_paused_claims_no_rate() -> None:
+    assert "steps/s" not in html(running(4, state="paused", playing=False))
+
+
+def test_error_and_stale_are_seen_together() -> None:
+    text = html(running(4, state="error", stale=True, problem=problem()))
+    assert "error" in text and "stale" in text
+
+
+def test_machine_that_cannot_keep_up_is_said() -> None:
+    assert "does not reach it" in html(running(4, speed=4.0, real_time_factor=1.2))
+    assert "does not reach it" not in html(running(4, speed=float("inf"), real_time_factor=1.2))
+
+
+def test_the_selected_envs_place_in_its_episode_is_said() -> None:
+    view = running(4)
+    assert view.step is not None
+    assert f"env {view.selected_env}: step {view.step.elapsed_steps[view.selected_env]}" in html(view)
+    assert "step" not in html(EMPTY)
+
+
+def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_first(
+    panels: Panels,
+) -> None:
+    """A reward that was NaN in most envs left a green "running"."""
+    lost = Outlier(Kind.NOT_A_NUMBER, 3, "the reward is <b>NaN</b>")
+    rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), []
+    line = StatusLine(panels.server, lambda: rows, lambda: went.append("first"))
+    line.draw(running(6))
+    (standing,) = (html for html in panels.htmls() if "data-press" in html.content)
+    content = standing.content
+    assert "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content and "In env 2, step 3:" in content
+    assert "wb-running wb-marked" in panels.html()
+    line.draw(running(6, steps_per_second=21.0))
+    assert standing.content is content, "it stays under the finger that presses"
+    panels.press("flagged")
+    assert went == ["first"]
+
+
+def test_no_env_flagged_is_no_mark(panels: Panels) -> None:
+    line = StatusLine(panels.server, lambda: rows_of(outliers={}), lambda: None)
+    line.draw(running(6))
+    assert "data-press" not in panels.html() and "wb-marked" not in panels.html()
+    assert flagged_text(rows_of(outliers={})) is None
+
+
+def test_the_tab_is_called_after_the_task() -> None:
+    assert 'data-title="Push-v1 · Workbench"' in html(running(4))
+    assert 'data-title="Workbench"' in html(EMPTY)

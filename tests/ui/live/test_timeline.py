@@ -1,0 +1,241 @@
+"""The timeline on a page, on a session with a hand-made scene, drawn without a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from tests.drive.panels import Clock, Panels
+from tests.drive.session import wait_until
+from tests.drive.waiting import until
+from tests.ui.scenes import running
+from workbench.session.live.session import Session
+from workbench.session.live.timeline import TimelineView
+from workbench.session.live.view import SessionView
+from workbench.session.protocol.messages import CameraRequest
+from workbench.ui.app.live_page import Page
+from workbench.ui.live import timeline as panel
+from workbench.ui.widgets.inputs import Control
+
+SLIDER = "step of the past"
+
+
+@dataclass
+class Lived:
+    """A session with a past, and its page."""
+
+    session: Session
+    page: Page
+    panels: Panels
+    clock: Clock
+
+    @property
+    def past(self) -> TimelineView:
+        return self.session.view().timeline
+
+    def draw(self) -> None:
+        self.clock.passes()
+        self.page.redraw()
+
+    def step(self, count: int) -> None:
+        for _ in range(count):
+            last = self.past.last
+            self.session.step()
+            wait_until(self.session, lambda view, n=last: view.timeline.last > n, "a step")
+        self.draw()
+
+    def ends(self) -> tuple[int, int, int]:
+        slider = self.panels.control(SLIDER)
+        return slider.min, slider.max, slider.value
+
+    def strip(self) -> str:
+        return self.panels.html("wb-timeline")
+
+    def hand(self) -> np.ndarray:
+        (hand, *_) = self.panels.bodies("arm hand")
+        return hand.batched_positions.copy()
+
+
+@pytest.fixture
+def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]) -> Lived:
+    session = scripted_session(3)
+    return Lived(session, Page(panels.server, session, clock=clock), panels, clock)
+
+
+def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(lived: Lived) -> None:
+    assert not lived.panels.part("Timeline").seen, "the page was not drawn yet"
+    lived.draw()
+    assert lived.panels.part("Timeline").seen
+    lived.step(4)
+    assert lived.ends() == (-4, 0, 0)
+    assert not lived.panels.shows("way to go on"), "nobody is in the past"
+    assert lived.panels.control("step to take").options == panel.WALK, "nothing was before the first reset"
+    assert "live" in lived.strip()
+
+
+def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Lived) -> None:
+    lived.step(2)
+    there = lived.hand()
+    lived.step(2)
+    assert not np.array_equal(lived.hand(), there)
+    lived.panels.set(SLIDER, -2)
+    lived.draw()
+    assert lived.past.shown == 2
+    assert np.array_equal(lived.hand(), there)
+    assert "2 steps ago" in lived.panels.html("wb-status") and "2 steps ago" in lived.strip()
+    travel = lived.panels.control("way to go on")
+    assert travel.options == ("Go on from here: env 0", "all envs", "env 0 into all envs")
+    assert lived.panels.shows("way to go on") and lived.ends() == (-4, 0, -2)
+    lived.panels.command("What is live")
+    lived.draw()
+    assert "live" in lived.strip() and not lived.panels.shows("way to go on")
+
+
+def test_going_on_puts_the_envs_that_were_named_back(lived: Lived) -> None:
+    lived.step(4)
+    lived.panels.choose(panel.LAST_STEP)
+    lived.panels.choose(panel.LAST_STEP)
+    lived.draw()
+    lived.panels.choose("Go on from here: env 0")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 5, "the jump")
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [2, 4, 4]
+    lived.draw()
+    lived.panels.choose(panel.LAST_STEP)
+    lived.draw()
+    lived.panels.choose("all envs")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 6, "the other jump")
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
+
+
+def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: Lived) -> None:
+    lived.step(4)
+    last = lived.past.last
+    lived.panels.command("Reset all envs")
+    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
+    lived.step(3)
+    lived.panels.choose(panel.EPISODE)
+    lived.draw()
+    assert lived.ends()[0] == -3
+    lived.panels.command("The first moment")
+    assert lived.past.shown == lived.past.last - 3, "of the episode"
+    lived.panels.command("What is live")
+    lived.draw()
+    assert lived.panels.control("step to take").options[-2:] == (panel.EVERYTHING, "undo reset of all")
+    lived.panels.choose(panel.EVERYTHING)
+    lived.draw()
+    assert lived.ends()[0] == -8
+    lived.panels.command("The first moment")
+    assert lived.past.shown == lived.past.first
+    lived.panels.command("What is live")
+    lived.draw()
+    lived.panels.choose("undo reset of all")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
+
+
+def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived: Lived) -> None:
+    lived.step(4)
+    last = lived.past.last
+    lived.panels.command("Reset all envs")
+    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
+    lived.step(2)
+    lived.panels.choose(panel.EPISODE)
+    lived.page.redraw()
+    assert lived.ends() == (-2, 0, 0)
+    lived.session.step()
+    wait_until(lived.session, lambda view: view.timeline.last == 8, "a step")
+    lived.session.past.seek(6)
+    lived.page.redraw()
+    assert lived.ends() == (-2, 0, -1), "within them: whoever holds the slider is not disturbed"
+    lived.session.past.seek(2)
+    lived.page.redraw()
+    assert lived.ends() == (-8, -4, -6), "the episode before"
+    lived.draw()
+    assert lived.ends() == (-8, -4, -6)
+
+
+def test_of_one_env_there_is_one_way_to_go_on() -> None:
+    assert panel.go_on_labels(running(1)) == ("Go on from here",)
+    assert panel.go_on_labels(SessionView()) == ("Go on from here",)
+    labels = panel.go_on_labels(running(3, selected_env=2))
+    assert labels == ("Go on from here: env 2", "all envs", "env 2 into all envs")
+
+
+def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: Lived) -> None:
+    lived.step(3)
+    until(lambda: not Control.took_the_key(), "a moment in which nobody touches anything")
+    lived.panels.command("A step back in time")
+    assert lived.past.shown == 2
+    lived.draw()
+    lived.panels.set(SLIDER, -2)
+    lived.panels.command("A step back in time")
+    assert lived.past.shown == 1, "only the slider went back"
+    until(lambda: not Control.took_the_key(), "the key to be over")
+    lived.panels.command("A step back in time")
+    assert lived.past.shown == 0
+
+
+def test_a_value_that_no_slider_has_is_refused(lived: Lived) -> None:
+    lived.step(3)
+    lived.panels.claim(SLIDER, 1)
+    lived.panels.claim(SLIDER, -4)
+    assert lived.panels.client.notices == ["The step of the past goes from -3 to 0."] * 2
+    assert lived.past.shown is None
+    lived.panels.claim(SLIDER, -3)
+    assert lived.past.shown == lived.past.first
+    lived.panels.claim("way to go on", "rm -rf")
+    lived.panels.claim("step to take", "rm -rf")
+    assert len(lived.panels.client.notices) == 4
+    assert lived.past.shown == lived.past.first and lived.past.last == 3
+
+
+def test_one_moment_alone_has_nothing_to_slide_along(lived: Lived) -> None:
+    lived.draw()
+    assert not lived.panels.shows(SLIDER)
+    assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
+    assert "1 step<" in lived.strip()
+    lived.step(1)
+    assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)
+
+
+def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
+    lived: Lived, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lived.step(3)
+    lived.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
+    lived.session.past.seek(1)
+    assert lived.past.wants_pictures
+    asked: list[int | None] = []
+    monkeypatch.setattr(lived.session.past, "draw", lambda: asked.append(lived.past.shown))
+    lived.page.redraw()
+    lived.clock.passes(0.3)
+    lived.page.redraw()
+    lived.session.past.seek(2)
+    for _ in range(2):
+        lived.page.redraw()
+        lived.clock.passes(0.3)
+    assert asked == [], "whoever drags draws none"
+    lived.page.redraw()
+    assert asked == [2]
+
+
+def test_home_is_the_left_end_of_the_slider(lived: Lived) -> None:
+    lived.step(3)
+    lived.panels.command("The first moment")
+    assert lived.past.shown == 0
+    last = lived.past.last
+    lived.panels.command("Reset all envs")
+    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
+    lived.step(2)
+    lived.panels.choose(panel.EPISODE)
+    lived.panels.command("What is live")
+    lived.draw()
+    lived.panels.command("The first moment")
+    assert lived.past.shown == 4
+    lived.panels.command("To the event before")
+    assert lived.past.shown == 0
+    lived.panels.command("To the next event")
+    assert lived.past.shown == 4

@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.ui.scenes import running
+from workbench.session.history.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.live.timeline import Strip, TimelineView
+from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
+from workbench.ui.live.timeline import (
+    POINTS,
+    megabytes,
+    polylines,
+    reward_lines,
+    step_in_words,
+    strip_html,
+    where,
+)
+from workbench.ui.widgets.templates import render
+
+
+def strip(**changes: object) -> Strip:
+    values: dict[str, object] = {
+        "low": 100,
+        "high": 200,
+        "events": ((100, RESET), (150, SUCCESS | TRUNCATED), (160, RESET), (180, WENT_BACK)),
+        "reward": np.linspace(0, 1, 101, dtype=np.float32),
+        "branches": ((180, 120),),
+        "stretches": ((100, 159), (160, 179), (180, 200)),
+    }
+    return Strip(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def past(shown: int | None = None) -> TimelineView:
+    return TimelineView(100, 200, shown, 60, 3 * 1024**2, 256 * 1024**2, 101, True, None)
+
+
+def marks(html: str) -> list[tuple[float, str, str]]:
+    """Per cent from the left, style and words of each."""
+    found = re.findall(r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" title="([^"]*)"', html)
+    return [(float(place), style, words) for style, place, words in found]
+
+
+def cursor(html: str) -> float:
+    return float(re.findall(r'<line x1="([\d.]+)" x2="\1" [^>]*wb-cursor', html)[0])
+
+
+def test_marks_stand_where_they_happened_and_say_what_matters_most() -> None:
+    html = strip_html(strip(), running(4, timeline=past()))
+    assert marks(html) == [
+        (0.0, "reset", "reset, 100 steps ago"),
+        (50.0, "success", "success, 50 steps ago"),
+        (60.0, "reset", "reset, 40 steps ago"),
+        (80.0, "back", "went back 60 steps, 20 steps ago"),
+    ]
+    assert re.findall(r'<path d="([^"]*)"', html) == ["M 20.0 0 Q 50.0 -26 80.0 0"]
+    assert ">live<" in html and cursor(html) == 100.0
+    legend = re.findall(r'wb-key wb-mark-(\w+)"></i>([^<]*)<', html)
+    assert legend == [("success", "success"), ("back", "went back"), ("reset", "reset")]
+
+
+def test_bands_are_what_was_lived_through_without_a_jump() -> None:
+    html = strip_html(strip(), running(4, timeline=past()))
+    bands = re.findall(r'<rect x="([\d.]+)" y="-14" width="([\d.]+)" height="46" class="([^"]*)"', html)
+    assert bands == [
+        ("0.0", "59.0", "wb-band"),
+        ("60.0", "19.0", "wb-band wb-odd"),
+        ("80.0", "20.0", "wb-band wb-branch"),
+    ]
+
+
+def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> None:
+    html = strip_html(strip(branches=()), running(4, timeline=past()))
+    assert marks(html)[-1] == (80.0, "back", "from a recording, 20 steps ago") and "<path" not in html
+    html = strip_html(strip(low=150, branches=((180, 120),)), running(4, timeline=past()))
+    assert re.findall(r'<path d="([^"]*)"', html) == ["M 0.0 0 Q 30.0 -26 60.0 0"]
+
+
+def test_a_shown_moment_is_told_in_steps_ago() -> None:
+    html = strip_html(strip(), running(4, selected_env=2, timeline=past(163)))
+    assert cursor(html) == 63.0 and ">live<" not in html
+    assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
+    assert "history 3.0 of 256 MB, 101 steps" in html
+
+
+def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
+    assert cursor(strip_html(strip(low=160), running(4, timeline=past(120)))) == 0.0
+
+
+def test_one_moment_alone_can_be_drawn() -> None:
+    one = strip(
+        low=100, high=100, events=((100, RESET),), reward=np.zeros(1), branches=(), stretches=((100, 100),)
+    )
+    html = strip_html(one, running(1, timeline=past()))
+    assert "nan" not in html and 'width="-' not in html
+
+
+@pytest.mark.parametrize("count", [2, POINTS, POINTS + 1, 15_000])
+def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
+    reward = np.zeros(count, np.float32)
+    reward[count // 3] = 5.0
+    (line,) = reward_lines(reward)
+    points = [tuple(map(float, point.split(","))) for point in line.split()]
+    assert len(points) <= POINTS
+    assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT == 30.0
+    assert all(0 <= x <= 100 for x, _ in points)
+
+
+def test_where_there_is_no_reward_is_a_gap_and_without_a_change_no_line() -> None:
+    assert reward_lines(np.full(10, np.nan, np.float32)) == []
+    assert reward_lines(np.ones(10, np.float32)) == []
+    lines = reward_lines(np.array([np.nan, 1, 2, np.nan, 0], np.float32))
+    assert [[point.split(",")[0] for point in line.split()] for line in lines] == [
+        ["25.00", "50.00"],
+        ["100.00", "100.00"],
+    ]
+    many = np.tile(np.array([np.nan, 1, 2], np.float32), 1000)
+    assert len(reward_lines(many)) == 1, "narrower than a pixel"
+    html = strip_html(strip(reward=many[:101]), running(4, timeline=past()))
+    assert "nan" not in html and html.count("<polyline") > 1
+
+
+def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
+    view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
+    not_carried = "; ".join(view.timeline.not_carried)
+    for arrived in ("", "<i>Push</i>, step 3: its actions were made again."):
+        html = render("timeline_hint", live=True, not_carried=not_carried, arrived=arrived)
+        assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
+        assert ("&lt;i&gt;Push&lt;/i&gt;, step 3" in html) == bool(arrived) and "<i>" not in html
+
+
+def test_fail_is_drawn_before_success() -> None:
+    html = strip_html(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
+    assert [style for _, style, _ in marks(html)] == ["fail"]
+
+
+def test_of_very_many_events_the_newest_are_drawn() -> None:
+    events = ((100, NOT_A_NUMBER), (101, FAIL), *((102 + k, RESET) for k in range(97)), *((199, RESET),) * 52)
+    html = strip_html(strip(events=events, branches=()), running(4, timeline=past()))
+    assert len(marks(html)) == 150 and [style for _, style, _ in marks(html)[:2]] == ["fail", "reset"]
+    both = strip_html(strip(events=((190, NOT_A_NUMBER | RESET),)), running(4, timeline=past()))
+    assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
+
+
+def test_where_one_is_is_said_as_far_as_it_is_known() -> None:
+    view = running(2, selected_env=1)
+    assert view.task is not None
+    assert where(view) == "env 1: step 7 / 50, 0.35 s" and step_in_words(view) == "env 1: step 7 / 50"
+    assert step_in_words(replace(view, task=replace(view.task, max_episode_steps=None))) == "env 1: step 7"
+    assert step_in_words(running(1)) == "step 7 / 50"
+    for unknown in (replace(view, task=None), replace(view, step=None), running(2, selected_env=2)):
+        assert step_in_words(unknown) == where(unknown) == ""
+
+
+def test_sizes_have_a_digit_more_below_ten() -> None:
+    sizes = (0, 0.05, 9.94, 10, 255.6)
+    assert [megabytes(round(size * 1024**2)) for size in sizes] == ["0.0", "0.1", "9.9", "10", "256"]
+
+
+def test_a_point_alone_is_a_dot() -> None:
+    points = ["1,1", None, "2,2", "3,3", None, None, "4,4"]
+    assert polylines(points) == ["1,1 1,1", "2,2 3,3", "4,4 4,4"]
+    assert polylines([None, None]) == [] == polylines([])

@@ -1,0 +1,94 @@
+"""The numbers beside the curves of a recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+
+from tests.drive.episodes import made
+from workbench.session.review.events import happenings
+from workbench.session.review.view import Opened, ReviewView
+from workbench.ui.live.reward import NumberRow
+from workbench.ui.review.curves import ReviewCurves, compared, known
+from workbench.ui.widgets.templates import render
+
+
+def test_a_nan_that_the_task_returned_is_shown_and_what_the_first_state_lacks_is_not() -> None:
+    assert known("NaN", 0) == "—"
+    assert known("NaN", 7) == "NaN"
+    assert known("0.50", 0) == known("0.50", 7) == "0.50"
+
+
+def test_what_only_another_recording_has_is_in_the_table() -> None:
+    old = [NumberRow("reward", "0.50", ""), NumberRow("success", "true", "", "good")]
+    new = [*old[:1], NumberRow("slope", "0.10", ""), NumberRow("success", "false", "")]
+    assert compared(old, [(old, 3), (new, 3)]) == [
+        {"name": "reward", "mood": "", "whole": False, "hint": "", "values": ["0.50", "0.50"]},
+        {"name": "success", "mood": "good", "whole": False, "hint": "", "values": ["true", "false"]},
+        {"name": "slope", "mood": "", "whole": False, "hint": "", "values": ["—", "0.10"]},
+    ]
+
+
+def test_what_is_not_per_env_is_marked() -> None:
+    phase = NumberRow("phase", "", "", whole="<b>reach", hint="not per env: str")
+    other = NumberRow("phase", "", "", whole="push", hint="not per env: str")
+    (row,) = table = compared([phase], [([phase], 1), ([other], 2)])
+    assert (row["values"], row["whole"], row["hint"]) == (["<b>reach", "push"], True, "not per env: str")
+    html = render("review_numbers", rows=table, of=(0, 1))
+    assert "not per env</span>" in html and "&lt;b&gt;reach" in html
+
+
+def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) -> ReviewView:
+    """A view of recordings of so many steps, whose state of that number is at position 0."""
+    episodes = [made(steps) for steps, _ in recordings]
+    anchors = tuple(anchor for _, anchor in recordings)
+    return ReviewView(
+        opened=tuple(Opened(str(i), f"{i}.rrd", e, happenings(e)) for i, e in enumerate(episodes)),
+        opened_serial=1,
+        selected=selected,
+        anchors=anchors,
+        position=position,
+        first=-max(anchors),
+        last=max(steps - anchor for steps, anchor in recordings),
+    )
+
+
+def drawn(server: viser.ViserServer, view: ReviewView, chart: str = "reward") -> list[list[Any]]:
+    """What is sent to a chart: the positions, a line for each recording, and the dot; None where there is a gap."""
+    curves = ReviewCurves(server)
+    curves.draw(view)
+    handle = curves._charts[chart].handle
+    assert handle is not None and handle.visible
+    return [[None if y is None or np.isnan(y) else float(y) for y in data] for data in handle.data]
+
+
+@pytest.mark.parametrize("selected", [0, 1])
+@pytest.mark.parametrize("position", [-5, -2, 0, 3, 5])
+def test_the_dot_lies_on_the_selected_line_at_the_position(
+    server: viser.ViserServer, selected: int, position: int
+) -> None:
+    view = aligned((10, 5), (6, 2), selected=selected, position=position)
+    positions, *lines, dot = drawn(server, view)
+    assert positions == list(range(-5, 6))
+    # A reward is the number of its step; the first state has none.
+    assert lines[0] == [None, *range(1, 11)]
+    assert lines[1] == [None] * 4 + [1, 2, 3, 4, 5, 6] + [None]
+    at = positions.index(position)
+    assert dot == [lines[selected][at] if i == at else None for i in range(11)]
+
+
+def test_of_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
+    server: viser.ViserServer,
+) -> None:
+    steps, anchor = 1000, 400
+    for position in (-400, -399, 0, 1, 599, 600):
+        positions, line, dot = drawn(server, aligned((steps, anchor), position=position))
+        assert positions[:3] == [-400, -398, -396] and len(positions) == 501
+        (at,) = [i for i, value in enumerate(dot) if value is not None] or [0]
+        assert abs(positions[at] - position) <= 1
+        value = position + anchor  # its own, and not that of the point
+        assert dot[at] == (None if value == 0 else value)
+        assert line[at] in (None, positions[at] + anchor)

@@ -1,0 +1,245 @@
+"""What the Judge tab says of verdicts, and where a press on one goes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from tests.drive.episodes import made, write
+from tests.drive.panels import Clock, Panels
+from tests.drive.waiting import until
+from workbench.authoring.problem import Problem
+from workbench.jobs.verdict import Verdict
+from workbench.recording.episode.source import Source
+from workbench.recording.library.library import Library
+from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore.background import JudgedView
+from workbench.session.review.review import Review
+from workbench.ui.review.rescore import (
+    IDLE,
+    RECORDED,
+    TODAYS,
+    Code,
+    RescoreChoices,
+    RescorePanel,
+    episode_files,
+)
+from workbench.ui.widgets.rescored import MOST_ROWS, status_html
+
+AS_RECORDED, TODAYS_CODE = Code(RECORDED, "", recorded=True), Code(TODAYS, "")
+
+
+def verdict(id: str = "a", **changes: Any) -> Verdict:
+    plain = Verdict(Source(Path(f"{id}.json"), None, id, f"push_{id}"), "Push-v1", 3, 5)
+    reward = np.arange(5, dtype=np.float32)
+    return replace(
+        plain,
+        **{"returns": (10.0, 10.0), "old_reward": reward, "new_reward": reward, "metres": 0.0, **changes},
+    )
+
+
+def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> None:
+    moved = verdict(success=(None, 41), fail=(7, None), first_difference=7)
+    assert words.what_changed(moved) == "success now at step 41, was never, fail never now, was at step 7"
+    reward = verdict(largest=0.25, first_difference=4, differing=("reward",))
+    assert words.what_changed(reward) == "reward by up to 0.25, from step 4"
+    assert words.what_changed(verdict()) == "as it was"
+    assert words.what_changed(verdict(differing=("height",))) == "as it was, but for height"
+    assert words.what_changed(verdict(why_not="it has no step")) == "not judged: it has no step"
+    assert words.returns(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
+
+
+def test_all_of_them_are_one_sentence() -> None:
+    many = [
+        verdict("a"),
+        verdict("b", success=(None, 3), has_success=True, first_difference=3, returns=(1.0, 5.0)),
+        verdict("c", why_not="x"),
+    ]
+    assert words.summary(many) == (
+        "1 of 2 episodes differs. Episodes with success: 0 → 1. Mean return: 5.5 → 7.5. 1 episode not judged."
+    )
+    assert words.summary(many[:1]).startswith("Nothing differs in 1 episode:")
+    assert words.summary(many[2:]) == "No episode could be judged."
+    assert "to the last bit" in words.doubts(many) and not words.is_doubtful(many)
+    assert words.doubts([verdict(metres=None)]) == ""
+    told = words.doubts([verdict(metres=0.032)], words.PUT_IN)
+    assert "3.2 cm" in told and "furthest in push_a" in told and told.endswith(words.PUT_IN)
+
+
+def test_numbers_that_are_none_are_null_in_json() -> None:
+    assert '"return_now": null' in words.as_json([verdict(returns=(1.0, float("nan")))])
+    assert words.as_csv([]) == "\n"
+
+
+def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
+    nan = float("nan")
+    lost = verdict(
+        "lost", largest=float("inf"), first_difference=4, returns=(1.0, nan), differing=("reward",)
+    )
+    assert words.what_changed(lost) == "reward NaN now, from step 4"
+    assert words.returns(lost) == "1 → NaN"
+    other = verdict("other", returns=(2.0, 2.0))
+    assert "Mean return: 1.5 → 2, NaN in 1 of 2." in words.summary([lost, other])
+
+
+def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
+    problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
+    html = status_html(JudgedView("failed", total=3, why="the code raised", problem=problem))
+    assert "push.py:88" in html and "<b>" not in html and "&lt;b&gt;" in html
+    assert "Select recordings" in status_html(JudgedView(), idle=IDLE)
+    told = JudgedView("judging", 2, (verdict(),), 1, 3, "episodes", task="Push-v1")
+    assert "judging with Push-v1: 1 of 3 episodes" in status_html(told)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for seed in range(1, 4):
+        write(tmp_path, made(6, seed=seed), pictures=False)
+    return tmp_path
+
+
+@pytest.fixture
+def library(child_process: None, folder: Path) -> Iterator[Library]:
+    library = Library(folder)
+    library.refresh()
+    yield library
+    library.close()
+
+
+@pytest.fixture
+def review(library: Library) -> Iterator[Review]:
+    review = Review(library)
+    yield review
+    review.close()
+
+
+class Told:
+    """Stands where what judges again stands for the panel: what it has told last."""
+
+    def __init__(self) -> None:
+        self.view, self.judging = JudgedView(), self
+
+    def stop(self) -> None:
+        raise AssertionError("nobody asked for that")
+
+
+@dataclass
+class Rescoring:
+    """The panel on a page, with what it is told."""
+
+    panel: RescorePanel
+    panels: Panels
+    clock: Clock
+    review: Review
+    choices: RescoreChoices
+    told: Told
+
+    def draw(self, told: JudgedView) -> None:
+        self.told.view = told
+        self.clock.passes()
+        self.panel.draw(self.review.view())
+
+
+@pytest.fixture
+def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) -> Rescoring:
+    told, choices = Told(), RescoreChoices(AS_RECORDED)
+    panel = RescorePanel(panels.server, cast(Any, told), review, library, choices)
+    return Rescoring(panel, panels, clock, review, choices, told)
+
+
+def test_a_row_opens_its_episode_at_the_first_difference(
+    rescoring: Rescoring, library: Library, review: Review
+) -> None:
+    rows = {row.seed: row for row in library.rows()}
+    given = [
+        verdict(rows[seed].id, seed=seed, first_difference=seed + 1, returns=(0.0, float(seed)))
+        for seed in (1, 2, 3)
+    ]
+    rescoring.draw(JudgedView("done", 1, tuple(given), 3, 3))
+    assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
+    assert not any(rescoring.panels.shows(name) for name in ("Judge what is open", "Stop"))
+    rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
+    until(lambda: review.view().opened, "the recording", seen=lambda: review.view().problems)
+    view = review.view()
+    assert view.opened[0].id == rows[2].id and view.states == (3,)
+    rescoring.draw(replace(rescoring.told.view, serial=2))
+    assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Judge what is open")
+    assert "wb-selected" in rescoring.panels.html()
+
+
+def test_why_nothing_could_be_judged_is_said_once(rescoring: Rescoring) -> None:
+    why = "push.py (0123456) is not trusted"
+    lost = (
+        verdict("a", why_not=why),
+        verdict("b", why_not=f"{why}: line 1"),
+        verdict("c", why_not="it has no step"),
+    )
+    rescoring.draw(JudgedView("failed", 1, lost, 3, 3, why=why))
+    assert rescoring.panels.html().count("is not trusted") == 1
+    assert "not judged: it has no step" in rescoring.panels.html()
+    rescoring.draw(JudgedView("done", 2, lost, 3, 3))
+    assert rescoring.panels.html().count(f"not judged: {why}") == 2, "nothing else says it"
+
+
+def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescoring: Rescoring) -> None:
+    moved = {"first_difference": 4, "largest": 0.25, "differing": ("reward",), "returns": (1.0, 2.5)}
+    given = (
+        verdict("same", seed=5),
+        verdict("lost", seed=6, why_not="it has no step"),
+        verdict("other", seed=7, metres=0.032, **moved),
+    )
+    rescoring.draw(JudgedView("done", 1, given, 3, 3))
+    html = rescoring.panels.html("wb-again-table")
+    rows = re.findall(r'<tr [^>]*class="([^"]*)" title="[^"]*">(.*?)</tr>', html)
+    said = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
+    assert said == [
+        ([], "|seed 7||reward by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
+        (["wb-same"], "|seed 5||as it was||10|"),
+        (["wb-same"], "|seed 6||not judged: it has no step|||"),
+    ]
+    assert words.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
+
+
+def test_before_anything_was_judged_the_page_says_how_and_shows_no_list(rescoring: Rescoring) -> None:
+    rescoring.draw(JudgedView())
+    assert "Select recordings in the Library" in rescoring.panels.html("wb-again")
+    assert not rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
+    rescoring.draw(JudgedView("done", 1, (verdict(),), 1, 1))
+    assert rescoring.panels.html("wb-again-table")
+    rescoring.draw(JudgedView("judging", 2, (), 0, 1))
+    assert rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
+
+
+def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
+    many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
+    rescoring.draw(JudgedView("done", 1, many, 23, 23))
+    assert (
+        rescoring.panels.html().count('data-press="') == MOST_ROWS + 2
+        and "1 to 10 of 23" in rescoring.panels.html()
+    )
+    rescoring.panels.press("on")
+    rescoring.panels.press("on")
+    rescoring.panels.press("on")
+    rescoring.draw(JudgedView("done", 2, many, 23, 23))
+    assert "21 to 23 of 23" in rescoring.panels.html()
+
+
+def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -> None:
+    assert rescoring.panels.control("Code").value == "as recorded"
+    rescoring.panels.set("Recorded states", True)
+    rescoring.panels.claim("Code", "../../etc")
+    assert rescoring.choices == RescoreChoices(AS_RECORDED, True)
+    rescoring.panels.set("Code", "today's")
+    assert rescoring.choices == RescoreChoices(TODAYS_CODE, True)
+
+
+def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:
+    rows = library.rows()
+    found = episode_files(library, ["no such", rows[0].id, rows[0].id])
+    assert [(file.id, file.path) for file in found] == [(rows[0].id, rows[0].paths[0])]

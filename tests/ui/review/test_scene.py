@@ -1,0 +1,54 @@
+"""Recordings as one scene: ghosts and side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.drive.episodes import BODY, geometry_of, made, poses_of
+from workbench.recording.episode.episode import Episode
+from workbench.session.review.events import happenings
+from workbench.session.review.view import Opened
+from workbench.ui.review.scene import SEE_THROUGH, review_scene
+from workbench.ui.scene.glb import group_by_wearers
+
+
+def opened(*episodes: Episode) -> tuple[Opened, ...]:
+    return tuple(Opened(str(i), str(i), e, happenings(e)) for i, e in enumerate(episodes))
+
+
+def test_side_by_side_shares_shapes_and_has_places() -> None:
+    scene = review_scene(opened(made(10), made(4, speed=0.02)), ghosts=False)
+    assert scene is not None
+    assert len(group_by_wearers(scene.geometry)) == 4, "what looks the same is one node"
+    assert all(len(visual.envs) == 2 for visual in scene.geometry.visuals)
+    assert not np.allclose(scene.layout.offsets[0], scene.layout.offsets[1])
+    poses = scene.poses((7, 3))
+    assert np.allclose(poses[:, BODY["cube"], 0], (0.07, 0.06))
+
+
+def test_a_ghost_is_tinted_and_drawn_only_where_it_parts() -> None:
+    a, b = made(10), made(10)
+    poses_of(b)[5:, BODY["cube"], 1] += 0.1
+    scene = review_scene(opened(a, b), ghosts=True)
+    assert scene is not None and not scene.layout.offsets.any()
+    ghosts = {int(v.bodies[0]): v.material for v in scene.geometry.visuals if 1 in v.envs}
+    assert set(ghosts) == {BODY["cube"]}, "what rests at one place in both is drawn once"
+    assert ghosts[BODY["cube"]].base_color[3] == SEE_THROUGH
+    assert np.isnan(scene.poses((4, 4))[1]).all(), "as long as they are together there is no ghost"
+    apart = scene.poses((6, 6))[1]
+    assert np.isfinite(apart[BODY["cube"]]).all() and np.isnan(apart[BODY["arm/hand"]]).all()
+
+
+def test_recordings_with_other_bodies_and_without_a_scene() -> None:
+    a, b, c = made(3), made(3), made(3)
+    b.geometry = replace(geometry_of(b), body_names=("ground", "table", "arm/hand", "box"))
+    c.geometry = c.poses = None
+    scene = review_scene(opened(a, b, c), ghosts=False)
+    assert scene is not None
+    names = scene.geometry.body_names
+    assert names == ("ground", "table", "arm/hand", "cube", "box")
+    poses = scene.poses((0, 0, 0))
+    assert np.isnan(poses[0, 4]).all() and np.isnan(poses[1, 3]).all() and np.isnan(poses[2]).all()
+    assert review_scene(opened(c), ghosts=True) is None

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import viser
+
+from tests.ui.scenes import table_scene
+from workbench.core.scene.shapes import Material
+from workbench.ui.scene.bodies import SceneView
+from workbench.ui.scene.env_grid import lay_out
+from workbench.ui.scene.glb import group_by_wearers
+
+
+def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:
+    return next(handle for handle in view.handles if part in handle.name)
+
+
+def test_one_node_for_everything_that_the_same_bodies_wear(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(4)
+    view = SceneView(server)
+    view.build(geometry, lay_out(geometry, poses), poses)
+    assert len(view.handles) == len(group_by_wearers(geometry)) == 4
+
+
+def test_bodies_stand_at_their_pose_plus_their_env_s_place(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    poses[:, 3, :3] += [0.1, 0.2, 0.3]
+    poses[2, 3, 3:] = [0, 0, 0, 1]
+    view.move(poses, layout, only_env=None)
+    cube = handle_named(view, "cube")
+    np.testing.assert_allclose(cube.batched_positions, poses[:, 3, :3] + layout.offsets, atol=1e-6)
+    np.testing.assert_allclose(cube.batched_wxyzs, poses[:, 3, 3:])
+
+
+def test_floor_is_drawn_once(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(9)
+    view = SceneView(server)
+    view.build(geometry, lay_out(geometry, poses), poses)
+    assert handle_named(view, "ground").batched_positions.shape == (1, 3)
+
+
+def test_one_env_alone_sends_one_env_at_the_origin(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(9)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses, only_env=5)
+    np.testing.assert_allclose(handle_named(view, "cube").batched_positions, poses[5:6, 3, :3])
+    view.move(poses, layout, only_env=None)
+    assert handle_named(view, "cube").batched_positions.shape == (9, 3)
+
+
+def test_absent_body_is_left_out_and_hidden_when_no_env_has_it(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(3)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    poses[1, 3] = np.nan
+    view.move(poses, layout, None)
+    cube = handle_named(view, "cube")
+    assert cube.batched_positions.shape == (2, 3)
+    assert np.isfinite(cube.batched_positions).all()
+    poses[:, 3] = np.nan
+    view.move(poses, layout, None)
+    assert not cube.visible
+    poses[:, 3] = poses[:, 2]
+    view.move(poses, layout, None)
+    assert cube.visible
+
+
+def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    before = view.handles
+    again, _ = table_scene(4)
+    blue = replace(again.visuals[4], material=Material((0.0, 0.0, 1.0, 1.0)))
+    again = replace(again, visuals=(*again.visuals[:4], blue))
+    view.build(again, layout, poses)
+    assert all(new is old for new, old in zip(view.handles[:3], before[:3], strict=True))
+    assert view.handles[3] is not before[3]
+
+
+def test_number_of_envs_may_change_between_two_loads(server: viser.ViserServer) -> None:
+    view = SceneView(server)
+    for num_envs in (4, 1, 16):
+        geometry, poses = table_scene(num_envs)
+        view.build(geometry, lay_out(geometry, poses), poses)
+        assert handle_named(view, "cube").batched_positions.shape == (num_envs, 3)
+    view.clear()
+    assert view.handles == ()
+
+
+def test_scene_without_a_floor_gets_a_grid(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(2)
+    geometry = replace(geometry, visuals=geometry.visuals[1:])
+    view = SceneView(server)
+    view.build(geometry, lay_out(geometry, poses), poses)
+    assert server.scene.get_handle_by_name("/floor") is not None

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import viser
+import websockets.sync.client
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.drive.waiting import until
+from tests.ui.scenes import table_scene
+from tests.ui.tabs import camera_message, handshake
+from workbench.core.camera_data import Picture
+from workbench.ui.scene.env_grid import lay_out
+from workbench.ui.scene.viewpoint import FOV, Framing, Viewpoint, frame_all, frame_box, frame_one
+
+
+@given(
+    size=st.tuples(st.floats(0.05, 60), st.floats(0.05, 60), st.floats(0.05, 10)),
+    aspect=st.floats(0.35, 3.5),
+    covered=st.floats(0, 0.45),
+)
+@settings(deadline=None, max_examples=80)
+def test_whole_box_is_in_the_picture_above_what_is_covered(
+    size: tuple[float, float, float], aspect: float, covered: float
+) -> None:
+    low, high = -np.array(size) / 2, np.array(size) / 2
+    viewpoint = frame_box(low, high, aspect, covered)
+    forward = viewpoint.look_at - viewpoint.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.where(picks == 0, low, high) - viewpoint.position
+    depth = corners @ forward
+    assert (depth > 0).all()
+    assert (corners @ up <= np.tan(FOV / 2) * depth).all()
+    assert (corners @ up >= -(1 - 2 * covered) * np.tan(FOV / 2) * depth).all()
+    assert (np.abs(corners @ right) <= np.tan(FOV / 2) * aspect * depth).all()
+
+
+def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
+    geometry, poses = table_scene(1)
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    picture, covered, fovy = Picture("render_camera", "human", 0, pose), 0.3, 1.0
+    viewpoint = frame_one(lay_out(geometry, poses), picture, 1.25, covered, fovy)
+    layout = lay_out(geometry, poses)
+    depth = 1.5 - float(layout.low[0] + layout.high[0]) / 2
+    away = viewpoint.position[0] - (1.5 - depth)
+    for part, place in ((0.0, covered), (1.0, 1.0), (-1.0, -(1 - 2 * covered))):
+        # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
+        z = 0.4 + part * depth * np.tan(fovy / 2)
+        assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV / 2)) - place) < 1e-5
+
+
+def test_more_envs_are_seen_from_further_away() -> None:
+    def distance(num_envs: int) -> float:
+        geometry, poses = table_scene(num_envs)
+        viewpoint = frame_all(lay_out(geometry, poses))
+        return float(np.linalg.norm(viewpoint.position - viewpoint.look_at))
+
+    assert distance(1) < distance(4) < distance(64)
+
+
+def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
+    geometry, poses = table_scene(1)
+    # At x = 1.5, turned half round z: it looks along -x.
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    viewpoint = frame_one(lay_out(geometry, poses), Picture("render_camera", "human", 0, pose))
+    np.testing.assert_allclose(viewpoint.position, pose[:3], atol=1e-6)
+    towards = viewpoint.look_at - viewpoint.position
+    np.testing.assert_allclose(towards / np.linalg.norm(towards), [-1, 0, 0], atol=1e-6)
+
+
+def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
+    server: viser.ViserServer,
+) -> None:
+    framing = Framing(server)
+
+    def frame(aspect: float, height: float) -> Viewpoint:
+        return frame_box(np.full(3, -1.0), np.full(3, 1.0), aspect)
+
+    framing.frame(frame)
+    address, arguments = handshake(f"http://127.0.0.1:{server.get_port()}")
+    with websockets.sync.client.connect(address, **arguments) as page:
+
+        def shows(width: int, position: np.ndarray) -> np.ndarray:
+            """Where it looks from after it said that it is so wide."""
+            page.send(camera_message(position.tolist(), width))
+            until(
+                lambda: any(one.camera.image_width == width for one in server.get_clients().values()),
+                "its width",
+            )
+            framing.follow()
+            framing.frame_untouched(frame)
+            (client,) = server.get_clients().values()
+            return np.array(client.camera.position)
+
+        at = np.array(server.initial_camera.position)
+        for narrower in (600, 500, 400):
+            before, at = at, shows(narrower, at)
+            assert np.linalg.norm(at) != np.linalg.norm(before), narrower
+        assert np.allclose(at, frame(400 / 720, 720).position)
+        begins = np.array(server.initial_camera.position)
+        assert np.allclose(shows(399, begins), frame(399 / 720, 720).position), "where it begins came after"
+        moved = at + 0.1
+        assert np.allclose(shows(300, moved), moved), "the view is the person's"

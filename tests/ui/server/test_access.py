@@ -1,0 +1,256 @@
+"""The judgement on one request, as a function: `test_door_attacks` asks the same over real sockets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from urllib.parse import quote
+
+import pytest
+
+from workbench.ui.server.access import (
+    Admitted,
+    Asked,
+    Entered,
+    Gate,
+    Refused,
+    Verdict,
+    Why,
+    cookie_name,
+    host_is_ours,
+    is_loopback,
+    judge,
+    split_authority,
+)
+
+TOKEN = "right"
+GATE = Gate(TOKEN)
+KNOWN = Asked(path="/", host=["localhost:8080"], cookie=["workbench-token-8080=right"])
+
+
+def why(verdict: Verdict) -> Why | None:
+    return verdict.why if isinstance(verdict, Refused) else None
+
+
+@pytest.mark.parametrize(
+    ("text", "split"),
+    [
+        ("localhost", ("localhost", None)),
+        ("LocalHost:1", ("localhost", 1)),
+        ("a_box.Lab.example:65535", ("a_box.lab.example", 65535)),
+        ("127.0.0.1:8080", ("127.0.0.1", 8080)),
+        ("[::1]", ("::1", None)),
+        ("[2001:DB8:0:0::1]:80", ("2001:db8::1", 80)),
+        ("[::ffff:127.0.0.1]:80", ("::ffff:7f00:1", 80)),
+        ("a" * 253, ("a" * 253, None)),
+        ("a" * 254, None),
+        ("localhost:0", None),
+        ("localhost:65536", None),
+        ("localhost:", None),
+        ("localhost:80:80", None),
+        (":80", None),
+        ("[::1", None),
+        ("[:::1]", None),
+        ("::1", None),
+        ("user@localhost", None),
+        ("", None),
+    ],
+)
+def test_a_host_and_its_port_are_read_or_refused(text: str, split: tuple[str, int | None] | None) -> None:
+    assert split_authority(text) == split
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("localhost", True),
+        ("127.0.0.1", True),
+        ("127.9.9.9", True),
+        ("::1", True),
+        ("128.0.0.1", False),
+        ("::2", False),
+        ("localhost.example", False),
+    ],
+)
+def test_loopback_is_localhost_and_its_addresses(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback
+    assert host_is_ours(GATE, host) is loopback
+
+
+def test_a_gate_takes_no_address_and_no_name_that_it_was_not_given() -> None:
+    for host in ("192.168.1.5", "box", "evil.example"):
+        assert not host_is_ours(GATE, host)
+        assert host_is_ours(Gate(TOKEN, names=frozenset({host})), host)
+    assert host_is_ours(Gate(TOKEN, any_address=True), "192.168.1.5")
+    assert not host_is_ours(Gate(TOKEN, any_address=True), "box")
+
+
+def test_the_host_is_quoted_as_it_was_sent() -> None:
+    for websocket in (False, True):
+        for gate in (GATE, Gate(None)):
+            asked = replace(KNOWN, host=["LocalHost:8080"], websocket=websocket)
+            assert judge(gate, asked) == Admitted("LocalHost:8080")
+
+
+@pytest.mark.parametrize("host", [[], [""], ["evil.example"], ["localhost:8080", "localhost:8080"]])
+def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list[str]) -> None:
+    for websocket in (False, True):
+        assert why(judge(GATE, replace(KNOWN, host=host, websocket=websocket))) is Why.NAME
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "ours"),
+    [
+        ("localhost:8080", "http://localhost:8080", True),
+        ("localhost:8080", "HTTP://LOCALHOST:8080", True),
+        ("localhost:8080", "https://localhost:8080", True),
+        ("localhost:8080", "http://127.0.0.1:8080", False),
+        ("localhost:8080", "http://localhost:8081", False),
+        ("localhost:8080", "http://localhost", False),
+        ("localhost:8080", "ws://localhost:8080", False),
+        ("localhost:8080", "localhost:8080", False),
+        ("localhost:8080", "null", False),
+        ("localhost:8080", "http://", False),
+        ("localhost:8080", "http:localhost:8080", False),
+        # A scheme's own port may be left out on either side.
+        ("localhost", "http://localhost", True),
+        ("localhost", "http://localhost:80", True),
+        ("localhost:80", "http://localhost", True),
+        ("localhost", "https://localhost:443", True),
+        ("localhost:443", "https://localhost", True),
+        ("localhost:443", "http://localhost", False),
+        ("localhost:80", "https://localhost", False),
+    ],
+)
+def test_an_origin_is_ours_where_scheme_host_and_port_lead_here(host: str, origin: str, ours: bool) -> None:
+    assert judge(Gate(None), Asked("/", [host], origin=[origin])) == (
+        Admitted(host) if ours else Refused(Why.SITE, "It came from a page of another site.")
+    )
+
+
+def test_an_origin_that_is_sent_twice_is_refused() -> None:
+    ours = "http://localhost:8080"
+    assert why(judge(GATE, replace(KNOWN, origin=[ours]))) is None
+    assert why(judge(GATE, replace(KNOWN, origin=[ours, ours]))) is Why.SITE
+
+
+NAVIGATES, DOCUMENT = {"fetch_mode": ["navigate"]}, {"fetch_dest": ["document"]}
+
+
+@pytest.mark.parametrize("site", ["same-origin", "none"])
+def test_what_the_page_itself_asks_for_is_let_in(site: str) -> None:
+    assert why(judge(GATE, replace(KNOWN, fetch_site=[site]))) is None
+
+
+@pytest.mark.parametrize("site", [["cross-site"], ["same-site"], [""], ["none", "cross-site"]])
+def test_what_a_foreign_page_loads_is_refused_and_a_link_that_a_person_followed_is_not(
+    site: list[str],
+) -> None:
+    foreign = replace(KNOWN, fetch_site=site)
+    for loaded in (foreign, replace(foreign, **NAVIGATES), replace(foreign, **DOCUMENT)):
+        assert why(judge(GATE, loaded)) is Why.SITE
+    framed = replace(foreign, **NAVIGATES, fetch_dest=["iframe"])
+    assert why(judge(GATE, framed)) is Why.SITE
+    assert why(judge(GATE, replace(foreign, **NAVIGATES, **DOCUMENT))) is None
+    # Browsers differ in what they say of a handshake, which carries an Origin anyway.
+    assert why(judge(GATE, replace(foreign, websocket=True))) is None
+
+
+def test_the_cookie_is_the_one_of_the_port_that_the_browser_sees() -> None:
+    assert cookie_name(8080) == "workbench-token-8080"
+    for host, port in (("localhost", 80), ("localhost:80", 80), ("localhost:9000", 9000)):
+        name = cookie_name(port)
+        assert why(judge(GATE, Asked("/", [host], cookie=[f"{name}={TOKEN}"]))) is None
+        assert (
+            why(judge(GATE, Asked("/", [host], cookie=[f"{cookie_name(port + 1)}={TOKEN}"]))) is Why.NO_TOKEN
+        )
+        assert why(judge(GATE, Asked("/", [host], cookie=[f"{name}=wrong"]))) is Why.OTHER_TOKEN
+        entered = judge(GATE, Asked(f"/?token={TOKEN}", [host]))
+        assert isinstance(entered, Entered)
+        assert entered.set_cookie == f"{name}={TOKEN}; Path=/; HttpOnly; SameSite=Strict"
+
+
+def test_a_wrong_cookie_hides_no_right_one() -> None:
+    name = cookie_name(8080)
+    for cookies in (
+        [f"{name}=wrong; {name}={TOKEN}"],
+        [f"a=b;{name}={TOKEN};  {name}=wrong"],
+        [f"{name}=wrong", f"{name}={TOKEN}"],
+    ):
+        assert why(judge(GATE, replace(KNOWN, cookie=cookies))) is None
+    # A token may hold the sign that ends a cookie's name.
+    assert why(judge(Gate("a=b"), replace(KNOWN, cookie=[f"{name}=a=b"]))) is None
+
+
+@pytest.mark.parametrize(
+    ("path", "location"),
+    [
+        ("/?token=right", "/"),
+        ("/some/page?token=right&x=1", "/some/page?x=1"),
+        ("/page?x=&y=a%20b&token=right", "/page?x=&y=a+b"),
+        ("/~who/a%20b?token=right", "/~who/a%20b"),
+        ("//evil.example/x?token=right", "/evil.example/x"),
+        ("/\\evil.example?token=right", "/evil.example"),
+        ("/%5C%2Fevil.example?token=right", "/evil.example"),
+        ("/x?token=right&next=//evil.example", "/x?next=%2F%2Fevil.example"),
+        ("/x?token=right&a?b=c", "/x?a%3Fb=c"),
+    ],
+)
+def test_the_right_token_in_the_address_goes_on_to_the_same_page_without_it(path: str, location: str) -> None:
+    for cookie in ([], KNOWN.cookie):
+        entered = judge(GATE, replace(KNOWN, path=path, cookie=cookie))
+        assert isinstance(entered, Entered)
+        assert (entered.location, entered.by_page) == (location, False)
+
+
+def test_a_link_on_another_site_with_the_token_goes_on_by_a_page() -> None:
+    followed = replace(KNOWN, path="/?token=right", **NAVIGATES, **DOCUMENT)
+    for site, by_page in (("cross-site", True), ("same-site", True), ("none", False)):
+        entered = judge(GATE, replace(followed, fetch_site=[site]))
+        assert isinstance(entered, Entered) and entered.by_page is by_page
+
+
+@pytest.mark.parametrize(
+    "query", ["token=wrong", "token=righ", "token=rightt", "token=right&token=right", f"token={quote('é')}"]
+)
+def test_a_wrong_or_doubled_token_in_the_address_is_refused_even_with_the_cookie(query: str) -> None:
+    assert why(judge(GATE, replace(KNOWN, path=f"/?{query}"))) is Why.OTHER_TOKEN
+
+
+def test_the_token_in_a_handshakes_address_counts_for_nothing() -> None:
+    handshake = replace(KNOWN, path="/?token=right", websocket=True)
+    assert judge(GATE, handshake) == Admitted("localhost:8080")
+    assert why(judge(GATE, replace(handshake, cookie=[]))) is Why.NO_TOKEN
+
+
+def test_another_word_of_the_address_is_no_token() -> None:
+    assert why(judge(GATE, replace(KNOWN, path="/?other=right", cookie=[]))) is Why.NO_TOKEN
+    assert why(judge(GATE, replace(KNOWN, path="/?other=right"))) is None
+
+
+def test_an_empty_token_in_the_address_is_none() -> None:
+    assert why(judge(GATE, replace(KNOWN, path="/?token="))) is None
+    assert why(judge(GATE, replace(KNOWN, path="/?token=", cookie=[]))) is Why.NO_TOKEN
+
+
+def test_where_no_token_is_asked_for_one_in_the_address_is_a_word_like_others() -> None:
+    assert judge(Gate(None), replace(KNOWN, path="/?token=right")) == Admitted("localhost:8080")
+
+
+@pytest.mark.parametrize("cookie", ["workbench-token-8080", f"workbench-token-8080=\udc80{TOKEN}"])
+def test_a_cookie_without_a_value_or_with_bytes_that_are_no_text_is_another_token(cookie: str) -> None:
+    assert why(judge(GATE, replace(KNOWN, cookie=[cookie]))) is Why.OTHER_TOKEN
+
+
+def test_each_refusal_is_a_sentence_without_the_requests_words() -> None:
+    evil = "evil.example"
+    asked = [
+        replace(KNOWN, host=[evil]),
+        replace(KNOWN, origin=[f"http://{evil}"]),
+        replace(KNOWN, fetch_site=[evil]),
+        replace(KNOWN, path=f"/?token={evil}"),
+        replace(KNOWN, cookie=[f"other={evil}"]),
+    ]
+    reasons = [verdict.reason for one in asked if isinstance(verdict := judge(GATE, one), Refused)]
+    assert len(set(reasons)) == len(asked)
+    for reason in reasons:
+        assert evil not in reason and reason[0].isupper() and reason.endswith(".")

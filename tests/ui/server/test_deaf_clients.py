@@ -1,0 +1,85 @@
+"""A slow line is not a deaf client: real sockets, with little room in the kernel."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+
+from workbench.ui.server import strangers
+
+MESSAGE = b"x" * 2**20
+
+
+def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
+    """Serve one message to this client, and the bytes of it that were unsent when the server was done with it."""
+
+    async def both() -> int | None:
+        ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
+
+        async def handler(connection: ServerConnection) -> None:
+            watch = asyncio.create_task(strangers.let_go_when_deaf(connection))
+            try:
+                await connection.send(MESSAGE)
+                await connection.recv()
+                ended.set_result(strangers.unsent(connection))
+            except ConnectionClosed:
+                ended.set_result(None)
+            finally:
+                watch.cancel()
+
+        listening = socket.create_server(("127.0.0.1", 0))
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        async with serve(handler, sock=listening, compression=None):
+            small = socket.socket()
+            small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            small.connect(listening.getsockname())
+            address = f"ws://127.0.0.1:{listening.getsockname()[1]}"
+            async with connect(address, sock=small, compression=None, close_timeout=0.1) as connection:
+                await client(connection)
+                return await ended
+
+    return asyncio.run(asyncio.wait_for(both(), 60))
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strangers, "READ_WITHIN", 1.0)
+
+
+def test_a_client_that_reads_nothing_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
+    async def read_nothing(connection: ClientConnection) -> None:
+        connection.transport.pause_reading()
+
+    assert talk(read_nothing) is None
+    assert "has read nothing for 1 s" in caplog.text
+
+
+def test_one_that_reads_slowly_gets_all_of_it_however_long_it_takes() -> None:
+    async def read_a_little_now_and_then(connection: ClientConnection) -> None:
+        took = asyncio.create_task(connection.recv())
+        for _ in range(15):  # three times as long as one that reads nothing is waited for
+            connection.transport.pause_reading()
+            await asyncio.sleep(0.2)
+            assert not took.done(), "this is not slow"
+            connection.transport.resume_reading()
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+        assert await took == MESSAGE
+        await connection.send("thanks")
+
+    assert talk(read_a_little_now_and_then) == 0
+
+
+def test_one_that_has_nothing_to_read_is_not_deaf() -> None:
+    async def wait(connection: ClientConnection) -> None:
+        assert await connection.recv() == MESSAGE
+        await asyncio.sleep(2.0)
+        await connection.send("thanks")
+
+    assert talk(wait) == 0

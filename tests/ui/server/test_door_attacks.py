@@ -1,0 +1,648 @@
+"""The attacker's side of the door, over real sockets on loopback and from a real browser."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import http.server
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import quote
+
+import msgspec
+import psutil
+import pytest
+import viser
+import viser._messages
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.drive.page import page_at
+from tests.drive.waiting import until
+from tests.ui.knocking import (
+    CAMERA,
+    PROTOCOL,
+    ask,
+    both,
+    claim,
+    client,
+    close_code,
+    cookie_of,
+    knock,
+    say,
+    token_of,
+)
+from workbench.ui.server import responses, viser_private
+from workbench.ui.server.access import (
+    Admitted,
+    Asked,
+    Entered,
+    Gate,
+    Refused,
+    cookie_name,
+    host_is_ours,
+    judge,
+)
+from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.page_guard import PageGuard
+from workbench.ui.server.strangers import ToldRarely
+from workbench.ui.server.viser_private import element_id
+
+# A busy machine is no failure, and one door is for all that is tried on it.
+unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
+
+
+@pytest.fixture
+def bystander(door: Door) -> Iterator[Callable[[], None]]:
+    """An honest client that was there before; call it to see that it still works."""
+    checkbox = door.server.gui.add_checkbox("alive", False)
+    with client(door) as connection:
+
+        def works() -> None:
+            wanted = not checkbox.value
+            say(connection, claim(checkbox, wanted))
+            until(lambda: checkbox.value == wanted, "what the honest page changed")
+
+        works()
+        yield works
+    checkbox.remove()
+
+
+# The gate ----------------------------------------------------------------------------------------
+
+
+def test_an_honest_page_is_let_in(door):
+    assert both(door) == (200, 101)
+    assert both(door, Sec_Fetch_Site="same-origin") == (200, 101)
+    assert ask(door, Sec_Fetch_Site="none")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "https://evil.example",
+        "http://evil.example:{port}",
+        "null",
+        "",
+        "http://127.0.0.1",
+        "http://127.0.0.1:3000",
+        "http://localhost:{port}",  # another origin than the Host to a browser
+        "http://127.0.0.1:{port}.evil.example",
+        "http://127.0.0.1:{port}@evil.example",
+        "http://evil.example#127.0.0.1:{port}",
+        "file://",
+        "chrome-extension://127.0.0.1:{port}",
+    ],
+)
+def test_a_page_of_another_origin_is_refused_even_with_the_cookie(door, origin):
+    assert both(door, Origin=origin.format(port=door.port)) == (403, 403)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example",
+        "evil.example:{port}",
+        "127.0.0.1.nip.io:{port}",
+        "localhost.evil.example:{port}",
+        "127.0.0.1:{port}.evil.example",
+        "127.0.0.1:{port}@evil.example",
+        "evil.example@127.0.0.1:{port}",
+        "192.168.1.5:{port}",
+        "0.0.0.0:{port}",
+        "",
+        None,
+    ],
+)
+def test_a_rebound_host_is_refused_even_with_the_token(door, host):
+    host = host and host.format(port=door.port)
+    origin = f"http://{host}"  # a rebound page is same-origin with its own name
+    assert both(door, Host=host, Origin=origin) == (403, 403)
+    assert ask(door, f"/?token={token_of(door)}", Host=host)[0] == 403
+
+
+def test_two_hosts_or_two_origins_are_refused(door):
+    for name, first, second in (
+        ("Host", f"127.0.0.1:{door.port}", "evil.example"),
+        ("Origin", f"http://127.0.0.1:{door.port}", "https://evil.example"),
+    ):
+        request = f"GET / HTTP/1.1\r\n{name}: {first}\r\n{name}: {second}\r\nCookie: {cookie_of(door)}\r\n"
+        if name == "Origin":
+            request += f"Host: 127.0.0.1:{door.port}\r\n"
+        with socket.create_connection(("127.0.0.1", door.port), timeout=20) as raw:
+            raw.sendall(request.encode() + b"\r\n")
+            assert raw.recv(12) == b"HTTP/1.1 403"
+
+
+def test_without_the_token_nothing_is_served(door):
+    for path in ("/", "/index.html", "/workbench/logo.svg", "/no-such-file", "/?token="):
+        assert ask(door, path, Cookie=None)[0] == 403, path
+    assert knock(door, Cookie=None) == 403
+
+
+@pytest.mark.parametrize(
+    "change", [str.lower, lambda t: t[:-1], lambda t: t + "A", lambda t: "", lambda t: "é" + t]
+)
+def test_a_wrong_token_is_refused_wherever_it_is_shown(door, change):
+    wrong = change(token_of(door))
+    status, headers, _ = ask(door, f"/?token={quote(wrong)}", Cookie=None)
+    assert status == 403
+    assert "Set-Cookie" not in headers
+    assert both(door, Cookie=f"{cookie_name(door.port)}={wrong.replace('é', 'e')}") == (403, 403)
+
+
+def test_the_token_in_a_websockets_address_is_no_way_in(door):
+    handshake: dict[str, str | None] = {"Upgrade": "websocket", "Connection": "Upgrade", "Cookie": None}
+    assert ask(door, f"/?token={token_of(door)}", **handshake)[0] == 403
+
+
+def test_the_right_token_becomes_a_cookie_and_leaves_the_address(door):
+    status, headers, body = ask(door, f"/some/page?token={token_of(door)}&x=1", Cookie=None)
+    assert (status, headers["Location"], body) == (303, "/some/page?x=1", b"")
+    assert headers["Cache-Control"] == "no-store"
+    cookie = headers["Set-Cookie"]
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(cookie.split("; "))
+    assert both(door, Cookie=cookie.partition(";")[0]) == (200, 101)
+
+
+def test_the_cookie_goes_by_the_port_that_the_browser_sees(door):
+    """ssh -L 9000:127.0.0.1:PORT."""
+    _, headers, _ = ask(door, f"/?token={token_of(door)}", Host="localhost:9000", Cookie=None)
+    cookie = headers["Set-Cookie"].partition(";")[0]
+    assert cookie.startswith("workbench-token-9000=")
+    tunnel = {"Host": "localhost:9000", "Origin": "http://localhost:9000"}
+    assert both(door, Cookie=cookie, **tunnel) == (200, 101)
+
+
+def test_the_cookie_of_another_ports_workbench_is_refused(door):
+    other = open_door(DoorOptions(port=0))
+    try:
+        assert both(door, Cookie=cookie_of(other)) == (403, 403)
+        assert both(door, Cookie=f"{cookie_name(door.port)}={token_of(other)}") == (403, 403)
+        assert both(door, Cookie=f"{cookie_name(other.port)}={token_of(door)}") == (403, 403)
+        # And the browser that is in both shows both, in any order.
+        assert both(door, Cookie=f"{cookie_of(other)}; {cookie_of(door)}") == (200, 101)
+        assert both(other, Cookie=f"{cookie_of(other)}; {cookie_of(door)}") == (200, 101)
+    finally:
+        other.close()
+
+
+def test_a_forged_cookie_beside_the_right_one_locks_nobody_out(door):
+    assert both(door, Cookie=f"{cookie_name(door.port)}=forged; {cookie_of(door)}") == (200, 101)
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "same-origin, none"])
+def test_a_foreign_pages_script_tag_gets_nothing(door, site):
+    """It carries no Origin, and from another port of this machine it carries the cookie."""
+    assert ask(door, "/workbench/logo.svg", Sec_Fetch_Site=site, **LOADED_BY)[0] == 403
+    assert ask(door, f"/?token={token_of(door)}", Sec_Fetch_Site=site, **LOADED_BY)[0] == 403
+
+
+@pytest.mark.parametrize(
+    "path", ["//evil.example", "/\\evil.example", "///evil.example/x", "/%2fevil.example", "/\\/evil.example"]
+)
+def test_the_right_token_redirects_to_no_other_host(door, path):
+    status, headers, _ = ask(door, f"{path}?token={token_of(door)}")
+    assert status == 303
+    location = headers["Location"]
+    assert location.startswith("/")
+    assert location[1:2] not in ("/", "\\")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/workbench/../../../../etc/passwd",
+        "/workbench/%2e%2e/%2e%2e/pyproject.toml",
+        "/workbench/%2e%2e%2f%2e%2e%2fpyproject.toml",
+        "/workbench/..%5cpyproject.toml",
+        "/workbench/..\\pyproject.toml",
+        "/workbench/%252e%252e/pyproject.toml",
+        "/workbench//etc/passwd",
+        "/workbench/%2fetc%2fpasswd",
+        "/workbench/logo.svg%00.html",
+        "/workbench/../pyproject.toml",
+        "/workbench/panels/../../pyproject.toml",
+        "/workbench/",
+        "/workbench/panels",
+        "/../../../etc/passwd",
+        "/%2e%2e/%2e%2e/version.py",
+        "/..\\..\\version.py",
+        "//etc/passwd",
+    ],
+)
+def test_no_path_leads_out_of_the_served_folders(door, path):
+    status, _, body = ask(door, path)
+    assert status == 404
+    assert b"root:" not in body and b"[project]" not in body and b"version" not in body
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"\x00\x01\x02\r\n\r\n",
+        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 1000 + b"\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00",  # TLS
+    ],
+)
+def test_garbage_instead_of_http_harms_nobody(door, bystander, raw, capfd):
+    with socket.create_connection(("127.0.0.1", door.port), timeout=20) as connection:
+        connection.sendall(raw)
+        connection.shutdown(socket.SHUT_WR)
+        answer = connection.recv(64)
+    assert b" 200 " not in answer and b" 101 " not in answer
+    bystander()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+hosts = st.from_regex(r"[A-Za-z0-9.:@\[\]/\\_-]{0,30}", fullmatch=True)
+
+
+@unhurried
+@given(host=st.one_of(hosts, st.text(max_size=30)), path=st.text(max_size=40), cookie=st.text(max_size=40))
+def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, cookie):
+    gate = Gate(token="x" * 43, any_address=True)
+    for websocket in (False, True):
+        asked = Asked(path=path, host=[host], origin=[f"http://{host}"], cookie=[cookie], websocket=websocket)
+        assert isinstance(judge(gate, asked), Refused)
+
+
+@unhurried
+@given(hosts)
+def test_without_a_token_only_loopback_hosts_are_let_in(host):
+    verdict = judge(Gate(token=None), Asked(path="/", host=[host]))
+    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+    loopback = name.lower() == "localhost" or name.startswith(("127.", "["))
+    assert isinstance(verdict, Refused) or loopback
+
+
+@unhurried
+@given(st.text(max_size=60))
+def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
+    gate = Gate(token="right")
+    verdict = judge(gate, Asked(path=f"{path}?token=right", host=["localhost:8080"]))
+    if isinstance(verdict, Entered):
+        assert verdict.location.startswith("/")
+        assert verdict.location[1:2] not in ("/", "\\")
+        assert verdict.location.isascii() and verdict.location.isprintable()
+        assert "token=right" not in verdict.location
+
+
+@unhurried
+@given(
+    st.text(st.characters(codec="ascii", categories=("Ll", "Nd")), min_size=1, max_size=12).filter(
+        lambda name: not name.isdigit()
+    )
+)
+def test_a_wider_gate_takes_bare_addresses_and_its_own_names_but_no_foreign_name(name):
+    gate = Gate(token=None, names=frozenset({"our-box"}), any_address=True)
+    for ours in ("192.168.1.5", "2001:db8::1", "our-box", "localhost", "::1"):
+        assert host_is_ours(gate, ours)
+    for foreign in (f"{name}.example", f"our-box.{name}.example", f"{name}-our-box"):
+        assert not host_is_ours(gate, foreign)
+
+
+def test_a_link_from_another_site_with_the_token_goes_on_by_a_page():
+    gate = Gate(token="right")
+    link = Asked(
+        path="/?token=right&a=%22%3E",
+        host=["127.0.0.1:8080"],
+        fetch_site=["cross-site"],
+        fetch_mode=["navigate"],
+        fetch_dest=["document"],
+    )
+    verdict = judge(gate, link)
+    assert isinstance(verdict, Entered) and verdict.by_page
+    assert '"' not in verdict.location and ">" not in verdict.location
+
+
+def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
+    door = open_door(DoorOptions(port=0, token=False))
+    try:
+        assert both(door, Cookie=None) == (200, 101)
+        assert both(door, Cookie=None, Origin="https://evil.example") == (403, 403)
+        assert both(door, Cookie=None, Host="evil.example", Origin="http://evil.example") == (403, 403)
+        assert ask(door, Cookie=None, Sec_Fetch_Site="cross-site", **LOADED_BY)[0] == 403
+        assert isinstance(judge(Gate(token=None), Asked("/", [f"localhost:{door.port}"])), Admitted)
+    finally:
+        door.close()
+
+
+def test_a_wide_door_takes_its_addresses_and_no_foreign_name():
+    door = open_door(DoorOptions(host="0.0.0.0", port=0))
+    try:
+        for host in ("192.168.1.5", socket.gethostname().lower(), "localhost"):
+            assert both(door, Host=f"{host}:{door.port}", Origin=f"http://{host}:{door.port}") == (
+                200,
+                101,
+            ), host
+            assert ask(door, Host=f"{host}:{door.port}", Cookie=None)[0] == 403
+        assert both(door, Host=f"evil.example:{door.port}", Origin=f"http://evil.example:{door.port}") == (
+            403,
+            403,
+        )
+    finally:
+        door.close()
+
+
+# Past the gate: what an authenticated client may say ----------------------------------------------
+
+
+def test_no_client_can_open_the_share_tunnel(door, bystander, caplog):
+    process = psutil.Process()
+    children = set(process.children())
+    threads = {thread.name for thread in threading.enumerate() if "unnel" in thread.name}
+    assert not set(viser_private.REFUSED_FROM_CLIENTS) & set(KINDS)
+    for name in viser_private.REFUSED_FROM_CLIENTS:
+        assert getattr(viser._messages, name) not in door.server._websock_server._incoming_handlers
+    with client(door) as connection:
+        say(connection, {"type": "ShareUrlRequest"})
+        say(connection, {"type": "ShareUrlDisconnect"})
+        text = door.server.gui.add_text("after", "")
+        say(connection, claim(text, "heard"))  # the same connection lives on, and has been read this far
+        until(lambda: text.value == "heard", "what was said last")
+        text.remove()
+    bystander()
+    assert door.server._share_tunnel is None
+    assert set(process.children()) <= children
+    assert {thread.name for thread in threading.enumerate() if "unnel" in thread.name} == threads
+    assert all(
+        link.raddr.ip.startswith("127.")
+        for link in process.net_connections(kind="inet")
+        if link.raddr and link.laddr.port == door.port
+    )
+    assert not [
+        link
+        for link in process.net_connections(kind="inet")
+        if link.raddr and not link.raddr.ip.startswith("127.") and link.raddr.ip != "::1"
+    ]
+    assert "ShareUrlRequest" in caplog.text
+
+
+def test_no_client_can_upload(door, bystander):
+    upload = door.server.gui.add_upload_button("upload")
+    with client(door) as connection:
+        say(
+            connection,
+            {
+                "type": "FileTransferStartUpload",
+                "source_component_uuid": element_id(upload),
+                "transfer_uuid": "t",
+                "filename": "../../etc/passwd",
+                "mime_type": "text/plain",
+                "part_count": 2,
+                "size_bytes": 2**40,
+            },
+        )
+        say(
+            connection,
+            {
+                "type": "FileTransferPart",
+                "source_component_uuid": element_id(upload),
+                "transfer_uuid": "t",
+                "part_index": 0,
+                "content": b"x" * 1000,
+            },
+        )
+        say(connection, claim(upload, {"name": "x", "content": b"y"}, "not_a_value"))
+        box = door.server.gui.add_checkbox("after", False)
+        say(connection, claim(box, True))
+        until(lambda: box.value, "what was said last")
+        box.remove()
+    assert door.server.gui._current_file_upload_states == {}
+    upload.remove()
+    bystander()
+
+
+def test_a_client_changes_nothing_of_a_control_but_its_value(door, bystander):
+    slider = door.server.gui.add_slider("x", 0.0, 10.0, 0.1, 5.0)
+    with client(door) as connection:
+        for prop in ("removed", "is_button", "update_cb", "uuid", "props", "__class__", "no_such"):
+            say(connection, claim(slider, True, prop))
+        say(connection, {**claim(slider, 1.0), "updates": {"value": 1.0, "removed": True}})
+        say(connection, {**claim(slider, 1.0), "updates": {}})
+        say(connection, claim(slider, 7.0))
+        until(lambda: slider.value == 7.0, "the value")
+    assert not slider._impl.removed
+    assert not slider._impl.is_button
+    assert callable(slider.on_update)
+    slider.remove()
+    bystander()
+
+
+def without(message: dict, field: str) -> dict:
+    return {key: value for key, value in message.items() if key != field}
+
+
+@pytest.mark.parametrize(
+    ("frame", "code"),
+    [
+        ("a text frame", 1008),
+        (b"", 1008),
+        (b"\xc1garbage", 1008),
+        (bytes(range(256)), 1008),
+        (msgspec.msgpack.encode([1, 2, 3]), 1008),
+        (msgspec.msgpack.encode({}), 1008),
+        (msgspec.msgpack.encode({"type": 7}), 1008),
+        (msgspec.msgpack.encode({"type": ["GuiUpdateMessage"]}), 1008),
+        (msgspec.msgpack.encode({"type": "NoSuchMessage"}), 1008),
+        (msgspec.msgpack.encode({"type": "np"}), 1008),
+        (msgspec.msgpack.encode(without(CAMERA, "position")), 1008),
+        (msgspec.msgpack.encode({**CAMERA, "surplus": 1}), 1008),
+        (msgspec.msgpack.encode({**CAMERA, "position": (1.0, 2.0)}), 1008),
+        (msgspec.msgpack.encode({**CAMERA, "position": "abc"}), 1008),
+        (msgspec.msgpack.encode({**CAMERA, "position": 5}), 1008),
+        (msgspec.msgpack.encode({**CAMERA, "fov": "wide"}), 1008),
+        (b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6, 1008),  # and no more
+        (msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x", "updates": [1]}), 1008),
+        (msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x", "updates": 1}), 1008),
+        (b"\x91" * 100_000, 1008),  # nested deeper than any stack
+        (b"x" * (MAX_BYTES + 1), 1009),
+    ],
+    ids=lambda value: repr(value)[:40],
+)
+def test_a_malformed_frame_closes_its_own_connection_only(door, bystander, capfd, frame, code):
+    with client(door) as connection:
+        connection.send(frame)
+        assert close_code(connection) == code
+    bystander()
+    with client(door):  # and the door still opens
+        pass
+    # The author's terminal is no place for a stranger's tracebacks.
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@unhurried
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**63), 2**63)
+        | st.floats()
+        | st.text(max_size=8)
+        | st.binary(max_size=8),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+        max_leaves=8,
+    ),
+    st.sampled_from(sorted(KINDS)),
+    st.data(),
+)
+def test_any_message_is_admitted_dropped_or_called_malformed(door, value, kind, data):
+    fields = list(KINDS[kind].__struct_fields__)
+    message = {
+        "type": kind,
+        **dict.fromkeys(data.draw(st.lists(st.sampled_from(fields), max_size=9)), value),
+    }
+    judged(door, msgspec.msgpack.encode(message))
+
+
+@unhurried
+@given(st.binary(max_size=200))
+def test_any_bytes_are_admitted_dropped_or_called_malformed(door, raw):
+    judged(door, raw)
+
+
+def judged(door: Door, raw: bytes) -> None:
+    """Let the guard of a page that is on no connection judge a frame; any other error fails the test."""
+    page = viser_private.ViserPage(None, [door.server])  # type: ignore[arg-type]
+
+    async def judge_it() -> None:
+        guard = PageGuard(page, ToldRarely(lambda line: None))
+        with contextlib.suppress(MalformedMessage):
+            assert guard.admits(raw) in (True, False)
+        guard.close()
+
+    # On a thread of its own: Playwright's loop may be at rest on this one.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, judge_it()).result()
+
+
+def test_what_only_the_server_says_is_dropped_from_a_client(door, bystander):
+    with client(door) as connection:
+        say(connection, {"type": "RunJavascriptMessage", "source": "alert(1)"})
+        box = door.server.gui.add_checkbox("after", False)
+        say(connection, claim(box, True))
+        until(lambda: box.value, "what was said last")
+        box.remove()
+    bystander()
+
+
+def test_viser_listens_to_nothing_that_the_seam_does_not_know(door, bystander):
+    """An upgrade that adds a kind of message must be looked at before clients may send it."""
+    handled = {kind.__name__ for kind in door.server._websock_server._incoming_handlers}
+    for one in door.server.get_clients().values():
+        handled |= {kind.__name__ for kind in one._websock_connection._incoming_handlers}
+    assert handled - set(viser_private.REFUSED_FROM_CLIENTS) <= set(KINDS)
+    assert len(handled) > 5
+
+
+# From a real browser ------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def hostile_site(html: str, handshakes: list[str] | None = None) -> Iterator[int]:
+    """A web server on another port of this machine, which serves ``html`` and notes who comes with a
+    websocket handshake."""
+
+    class Site(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if "Upgrade" in self.headers and handshakes is not None:
+                handshakes.append(self.path)
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(html.encode())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    site = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Site)
+    thread = threading.Thread(target=site.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield site.server_port
+    finally:
+        site.shutdown()
+        site.server_close()
+        thread.join()
+
+
+@pytest.mark.browser
+def test_a_link_cannot_send_our_page_to_another_server(door, browser, monkeypatch):
+    """``?websocket=`` is viser's; what such a server sends would run as our page, with our cookie."""
+    came: list[str] = []
+    later: list[str] = []
+    with (
+        # Another for each try: what was begun in the first may arrive late.
+        hostile_site("", came) as first,
+        hostile_site("", later) as second,
+        page_at(browser, "about:blank", 640, 480) as (page, _),
+    ):
+        page.goto(door.url, wait_until="domcontentloaded")
+        link = f"http://127.0.0.1:{door.port}/?websocket=ws://127.0.0.1:"
+        with monkeypatch.context() as without_policy:
+            without_policy.setattr(responses, "page_policy", lambda authority: "frame-ancestors 'self'")
+            page.goto(f"{link}{first}", wait_until="domcontentloaded")
+            until(lambda: came, "the attack, which is real")
+        page.goto("about:blank")
+        page.goto(f"{link}{second}", wait_until="domcontentloaded")
+        page.wait_for_selector("canvas", timeout=60_000)
+        page.wait_for_timeout(4000)  # it tries once a second, and nobody is told what the policy refuses
+        assert later == []
+
+
+@pytest.mark.browser
+def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door, browser):
+    """The browser holds the cookie. ``127.0.0.1`` on another port is the same *site* to it, so there the
+    cookie is sent along; ``localhost`` is another site."""
+    target = f"127.0.0.1:{door.port}"
+    attack = """
+        <body><script>
+        async function attack() {
+          const seen = {};
+          seen.socket = await new Promise(done => {
+            const socket = new WebSocket("ws://TARGET", "PROTOCOL");
+            socket.onopen = () => done("open"); socket.onerror = () => done("refused");
+          });
+          seen.fetch = await fetch("http://TARGET/", {credentials: "include"}).then(() => "read", () => "refused");
+          seen.image = await new Promise(done => {
+            const image = new Image(); image.onload = () => done("read"); image.onerror = () => done("refused");
+            image.src = "http://TARGET/workbench/logo.svg";
+          });
+          return seen;
+        }
+        </script></body>
+    """
+    attack = attack.replace("TARGET", target).replace("PROTOCOL", PROTOCOL)
+    refused = {"socket": "refused", "fetch": "refused", "image": "refused"}
+    with hostile_site(attack) as port, page_at(browser, "about:blank", 640, 480) as (page, _):
+        page.goto(door.url, wait_until="domcontentloaded")
+        until(door.server.get_clients, "the page")
+        # The attack itself works: from our own page it gets through.
+        own = page.evaluate(
+            "() => {" + attack.partition("<script>")[2].partition("</script>")[0] + "; return attack(); }"
+        )
+        assert own == {"socket": "open", "fetch": "read", "image": "read"}
+        for site in ("127.0.0.1", "localhost"):
+            page.goto(f"http://{site}:{port}/", wait_until="domcontentloaded")
+            assert page.evaluate("attack()") == refused, site
+
+        # A person who follows a link to the printed address in another site's page gets in.
+        page.context.clear_cookies()
+        page.goto(f"http://localhost:{port}/", wait_until="domcontentloaded")
+        page.evaluate(
+            "address => { const a = document.createElement('a'); a.href = address; a.id = 'go'; a.text = 'go';"
+            " document.body.append(a); }",
+            door.url,
+        )
+        page.click("#go")
+        page.wait_for_url(f"http://{target}/", wait_until="domcontentloaded")
+        page.wait_for_selector("canvas", timeout=60_000)

@@ -1,0 +1,170 @@
+"""The headers: what they forbid, and that each exception of the page's policy is needed."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import trimesh
+import trimesh.visual
+import trimesh.visual.material
+from PIL import Image
+from playwright.sync_api import Page
+
+from tests.drive.page import page_at
+from tests.drive.waiting import until
+from tests.ui.knocking import ask
+from workbench.machine.web_assets import web_assets_folder
+from workbench.ui.server import responses
+from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.responses import DIRECTIVES, HANDLERS
+
+
+@pytest.fixture
+def filled(door: Door) -> Door:
+    """With one of each thing that a policy could break: blobs, data, workers, wasm, frames, handlers."""
+    server = door.server
+    server.gui.add_html(
+        "<div id='from-html' style='color: red'>html</div><img src='/workbench/logo.svg'>"
+        '<div onpointerdown="wb.press(event)"><b id="press" data-press="none">x</b></div>'
+        "<iframe src='/workbench/logo.svg'></iframe>"
+    )
+    server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(
+        uv=np.zeros((len(box.vertices), 2)),
+        material=trimesh.visual.material.PBRMaterial(
+            baseColorTexture=Image.new("RGB", (4, 4), (200, 30, 30))
+        ),
+    )
+    server.scene.add_mesh_trimesh("/box", box)
+    server.scene.add_camera_frustum("/frustum", fov=1.0, aspect=1.0, image=np.zeros((8, 8, 3), np.uint8))
+    server.scene.configure_environment_map("city", background=True)
+    return door
+
+
+def complaints_of(page: Page) -> list[str]:
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    return complaints
+
+
+# Without a browser --------------------------------------------------------------------------------
+
+
+def test_every_handler_in_our_templates_is_allowed_and_no_other():
+    used: set[str] = set()
+    for template in (web_assets_folder() / "panels").glob("*.html"):
+        used |= set(re.findall(r'(?:^|\s)on[a-z]+="([^"]*)"', template.read_text(encoding="utf-8")))
+    assert used == set(HANDLERS)
+
+
+def test_code_comes_from_files_and_known_hashes_alone():
+    sources = DIRECTIVES["script-src"].split()
+    assert "'unsafe-inline'" not in sources and "'unsafe-eval'" not in sources
+    assert not [source for source in sources if source.startswith(("http", "blob:", "data:", "*"))]
+    assert DIRECTIVES["default-src"] == "'none'"
+
+
+def test_every_reply_isolates_the_page_and_gives_it_no_devices(door):
+    for path in ("/", "/none", "/workbench/logo.svg", "/?token=wrong"):
+        headers = ask(door, path)[1]
+        assert headers["Cross-Origin-Opener-Policy"] == "same-origin", path
+        assert headers["Cross-Origin-Resource-Policy"] == "same-origin", path
+        for device in ("camera", "microphone", "geolocation", "usb", "serial", "display-capture"):
+            assert f"{device}=()" in headers["Permissions-Policy"], path
+        assert headers.get_all("Content-Security-Policy") is not None, path
+
+
+# In a real browser --------------------------------------------------------------------------------
+
+
+@pytest.mark.browser
+def test_code_that_came_into_the_page_as_html_does_not_run(door, browser):
+    attacks = (
+        '<img src="/none" onerror="document.title=\'ran\'">',
+        "<svg onload=\"document.title='ran'\"></svg>",
+        "<script>document.title='ran'</script>",
+        "<iframe srcdoc=\"<script>parent.document.title='ran'</script>\"></iframe>",
+        "<a id='link' href=\"javascript:document.title='ran'\">x</a>",
+        "<div onclick=\"wb.press(event);document.title='ran'\" id='click'>x</div>",
+        "<object data=\"javascript:document.title='ran'\"></object><embed src='data:text/html,x'>",
+        "<style onload=\"document.title='ran'\"></style><base href='//evil.example/'>",
+    )
+    handle = door.server.gui.add_html("".join(attacks) + "<p id='there'>x</p>")
+    refused = {"inline event handler": 4, "inline script": 2, "JavaScript URL": 1, "plugin": 1, "base URI": 1}
+    with page_at(browser, door.url) as (page, complaints):
+        page.wait_for_selector("#there", timeout=60_000)
+        page.evaluate("document.getElementById('link').click(); document.getElementById('click').click()")
+        page.evaluate(
+            """() => { const s = document.createElement('script'); s.textContent = "document.title='ran'";
+            document.head.append(s) }"""
+        )
+
+        def were() -> dict[str, int]:
+            page.wait_for_timeout(50)  # in which Playwright hears of them
+            return {what: sum(what in complaint for complaint in complaints) for what in refused}
+
+        until(lambda: were() == refused, "the browser's word that each was refused", seen=were)
+        assert page.title() != "ran"
+    handle.remove()
+
+
+@pytest.mark.browser
+def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
+    door = open_door(DoorOptions(port=0))
+    try:
+        with page_at(browser, door.url) as (page, _):
+            until(door.server.get_clients, "the page")
+            door.renew_token()
+            page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
+            page.goto(door.url, wait_until="domcontentloaded")
+            page.wait_for_selector("canvas", timeout=60_000)
+    finally:
+        door.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_each_exception_is_needed(filled, browser, monkeypatch):
+    # 'self' means ws: too in Chromium, but not in every browser; connect-src 'self' is what let_in.js asks when the
+    # connection is lost, see the test above.
+    elsewhere = {("connect-src", source) for source in ("'self'", "ws://{authority}", "wss://{authority}")}
+    # viser's scripts by their hashes; without one there is no page.
+    exceptions = [
+        (name, source)
+        for name, sources in DIRECTIVES.items()
+        for source in sources.split()
+        if source != "'none'" and name != "frame-ancestors" and (name, source) not in elsewhere
+    ]
+
+    def load() -> list[str]:
+        page = browser.new_page(viewport={"width": 640, "height": 480})
+        complaints = complaints_of(page)
+        page.goto(filled.url, wait_until="domcontentloaded")
+        pressed = False
+        # The first complaint is enough; to have none takes as long as everything needs to load.
+        for _ in range(80):
+            page.wait_for_timeout(100)
+            if complaints:
+                break
+            if not pressed and page.query_selector("#press"):
+                page.dispatch_event("#press", "pointerdown")
+                pressed = True
+        page.close()
+        return complaints
+
+    assert load() == []
+    needless = []
+    for name, source in exceptions:
+        others = " ".join(other for other in DIRECTIVES[name].split() if other != source) or "'none'"
+        handler = next((one for one in HANDLERS if source == f"'{responses.hash_of(one)}'"), None)
+        if handler is not None and handler != "wb.press(event)":
+            continue  # each is in a template: the test above
+        with monkeypatch.context() as without:
+            without.setitem(DIRECTIVES, name, others)
+            if not load():
+                needless.append(f"{name} {source}")
+    assert needless == []

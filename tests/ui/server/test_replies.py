@@ -1,0 +1,273 @@
+"""What is answered to a request that was let in, as a function: `test_door` asks the same over real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import html
+import mimetypes
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from workbench.ui.server.access import Asked, Entered
+from workbench.ui.server.responses import (
+    EVERY_REPLY,
+    LONGEST_NAME,
+    LONGEST_PATH,
+    PAGE_OF_OURS,
+    SCRIPTS,
+    STYLES,
+    Handler,
+    admitted_reply,
+    asked_of,
+    content_type,
+    entered_reply,
+    folder_handler,
+    page_policy,
+    refusals,
+    reply,
+    with_our_head,
+)
+
+AUTHORITY = "localhost:8080"
+PAGE = b"<html><head><title>viser</title></head><body></body></html>"
+NO_SUCH_FILE = b"There is no such file."
+
+
+def of_viser(kind: str = "text/html; charset=utf-8", body: bytes = PAGE, **headers: str) -> Any:
+    """viser's own answer to whatever it is asked."""
+    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **headers}
+    return lambda connection, request: Response(200, "OK", Headers(fields), body)
+
+
+def answer(
+    path: str,
+    routes: Mapping[str, tuple[Handler, Mapping[str, str]]] | None = None,
+    viser_hook: Any = None,
+    accepts: str = "",
+) -> Response:
+    request = Request(path, Headers({"Accept-Encoding": accepts} if accepts else {}))
+    connection = cast(ServerConnection, None)  # only a file that is sent while it is read needs one
+    return asyncio.run(admitted_reply(routes or {}, viser_hook or of_viser(), connection, request, AUTHORITY))
+
+
+def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, str, bytes]]:
+    return lambda path: (200, kind, body)
+
+
+def test_the_gate_is_told_every_value_of_what_it_judges() -> None:
+    headers = Headers([("Host", "a"), ("Host", "b"), ("Origin", "c"), ("Cookie", "d"), ("Cookie", "e")])
+    headers.update([("Sec-Fetch-Site", "f"), ("Sec-Fetch-Mode", "g"), ("Sec-Fetch-Dest", "h")])
+    asked = Asked("/x?y", ["a", "b"], ["c"], ["d", "e"], ["f"], ["g"], ["h"], websocket=False)
+    assert asked_of(Request("/x?y", headers)) == asked
+
+
+@pytest.mark.parametrize(
+    ("upgrade", "websocket"),
+    [([], False), (["websocket"], True), (["WebSocket"], False), (["websocket", "websocket"], False)],
+)
+def test_a_handshake_is_what_viser_takes_for_one(upgrade: list[str], websocket: bool) -> None:
+    assert asked_of(Request("/", Headers([("Upgrade", value) for value in upgrade]))).websocket is websocket
+
+
+def test_a_reply_says_its_length_and_how_it_is_packed() -> None:
+    plain = reply(200, "text/plain", b"12345", {"X-Of-It": "1"})
+    assert (plain.status_code, plain.reason_phrase, plain.body) == (200, "OK", b"12345")
+    assert dict(plain.headers.raw_items()) == {
+        "Content-Type": "text/plain",
+        "Content-Length": "5",
+        "X-Of-It": "1",
+        **EVERY_REPLY,
+    }
+    packed = reply(200, "text/plain", b"12345", {}, gzipped=True)
+    assert (packed.headers["Content-Encoding"], packed.headers["Vary"]) == ("gzip", "Accept-Encoding")
+
+
+def test_a_refusal_says_why_and_where_to_go_in_html_that_holds_no_markup_of_theirs() -> None:
+    refused = refusals("http://localhost:8080/?a=<b>")("<script>")
+    text = bytes(refused.body).decode()
+    assert refused.status_code == 403
+    assert "&lt;script&gt;" in text and html.escape("?a=<b>") in text and "<svg" in text
+    assert "<script>" not in text and "{{" not in text
+    assert PAGE_OF_OURS.items() <= dict(refused.headers.raw_items()).items()
+
+
+def test_the_way_in_sets_the_cookie_and_goes_on() -> None:
+    onward = entered_reply(Entered("/x?y=1", "name=token", by_page=False))
+    assert (onward.status_code, onward.headers["Location"], onward.body) == (303, "/x?y=1", b"")
+    by_page = entered_reply(Entered('/x?y="1"&z', "name=token", by_page=True))
+    assert by_page.status_code == 200 and "Location" not in by_page.headers
+    assert b'content="0;url=/x?y=&quot;1&quot;&amp;z"' in by_page.body
+    for made in (onward, by_page):
+        assert made.headers["Set-Cookie"] == "name=token"
+        assert PAGE_OF_OURS.items() <= dict(made.headers.raw_items()).items()
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_visers_page_gets_our_head_and_the_length_that_it_then_has(zipped: bool) -> None:
+    body, headers = (gzip.compress(PAGE), {"Content-Encoding": "gzip"}) if zipped else (PAGE, {})
+    made = answer("/", viser_hook=of_viser(body=body, **headers))
+    assert made.headers.get_all("Content-Length") == [str(len(made.body))]
+    text = (gzip.decompress(made.body) if zipped else bytes(made.body)).decode()
+    head, _, rest = text.partition("</head>")
+    assert head.startswith("<html><head><title>viser</title>") and rest == "<body></body></html>"
+    assert [f'src="/workbench/{name}"' in head for name in SCRIPTS] == [True] * len(SCRIPTS)
+    assert f'<link rel="stylesheet" href="/workbench/{STYLES}">' in head
+    assert made.headers["Content-Security-Policy"] == page_policy(AUTHORITY)
+    assert EVERY_REPLY.items() <= dict(made.headers.raw_items()).items()
+
+
+def test_what_viser_serves_besides_its_page_stays_as_it_is() -> None:
+    made = answer("/x.js", viser_hook=of_viser("text/javascript", b"</head>"))
+    assert (made.body, made.headers["Content-Length"]) == (b"</head>", "7")
+    assert made.headers["Content-Security-Policy"] == page_policy(AUTHORITY)
+    nameless = of_viser("", b"</head>")
+    assert answer("/x", viser_hook=nameless).body == b"</head>"
+
+
+def test_a_page_without_a_head_is_an_error_that_names_viser() -> None:
+    with pytest.raises(ValueError, match="viser .* serves a page with a </head>"):
+        with_our_head(b"<html>", False)
+
+
+def test_what_only_viser_takes_for_a_handshake_is_a_bad_request() -> None:
+    made = answer("/", viser_hook=lambda connection, request: None)
+    assert (made.status_code, bytes(made.body)) == (400, b"Bad request.")
+
+
+def test_the_longest_prefix_gets_the_rest_of_the_path_decoded_once() -> None:
+    def route(name: str) -> Handler:
+        return lambda path: (200, "text/plain", f"{name}: {path}".encode())
+
+    routes = {"/a/": (route("a"), {}), "/a/b/": (route("b"), {"X-Of-Route": "1"})}
+    assert answer("/a/x%20y?z", routes).body == b"a: x y"
+    made = answer("/a/b/x%2520y", routes)
+    assert (made.body, made.headers["X-Of-Route"]) == (b"b: x%20y", "1")
+    assert made.headers["Cache-Control"] == "no-cache"
+    assert answer("/c/x", routes, of_viser("text/plain", b"viser's")).body == b"viser's"
+
+
+def test_a_route_that_fails_says_so_and_its_error_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    def fails(path: str) -> tuple[int, str, bytes]:
+        raise ZeroDivisionError
+
+    made = answer("/a/x", {"/a/": (fails, {})})
+    assert (made.status_code, bytes(made.body)) == (500, b"This went wrong; the terminal says how.")
+    assert caplog.records[0].exc_info and caplog.records[0].exc_info[0] is ZeroDivisionError
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "accepts", "packed"),
+    [
+        ("text/plain; charset=utf-8", 1025, "gzip", True),
+        ("text/plain; charset=utf-8", 1025, "br, gzip;q=0.5", True),
+        ("text/plain; charset=utf-8", 1024, "gzip", False),
+        ("text/plain; charset=utf-8", 1025, "br", False),
+        ("text/plain; charset=utf-8", 1025, "", False),
+        ("application/json; charset=utf-8", 1025, "gzip", True),
+        ("application/wasm", 1025, "gzip", True),
+        ("image/svg+xml", 1025, "gzip", True),
+        ("image/png", 1025, "gzip", False),
+    ],
+)
+def test_what_is_large_and_compresses_is_packed_for_who_takes_it(
+    kind: str, size: int, accepts: str, packed: bool
+) -> None:
+    made = answer("/a/x", {"/a/": (says(b"x" * size, kind), {})}, accepts=accepts)
+    assert ("Content-Encoding" in made.headers) is packed
+    assert (gzip.decompress(made.body) if packed else bytes(made.body)) == b"x" * size
+    assert made.headers["Content-Length"] == str(len(made.body))
+
+
+@pytest.mark.parametrize(
+    ("path", "served"),
+    [
+        ("/a/" + "x" * LONGEST_NAME, True),
+        ("/a/" + "x" * (LONGEST_NAME + 1), False),
+        ("/a/" + "é" * (LONGEST_NAME // 2), True),
+        ("/a/" + "é" * (LONGEST_NAME // 2 + 1), False),
+        ("/a" + "/" + "/".join(["x" * 100] * 29 + ["x" * (LONGEST_PATH - 2901)]), True),
+        ("/a" + "/" + "/".join(["x" * 100] * 29 + ["x" * (LONGEST_PATH - 2900)]), False),
+        ("/a/..", False),
+        ("/a/%2e%2e/x", False),
+        ("/a/..%5Cx", False),
+        ("/a/..x/x..", True),
+        ("/a/x%00y", False),
+    ],
+)
+def test_a_path_that_no_file_can_have_is_answered_without_a_look(path: str, served: bool) -> None:
+    assert (LONGEST_NAME, LONGEST_PATH) == (255, 3000)
+    made = answer(path, {"/a/": (says(b"served"), {})})
+    assert (made.status_code, bytes(made.body)) == ((200, b"served") if served else (404, NO_SUCH_FILE))
+
+
+def test_a_folder_serves_its_files_and_nothing_else(tmp_path: Path) -> None:
+    folder = tmp_path / "served"
+    (folder / "below").mkdir(parents=True)
+    (folder / "below" / "a.JS").write_bytes(b"1")
+    (tmp_path / "secret.txt").write_text("secret")
+    (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
+    (folder / "inside.txt").symlink_to(folder / "below" / "a.JS")
+    handle = folder_handler(folder)
+    assert handle("below/a.JS") == handle("/below/a.JS") == (200, "text/javascript; charset=utf-8", b"1")
+    assert handle("inside.txt")[2] == b"1"
+    for path in ("", "below", "link.txt", "none.txt", "../secret.txt"):
+        assert handle(path) == (404, "text/plain; charset=utf-8", NO_SUCH_FILE)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("a.css", "text/css; charset=utf-8"),
+        ("a.html", "text/html; charset=utf-8"),
+        ("a.min.Js", "text/javascript; charset=utf-8"),
+        ("a.json", "application/json"),
+        ("a.svg", "image/svg+xml"),
+        ("a.wasm", "application/wasm"),
+        ("a.png", "image/png"),
+        ("a.no-such-ending", "application/octet-stream"),
+        ("js", "application/octet-stream"),
+    ],
+)
+def test_a_content_type_goes_by_the_end_of_the_name(name: str, kind: str) -> None:
+    assert content_type(name) == kind
+
+
+def test_a_routes_headers_come_in_place_of_the_pages() -> None:
+    made = answer("/a/x", {"/a/": (says(b""), {"Cache-Control": "max-age=1", "Referrer-Policy": "origin"})})
+    assert made.headers.get_all("Cache-Control") == ["max-age=1"]
+    assert made.headers.get_all("Referrer-Policy") == ["origin"]
+
+
+def test_what_a_browser_asked_for_writes_nothing_into_the_terminal(caplog: pytest.LogCaptureFixture) -> None:
+    def fails(path: str) -> tuple[int, str, bytes]:
+        raise ZeroDivisionError
+
+    answer("/a/%1b[31m", {"/a/": (fails, {})})
+    told = caplog.records[0].getMessage()  # `caplog.text` has such codes taken out
+    assert "/a/" in told and "\x1b" not in told
+
+
+def test_a_folder_beside_the_served_one_and_a_link_to_itself_are_not_served(tmp_path: Path) -> None:
+    folder, beside = tmp_path / "served", tmp_path / "served-not"
+    for made in (folder, beside):
+        made.mkdir()
+        (made / "a.txt").write_text("a")
+    (folder / "loop").symlink_to(folder / "loop")
+    through_a_link = tmp_path / "link"
+    through_a_link.symlink_to(folder)
+    for handle in (folder_handler(folder), folder_handler(through_a_link)):
+        assert handle("a.txt")[::2] == (200, b"a")
+        for path in ("loop", "../served-not/a.txt", str(beside / "a.txt")):
+            assert handle(path)[::2] == (404, NO_SUCH_FILE)
+
+
+def test_a_scripts_type_is_not_what_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mimetypes, "guess_type", lambda name: ("text/plain", None))
+    assert content_type("a.js").startswith("text/javascript") and content_type("a.png") == "text/plain"

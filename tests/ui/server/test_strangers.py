@@ -1,0 +1,255 @@
+"""Connections that have not shown the token: how long, how many, how much, and what is said of them."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import logging
+import re
+import socket
+import time
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.ui.knocking import ask, both, client, cookie_of, knock, token_of
+from workbench.ui.server import strangers
+from workbench.ui.server.access import cookie_name
+from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.strangers import ToldRarely
+
+LONG = 300
+
+
+def connected(door: Door) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", door.port), timeout=30)
+
+
+def is_closed(sock: socket.socket) -> bool:
+    """Whether the other end has hung up; waits no longer than the socket does."""
+    try:
+        return sock.recv(1 << 16) == b""
+    except ConnectionResetError:
+        return True
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"]
+)
+def test_a_connection_that_asks_nothing_is_closed_after_a_while(door, monkeypatch, said):
+    monkeypatch.setattr(strangers, "PATIENCE", 0.3)
+    with connected(door) as quiet:
+        quiet.sendall(said)
+        assert is_closed(quiet)
+    assert both(door) == (200, 101)
+
+
+def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(door, monkeypatch):
+    monkeypatch.setattr(strangers, "PATIENCE", 0.5)
+    with connected(door) as slow, pytest.raises(OSError):
+        for byte in b"GET / HTTP/1.1\r\nX: " + b"y" * 10_000:
+            slow.sendall(bytes([byte]))
+            time.sleep(0.02)  # what is tested: all the time a little comes
+
+
+def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(door, monkeypatch):
+    monkeypatch.setattr(strangers, "PATIENCE", 0.5)
+    with connected(door) as refused:
+        refused.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        answer = b""
+        while piece := refused.recv(1 << 16):
+            answer += piece
+    assert answer.startswith(b"HTTP/1.1 403")
+
+
+def test_a_page_that_has_shown_the_token_is_not_hurried(door, monkeypatch):
+    monkeypatch.setattr(strangers, "PATIENCE", 0.3)
+    slow = (200, "application/octet-stream", b"x" * 1000)
+    # Both take longer than a stranger is given.
+    door.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
+    assert ask(door, "/slow/x")[2] == b"x" * 1000
+    with client(door) as page:
+        time.sleep(0.6)
+        page.ping().wait(30)
+
+
+def test_too_many_that_say_nothing_lock_nobody_out(door, monkeypatch, caplog):
+    monkeypatch.setattr(strangers, "MOST", 10)
+    with contextlib.ExitStack() as stack, caplog.at_level(logging.WARNING):
+        idle = [stack.enter_context(connected(door)) for _ in range(30)]
+        for _ in range(5):
+            assert both(door) == (200, 101)
+            assert ask(door, "/", Cookie=None)[0] == 403
+        # The first of them have gone, the last are still there.
+        assert is_closed(idle[0])
+        idle[-1].settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            idle[-1].recv(1)
+    assert "10 connections at a time do not show the token (from 127.0.0.1)" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"GET / HTTP/1.1\r\n" + b"X: " + b"y" * 8000 + b"\r\n",
+        b"GET /" + b"y" * 5000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" + b"more" * 50_000,
+    ],
+)
+def test_a_head_is_not_taken_beyond_its_bound(door, head):
+    with connected(door) as large:
+        with contextlib.suppress(OSError):
+            for _ in range(200):
+                large.sendall(head)
+        with contextlib.suppress(ConnectionResetError):
+            while piece := large.recv(1 << 16):
+                assert b" 200 " not in piece[:20]
+    assert both(door) == (200, 101)
+
+
+def test_the_cookies_of_many_other_programs_come_with_it(door):
+    others = "; ".join(f"other-{number}={'x' * 3000}" for number in range(2))
+    assert both(door, Cookie=f"{others}; {cookie_of(door)}") == (200, 101)
+    lines = "".join(f"X-{number}: {'y' * 4000}\r\n" for number in range(20))
+    with connected(door) as sock:
+        sock.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n{lines}".encode())
+        assert sock.recv(100).startswith(b"HTTP/1.1 431 Request Header Fields Too Large")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/" + "x" * LONG,
+        "/workbench/" + "x" * LONG,
+        "/" + "%C3%A9" * 200,
+        "/a%00b",
+        "/workbench/%00",
+        "/" + "x/" * 1800,
+    ],
+)
+def test_a_path_that_no_file_can_have_is_not_found(door, path, caplog, capfd):
+    assert ask(door, path)[0] == 404
+    assert not caplog.records
+    assert capfd.readouterr().err == ""
+
+
+REQUESTS = st.lists(
+    st.sampled_from(
+        [
+            *(b"GET ", b"POST ", b"/", b" HTTP/1.1\r\n", b" HTTP/1.0\r\n", b"Host: 127.0.0.1\r\n", b"\r\n"),
+            *(b"Upgrade: websocket\r\nConnection: Upgrade\r\n", b"Sec-WebSocket-Key: x\r\n", b"Cookie: "),
+            *(b"Sec-WebSocket-Version: 13\r\n", b"Content-Length: 5\r\n", b"Transfer-Encoding: chunked\r\n"),
+            *(b"?token=", b"%00", b"\xff\xfe", b"\n", b":", b"\x81\x85\0\0\0\0", b"x" * 9000),
+        ]
+    )
+    | st.binary(max_size=20),
+    max_size=14,
+).map(b"".join)
+
+
+def fuzz(door: Door, raw: bytes) -> None:
+    with connected(door) as sock, contextlib.suppress(ConnectionResetError, BrokenPipeError):
+        sock.sendall(raw)
+        sock.shutdown(socket.SHUT_WR)
+        answer = b""
+        while piece := sock.recv(1 << 16):
+            answer += piece
+        assert answer == b"" or answer.startswith((b"HTTP/1.1 403", b"HTTP/1.1 431"))
+
+
+@pytest.fixture
+def fuzzed(door: Door, capfd: pytest.CaptureFixture[str]) -> Iterator[Door]:
+    """After all that was sent to it, it still opens, and nothing was printed of it."""
+    yield door
+    assert both(door) == (200, 101)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@settings(unhurried, max_examples=60)
+@given(REQUESTS)
+def test_whatever_a_stranger_sends_is_refused(fuzzed, raw):
+    fuzz(fuzzed, raw)
+
+
+@pytest.mark.slow
+@settings(unhurried, max_examples=3000)
+@given(REQUESTS | st.binary(max_size=3000))
+def test_whatever_a_stranger_sends_for_long_is_refused(fuzzed, raw):
+    fuzz(fuzzed, raw)
+
+
+# What is said ------------------------------------------------------------------------------------
+
+
+def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(door, caplog):
+    hostile = "\x1b[31m\n<b>"
+    with caplog.at_level(logging.WARNING):
+        assert door.turned_away == 0  # the door's own try is not one
+        for _ in range(3):
+            ask(door, "/", Cookie=None)
+            ask(door, f"/?token=wrong{'x' * 30}", Cookie=None)
+            ask(door, "/", Cookie=f"{cookie_name(door.port)}=old")
+            knock(door, Origin="https://evil.example")
+            ask(door, "/", Host="evil.example")
+        ask(door, "/" + hostile.encode().hex())
+    assert door.turned_away == 15
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == 4
+    assert all(
+        "from 127.0.0.1" in line and "evil" not in line and token_of(door) not in line for line in lines
+    )
+
+
+def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(strangers.time, "monotonic", lambda: now[0])
+    said: list[str] = []
+    told = ToldRarely(said.append, pause=60.0)
+    for _ in range(4 * 3600):
+        told.happened("a", "It happened.")
+        now[0] += 1.0
+    assert said[:2] == ["It happened.", "It happened. (59 more times since this was last said.)"]
+    assert len(said) < 12
+    lines = len(said)
+    for _ in range(2):
+        told.say_the_rest()
+    assert len(said) == lines + 1, "what was not told is told once"
+    untold = sum(int(number) for line in said for number in re.findall(r"\((\d+) more times", line))
+    assert lines + untold == 4 * 3600
+    told.happened("b", "Another\x1b[2J\nthing\u202e.")
+    assert said[-1] == r"Another\x1b[2J\nthing\u202e."
+
+
+def test_what_was_not_told_yet_is_told_at_the_end_with_the_total(caplog):
+    closing = open_door(DoorOptions(port=0))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(30):
+            ask(closing, f"/?token=wrong{'x' * 30}", Cookie=None)
+        assert len(caplog.records) == 1
+        closing.close()
+        closing.close()  # what was told is not told again
+    lines = [record.getMessage() for record in caplog.records]
+    assert "(29 more times since this was last said.)" in lines[1] and "token that is not valid" in lines[1]
+    assert lines[2:] == ["In all 30 requests were turned away."]
+
+
+def test_no_program_is_named(door):
+    for path, headers in (("/", {}), ("/none", {}), ("/", {"Cookie": None})):
+        assert ask(door, path, **headers)[1]["Server"] is None
+    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+    handshake = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version": "13",
+        "Origin": f"http://127.0.0.1:{door.port}",
+        "Cookie": cookie_of(door),
+    }
+    connection.request("GET", "/", headers=handshake)
+    response = connection.getresponse()
+    assert (response.status, response.headers["Server"]) == (101, None)
+    connection.close()

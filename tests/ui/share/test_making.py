@@ -1,0 +1,121 @@
+"""Things are made from recordings in a process of its own: the page hears of it, stops it, and keeps nothing half-made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.episodes import Made, Track
+from tests.drive.waiting import until
+from workbench.core.camera_data import CameraInfo
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.source import Source
+from workbench.recording.reader.reading import sources_among
+from workbench.ui.share.make import Making, MakingView, Wanted
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one recording of 200 steps and one camera."""
+    folder = tmp_path_factory.mktemp("recordings")
+    steps, size = 200, 256
+    poses = np.zeros((steps + 1, 1, 7), np.float32)
+    poses[:, 0, 0], poses[..., 3] = np.linspace(0, 1, steps + 1), 1
+    triangle = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
+    zero = np.zeros(1, np.int32)
+    camera = CameraInfo(
+        "eye", "sensor", size, size, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb",)
+    )
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 255, (steps + 1, size, size, 3), np.uint8)
+    Made(
+        info=EpisodeInfo("Made-v1", 0, 7, None, "", {}, 0.05, None, "cpu"),
+        geometry=SceneGeometry(
+            1,
+            ("cube",),
+            ("dynamic",),
+            (False,),
+            (Visual("cube", triangle, Material((1, 0, 0, 1)), zero, zero),),
+        ),
+        segmentation={},
+        poses=poses,
+        action=np.zeros((steps, 1), np.float32),
+        action_names=("grip",),
+        reward=np.ones(steps, np.float32),
+        terminated=np.zeros(steps, np.bool_),
+        truncated=np.zeros(steps, np.bool_),
+        evaluate={"success": np.zeros(steps + 1, np.bool_)},
+        cameras=[Track(camera, np.arange(steps + 1), np.tile(poses[0, 0], (steps + 1, 1)), rgb)],
+    ).write(folder)
+    return folder
+
+
+class Told:
+    """A `Making`, and a way to wait for what it tells."""
+
+    def __init__(self) -> None:
+        self.making = Making()
+
+    def wait(self, reached: Callable[[MakingView], bool]) -> MakingView:
+        until(lambda: reached(self.making.view()), "what is waited for", seen=self.making.view)
+        return self.making.view()
+
+
+def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_path: Path) -> None:
+    told, (source,) = Told(), sources_among([recordings])
+    assert told.making.start(Wanted("sheet", (source,), tmp_path))
+    assert not told.making.start(Wanted("sheet", (source,), tmp_path)), "two at a time"
+    view = told.wait(lambda view: not view.running)
+    assert view.problem == ""
+    assert [path.name for path in view.made[0].paths] == [f"{source.stem}.sheet.png"]
+    assert told.making.start(Wanted("sheet", (source,), tmp_path))
+    view = told.wait(lambda view: not view.running)
+    assert "not written over" in view.problem and len(view.made) == 1
+
+
+def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
+    told = Told()
+    told.making.start(Wanted("film", sources_among([recordings]) * 20, tmp_path / "films", "eye"))
+    told.wait(lambda view: view.done > 0.01 and "eye" in view.doing)
+    told.making.stop()
+    view = told.wait(lambda view: not view.running)
+    assert (view.problem, view.made) == ("", ())
+    assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
+
+
+def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
+    told = Told()
+    told.making.start(Wanted("lerobot", sources_among([recordings]) * 200, tmp_path / "datasets" / "one"))
+    until(lambda: list(tmp_path.glob("datasets/.one.*/videos/*/*/*")), "a film that is written")
+    told.making.stop()
+    view = told.wait(lambda view: not view.running)
+    assert view.done < 0.9 and (view.problem, view.made) == ("", ())
+    assert list((tmp_path / "datasets").iterdir()) == []
+
+
+def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
+    told = Told()
+    (tmp_path / "x.json").write_text("{}")
+    told.making.start(Wanted("sheet", (Source(tmp_path / "x.json"),), tmp_path))
+    assert "x" in told.wait(lambda view: not view.running).problem
+    scratch = told.making.scratch()
+    told.making.close()
+    assert not scratch.exists()
+
+
+def test_recordings_are_found_in_folders_and_by_any_of_their_files(recordings: Path, tmp_path: Path) -> None:
+    (found,) = sources_among([recordings])
+    for file in recordings.iterdir():
+        if not file.name.startswith("."):
+            assert sources_among([file, recordings]) == (found,)
+    with pytest.raises(FileNotFoundError, match="nothing at"):
+        sources_among([tmp_path / "none"])
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(ValueError, match="no recording in"):
+        sources_among([tmp_path])

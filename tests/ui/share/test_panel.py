@@ -1,0 +1,173 @@
+"""The Share tab without a browser: what it is about, and what a press makes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import viser
+
+from tests.drive.panels import Panels
+from workbench.recording.episode.source import Source
+from workbench.ui.server.file_response import Offers
+from workbench.ui.server.gated_server import Door
+from workbench.ui.share.make import EVERY_CAMERA, Made, Making, MakingView, Wanted
+from workbench.ui.share.panel import (
+    ALL_CAMERAS,
+    MOST_NAMED,
+    OPENED,
+    Chosen,
+    SharePanel,
+    short_names,
+    will_make,
+)
+
+
+class Noted(Making):
+    """Notes what is wanted instead of starting a process for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted: list[Wanted] = []
+        self.shown = MakingView()
+        self.started = threading.Event()
+
+    def view(self) -> MakingView:
+        return self.shown
+
+    def start(self, wanted: Wanted) -> bool:
+        self.wanted.append(wanted)
+        return True
+
+
+@pytest.fixture
+def making() -> Iterator[Noted]:
+    making = Noted()
+    yield making
+    making.close()
+
+
+@pytest.fixture
+def panels(door: Door) -> Panels:
+    return Panels(door.server)
+
+
+@pytest.fixture
+def panel(panels: Panels, door: Door, making: Noted, tmp_path: Path) -> SharePanel:
+    return SharePanel(door.server, Offers(door), making, tmp_path)
+
+
+RECORDING = Source(Path("/recordings/Push_seed1.json"))
+
+
+def test_without_a_recording_there_is_nothing_to_make(
+    panel: SharePanel, panels: Panels, making: Noted
+) -> None:
+    panel.draw(Chosen())
+    assert panels.control("Make", "button").disabled and "Select recordings" in panels.html()
+    panels.claim("Make", True, "button")
+    assert making.wanted == []
+
+
+def test_recordings_and_files_are_named_before_they_are_made(
+    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+) -> None:
+    panel.draw(Chosen((RECORDING,), ("base_camera", "hand/camera"), selected=True))
+    assert "Selected in the library" in panels.html() and "Push_seed1" in panels.html()
+    said = panels.html()
+    assert "2 files" in said and "Push_seed1.base_camera.mp4" in said and "Push_seed1.hand_camera.mp4" in said
+    many = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(MOST_NAMED + 2))
+    will = will_make("sheet", Chosen(many), ALL_CAMERAS, tmp_path)
+    assert (will["what"], will["files"][0]) == (f"{MOST_NAMED + 2} files", ("r0.sheet.png",) * 2)
+    assert str(tmp_path / "datasets") in will_make("lerobot", Chosen(many), ALL_CAMERAS, tmp_path)["where"]
+    panel.draw(Chosen(many))
+    assert "Open in the review" in panels.html() and "and 2 more" in panels.html()
+    assert "one film for each camera of these 7 recordings" in panels.html()
+    panels.set("Make", "Sheet of pictures (png)")
+    panel.draw(Chosen(many))
+    assert panels.html().count("and 2 more") == 2 and panels.html().count(".sheet.png<") == MOST_NAMED
+
+
+def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(
+    panel: SharePanel, panels: Panels, making: Noted
+) -> None:
+    panel.draw(Chosen((RECORDING,), ("base_camera", "hand_camera")))
+    assert panels.shows("Camera") and panels.control("Camera").options == (
+        ALL_CAMERAS,
+        "base_camera",
+        "hand_camera",
+    )
+    panels.press("Make")
+    panels.set("Camera", "hand_camera")
+    panels.press("Make")
+    assert [wanted.camera for wanted in making.wanted] == [EVERY_CAMERA, "hand_camera"]
+    assert making.wanted[0].folder != making.wanted[1].folder
+    panel.draw(Chosen((RECORDING,), ("base_camera",)))
+    assert not panels.shows("Camera"), "there is no choice"
+
+
+def test_names_are_shown_without_their_time_and_the_scope_stays_as_chosen(
+    panel: SharePanel, panels: Panels
+) -> None:
+    name = "Push_seed0001_env00_2026-11-22T04-40-41"
+    panel.draw(Chosen((Source(Path(f"/recordings/{name}.json")),), ("eye",), selected=True))
+    assert ">Push_seed0001_env00<" in panels.html() and f'title="{name}"' in panels.html()
+    assert ">Push_seed0001_env00.eye.mp4<" in panels.html()
+    same = [name, name.replace("41", "42")]
+    assert short_names(same) == same
+    assert not panel.takes_opened(True) and panels.shows("Of")
+    panels.set("Of", OPENED)
+    assert panel.takes_opened(True) and not panel.takes_opened(False) and not panels.shows("Of")
+    assert panel.takes_opened(True)
+
+
+def test_a_value_that_no_page_of_ours_sends_makes_nothing(
+    panel: SharePanel, panels: Panels, making: Noted
+) -> None:
+    panel.draw(Chosen((RECORDING,), ("base_camera",)))
+    panels.claim("Camera", "../../etc")
+    panels.press("Make")
+    panels.claim("Make", "../../etc")
+    assert [sentence[-9:] for sentence in panels.client.notices] == ["on offer."] * 2
+    panels.press("Make")
+    assert [(wanted.camera, wanted.what) for wanted in making.wanted] == [(EVERY_CAMERA, "film")] * 2
+
+
+def test_a_dataset_goes_into_the_recordings_folder(
+    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+) -> None:
+    panels.set("Make", "LeRobot dataset")
+    panel.draw(Chosen((RECORDING,)))
+    assert panels.shows("Only successes") and panels.shows("Task") and not panels.shows("Camera")
+    panels.set("Task", "  push it  ")
+    panels.press("Make")
+    (wanted,) = making.wanted
+    assert wanted.folder.parent == tmp_path / "datasets"
+    assert (wanted.export.instruction, wanted.export.only_successes) == ("push it", True)
+
+
+def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
+    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+) -> None:
+    film = tmp_path / "a<b>.mp4"
+    film.write_bytes(bytes(2_500_000))
+    making.shown = MakingView(running=True, done=0.4, doing="a: the 3-D view")
+    panel.draw(Chosen((RECORDING,)))
+    assert "width: 40%" in panels.html() and panels.shows("Stop") and not panels.shows("Make", "button")
+    making.shown = MakingView(made=(Made((film,), "1 file"),), problem="There is no <room>.")
+    panel.draw(Chosen((RECORDING,)))
+    said = panels.html()
+    assert "a&lt;b&gt;.mp4" in said and "2.5 MB" in said and "/offered/" in said and "<room>" not in said
+    film.unlink()
+    panel.draw(Chosen((RECORDING,), ("x",)))
+    assert "/offered/" not in panels.html()
+
+
+def test_the_page_is_built_anew_without_a_trace(door: Door, making: Noted, tmp_path: Path) -> None:
+    offers = Offers(door)
+    for _ in range(3):
+        SharePanel(door.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
+        door.server.gui.reset()
+    assert isinstance(door.server, viser.ViserServer)

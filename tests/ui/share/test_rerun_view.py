@@ -1,0 +1,178 @@
+"""rerun's viewer through the page's door: what is served, to whom, and that nobody else is asked."""
+
+from __future__ import annotations
+
+import gzip
+import http.client
+import threading
+import urllib.parse
+from pathlib import Path
+
+import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+from playwright.sync_api import Browser, Request
+from rerun.chunk import LazyChunkStream
+
+from tests.drive.page import page_at
+from tests.drive.waiting import until
+from workbench.recording.rerun.append_blueprint import add_blueprint, blueprint_stream, encode_blueprint
+from workbench.recording.rerun.chunks import static_chunk
+from workbench.recording.rerun.viewer import VIEWER_FILES, web_viewer_folder
+from workbench.ui.server.access import cookie_name
+from workbench.ui.server.file_response import Offers
+from workbench.ui.server.gated_server import Door
+from workbench.ui.share.rerun_view import RerunPages, RerunView
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings") / "Push ä <b>.rrd"
+    stream = rr.RecordingStream("workbench", recording_id="one")
+    stream.save(path)
+    for step in range(30):
+        stream.set_time("step", sequence=step)
+        stream.log("reward", rr.Scalars(1.0))
+    stream.disconnect()
+    return path
+
+
+@pytest.fixture
+def pages(child_process: None, door: Door) -> RerunPages:
+    return RerunPages(door, Offers(door))
+
+
+def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
+    cookie = {"Cookie": f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"}
+    try:
+        connection.request("GET", path, headers={**cookie, **headers})
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Door, tmp_path: Path) -> None:
+    offers = Offers(door)
+    big = tmp_path / "big one.rrd"
+    big.write_bytes(bytes(range(256)) * 20_000)
+    address = offers.address(big)
+    assert address == offers.address(big)
+    status, headers, body = get(door, address)
+    assert (status, body == big.read_bytes()) == (200, True)
+    assert headers["Content-Length"] == str(big.stat().st_size)
+    assert "sandbox" in headers["Content-Security-Policy"]
+    assert get(door, f"/offered/{'x' * 22}/big%20one.rrd")[0] == 404
+    assert get(door, f"/offered/{urllib.parse.quote(str(big))}")[0] == 404
+    assert get(door, address, Cookie="")[0] == 403
+    saved = get(door, offers.address(big, download=True))[1]
+    assert saved["Content-Disposition"] == "attachment; filename*=UTF-8''big%20one.rrd"
+    big.unlink()
+    assert get(door, address)[0] == 404
+
+
+def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(door: Door, tmp_path: Path) -> None:
+    big = tmp_path / "big.rrd"
+    big.write_bytes(bytes(40_000_000))  # more than the sockets hold
+    address = Offers(door).address(big)
+    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
+    cookie = f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"
+    connection.request("GET", address, headers={"Cookie": cookie})
+    answer = connection.getresponse()
+    answer.read(1000)
+    with big.open("r+b") as file:
+        file.truncate(5)
+    with pytest.raises((http.client.IncompleteRead, ConnectionError)):
+        answer.read()
+    connection.close()
+    assert get(door, "/")[0] == 200
+
+
+def test_the_viewer_is_sent_packed_to_those_who_take_it(
+    door: Door, pages: RerunPages, recording: Path
+) -> None:
+    viewer = get(door, pages.address([recording]))[2].decode().partition('location.replace("')[2]
+    root = viewer.partition('"')[0]
+    assert get(door, root + "index.html")[1]["Content-Type"] == VIEWER_FILES["index.html"]
+    for name, kind in list(VIEWER_FILES.items())[1:]:
+        packed = (web_viewer_folder() / f"{name}.gz").read_bytes()
+        status, headers, body = get(door, root + name, **{"Accept-Encoding": "gzip"})
+        assert (status, headers["Content-Type"], headers["Content-Encoding"]) == (200, kind, "gzip")
+        assert body == packed
+        assert "connect-src 'self'" in headers["Content-Security-Policy"]
+    status, headers, body = get(door, root + "re_viewer.js")
+    assert "Content-Encoding" not in headers
+    assert body == gzip.decompress((web_viewer_folder() / "re_viewer.js.gz").read_bytes())
+    for name in ("", "../secret", "index.html.gz"):
+        assert get(door, root + name)[0] == 404
+
+
+def test_the_blueprint_of_a_recording_is_sent_before_it(
+    door: Door, pages: RerunPages, recording: Path, tmp_path: Path
+) -> None:
+    ours = tmp_path / "ours.rrd"
+    LazyChunkStream.from_iter([static_chunk("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]).write_rrd(
+        ours, application_id="workbench", recording_id="two"
+    )
+    add_blueprint(ours, encode_blueprint("workbench", rrb.Blueprint(rrb.Spatial3DView())))
+    address = pages.address([recording, ours])
+    assert 'for (const name of ["1.rbl"])' in get(door, address)[2].decode()
+    status, _, body = get(door, address + "1.rbl")
+    assert (status, body) == (200, blueprint_stream(ours))
+    for name in ("0.rbl", "2.rbl", "../1.rbl", "1.rbl/"):
+        assert not get(door, address + name)[2].startswith(b"RRF2")
+
+
+def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, tmp_path: Path) -> None:
+    page = get(door, pages.address([tmp_path / "</script><b>.rrd"]))[2].decode()
+    assert page.count("</script>") == 1
+    assert "<b>" not in page
+
+
+def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
+    door: Door, pages: RerunPages, recording: Path, browser: Browser
+) -> None:
+    library = door.server.gui.add_panel()
+    with library.add_tab("Library"):
+        door.server.gui.add_html("...")
+    library.dock_left()
+    library.minimize()
+    view = RerunView(door.server, pages, lambda fold: 850)
+    stopping = threading.Event()
+
+    def draw() -> None:
+        while not stopping.wait(0.1):
+            view.draw([recording], moments={recording: 12})
+
+    threading.Thread(target=draw, daemon=True).start()
+    asked: list[Request] = []
+    failed: dict[str, str | None] = {}
+    with page_at(browser, "about:blank", 1280, 720, drawn=True) as (tab, _):
+        tab.on("request", lambda request: asked.append(request))
+        tab.on("requestfailed", lambda request: failed.update({request.url: request.failure}))
+        tab.goto(door.url)
+        with tab.expect_response(lambda answer: "/offered/" in answer.url, timeout=120_000) as answer:
+            tab.get_by_role("button", name="Open in rerun").click()
+        assert answer.value.status == 200
+        frame = tab.frame_locator("iframe.wb-rerun")
+        frame.locator("canvas.visible").wait_for(timeout=90_000)
+        # The state of the viewer as it tells it: the cursor of the timeline "step" is at 12.
+        inside = next(frame for frame in tab.frames if "/rerun/viewer-" in frame.url)
+        state = "() => new TextDecoder().decode(window._handle.viewer_state())"
+        until(
+            lambda: "step\x10\x01\x1a\x02\x08\x0c" in inside.evaluate(state), "the moment that was asked for"
+        )
+        tab.get_by_text("from step 12").wait_for()
+        width = "document.querySelector('iframe.wb-rerun').clientWidth"
+        until(lambda: tab.evaluate(width) > 450, "half of the page")
+        assert tab.evaluate("document.activeElement.tagName") != "IFRAME", "the keys are the page's"
+        tab.get_by_role("button", name="Close rerun").click()
+        tab.locator("iframe.wb-rerun").wait_for(state="detached")
+    stopping.set()
+    ours = f"http://127.0.0.1:{door.port}/"
+    foreign = {
+        r.url for r in asked if not r.url.startswith((ours, f"ws://127.0.0.1:{door.port}", "data:", "blob:"))
+    }
+    assert {url: failed.get(url) for url in foreign} == dict.fromkeys(foreign, "csp")
+    assert foreign, "rerun's page has stopped asking others; the policy can be simpler"

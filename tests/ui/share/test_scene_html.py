@@ -1,0 +1,86 @@
+"""The moving page of a scene plays from the disk, and asks nobody for anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from tests.drive.page import page_at
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.recording.episode.episode import Episode, EpisodeInfo
+from workbench.ui.share.scene_html import write_scene_html
+
+DRAWN = """before => {
+    const said = document.querySelector(".wb-caption").innerText;
+    const step = parseInt(said.split("step ")[1]);
+    return said !== before && Object.values(window.__viserSceneTree.getState()).some(node => {
+        const p = node.message?.props?.batched_positions;
+        if (!p) return false;
+        const x = new DataView(p.buffer, p.byteOffset, 4).getFloat32(0, true);
+        return Math.abs(x - (-0.3 + 0.03 * step)) < 1e-4;
+    });
+}"""
+"""Whether another step is told than before, and the cube is drawn where it was at that step."""
+
+
+@pytest.fixture
+def episode() -> Episode:
+    steps = 20
+    poses = np.zeros((steps + 1, 1, 7), np.float32)
+    poses[:, 0, 0], poses[..., 3] = np.linspace(-0.3, 0.3, steps + 1), 1
+    corners = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint32)
+    zero = np.zeros(1, np.int32)
+    visual = Visual("cube", Mesh(corners, faces), Material((1.0, 0.0, 0.0, 1.0)), zero, zero)
+    return Episode(
+        info=EpisodeInfo("Made & <b>", 0, 7, None, "", {}, 0.1, None, "cpu"),
+        geometry=SceneGeometry(1, ("cube",), ("dynamic",), (False,), (visual,)),
+        segmentation={},
+        poses=poses,
+        action=np.zeros((steps, 1), np.float32),
+        action_names=("grip",),
+        reward=np.zeros(steps, np.float32),
+        terminated=np.zeros(steps, np.bool_),
+        truncated=np.zeros(steps, np.bool_),
+        evaluate={},
+        cameras=[],
+    )
+
+
+def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Browser) -> None:
+    path, done = tmp_path / "a.html", []
+    write_scene_html(path, episode, on_progress=done.append)
+    assert done == sorted(done) and done[-1] == 1.0
+    asked: list[str] = []
+    with page_at(browser, "about:blank", 320, 240, drawn=True) as (tab, _):
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.goto(path.as_uri())
+        time_shown = tab.locator("input").first
+        tab.wait_for_function(
+            "() => document.querySelector('input') && parseFloat(document.querySelector('input').value) > 0.3"
+        )
+        assert float(time_shown.input_value()) <= 3.2
+        # What is said is the episode's own time, to its end and no further while the last state is held.
+        tab.wait_for_function(
+            "() => document.querySelector('#wb-time').textContent === 'step 20 of 20, 2.00 of 2.00 s'"
+        )
+        caption = tab.locator(".wb-caption")
+        assert "Made & <b>, seed 7" in caption.inner_text()
+        assert not time_shown.is_visible(), "the player's clock runs on while the last state is held"
+        tab.keyboard.press("Space")
+        before = caption.inner_text()
+        for x in (120, 60):
+            tab.locator(".mantine-Slider-root").first.click(position={"x": x, "y": 5})
+            tab.wait_for_function(DRAWN, arg=before)
+            before = caption.inner_text()
+    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_it_takes_the_place_of_nothing(episode: Episode, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text("mine")
+    with pytest.raises(FileExistsError):
+        write_scene_html(tmp_path / "a.html", episode)
+    assert (tmp_path / "a.html").read_text() == "mine"

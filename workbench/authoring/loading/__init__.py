@@ -1,0 +1,1 @@
+"""The author's file and its modules: found, trusted, executed, registered, watched."""

@@ -1,0 +1,160 @@
+"""Which class of a file is opened: the one that was named, else the task that is registered last, else a robot in a scene.
+
+A robot's file has no task, and is opened all the same: its author wants to see the robot move, and ManiSkill has a scene
+for that (``Empty-v1``), in which it stands alone.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from workbench.authoring.loading import registry
+from workbench.authoring.loading.modules import module_name
+from workbench.authoring.problem import TaskError, refused
+
+if TYPE_CHECKING:
+    from mani_skill.envs.sapien_env import BaseEnv
+
+_SCENE = "Empty-v1"
+"""ManiSkill's own for looking at robots."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """An agent class that a file registers."""
+
+    class_name: str
+    uid: str
+
+
+@dataclass(frozen=True)
+class ChosenTask:
+    cls: type[BaseEnv]
+    env_id: str | None
+    """None for a class that is not registered."""
+    others: tuple[str, ...]
+    """What else of the file can be named."""
+    alternatives: tuple[str, ...] = ()
+    """Those of them that may be opened in its place where none was named and it fails, in the order of trying."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """For the constructor, besides those of the registration."""
+    robot: Robot | None = None
+
+
+def choose_task(
+    module: ModuleType,
+    wanted: str | None,
+    file: Path,
+    text: str,
+    registrations: registry.Registrations,
+) -> ChosenTask:
+    """The wanted class of a module that was just executed, or the one that is opened when none is named.
+
+    Args:
+        text: of the file.
+        registrations: what the module registered.
+
+    Raises:
+        TaskError: there is no such class, or none at all.
+    """
+    mine = [made for made in registrations.made if made.file == str(file)]
+    registered = {made.cls: made.name for made in mine if registry.is_task(made.cls)}
+    robots = {made.cls.__name__: made for made in mine if registry.is_robot(made.cls)}
+    defined = [
+        value
+        for value in vars(module).values()
+        if registry.is_task(value) and value.__module__ == module.__name__
+    ]
+    # Registered ones last, in the order of their registration: the last of all is the default.
+    candidates = [cls for cls in dict.fromkeys(defined) if cls not in registered] + list(registered)
+    names = [cls.__name__ for cls in candidates]
+    if wanted is None:
+        if candidates:
+            cls = candidates[-1]
+        elif robots:
+            return _in_a_scene(module, list(robots)[-1], robots)
+        else:
+            raise _no_class(module, file, text)
+    else:
+        cls = next(
+            (cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None)
+        )
+        if wanted in robots and not registry.is_task(cls):
+            return _in_a_scene(module, wanted, robots)
+        if not registry.is_task(cls):
+            raise no_such_class(wanted, cls, file.name, file, names or list(robots))
+    assert isinstance(cls, type)
+    others = tuple(other.__name__ for other in candidates if other is not cls)
+    return ChosenTask(
+        cls, registered.get(cls), others, () if wanted else _alternatives(cls, candidates, registered)
+    )
+
+
+def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
+    """Not what the tasks of a file have in common: a base class may open, and shows nothing."""
+    return tuple(
+        other.__name__
+        for other in reversed(candidates)
+        if other is not cls and not issubclass(cls, other) and (other in registered) == (cls in registered)
+    )
+
+
+def _in_a_scene(module: ModuleType, class_name: str, robots: dict[str, registry.Registration]) -> ChosenTask:
+    spec = registry.environment(_SCENE)
+    assert spec is not None
+    # A class of its own for each version: it stands for the file.
+    cls = type(spec.cls.__name__, (spec.cls,), {"__module__": module.__name__})
+    uid = robots[class_name].name
+    others = tuple(name for name in robots if name != class_name)
+    return ChosenTask(cls, _SCENE, others, kwargs={"robot_uids": uid}, robot=Robot(class_name, uid))
+
+
+def shown_in_a_scene(robot: Robot, file: Path) -> str:
+    """What the author of a robot must know of the scene that is shown, in a sentence."""
+    place = module_name(file)
+    name = place.name if (file.parent / "__init__.py").is_file() else file.stem
+    return (
+        f"{file.name} has no task but an agent, {robot.class_name} with the uid {robot.uid!r}: it is shown in {_SCENE}. "
+        f"To see it in a task, type in {place.search_folder}: "
+        f"workbench open PickCube-v1 --import {name} --env robot_uids={robot.uid}"
+    )
+
+
+def no_such_class(wanted: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
+    """There is no task class `wanted` in `name`, which has the classes `names`."""
+    if found is not None:
+        return refused(f"{wanted} in {name} is not a class that inherits BaseEnv", file)
+    close = difflib.get_close_matches(wanted, names, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names) or 'no task class at all'}"
+    return refused(f"there is no class {wanted} in {name}; {hint}", file)
+
+
+def _no_class(module: ModuleType, file: Path, text: str) -> TaskError:
+    name = file.name
+    if not text.strip():
+        return refused(f"{name} is empty; a task is a class that inherits BaseEnv", file)
+    imported = [value for value in vars(module).values() if registry.is_task(value)]
+    robots = [
+        value
+        for value in vars(module).values()
+        if registry.is_robot(value) and value.__module__ == module.__name__
+    ]
+    if robots:
+        hint = (
+            f"{robots[-1].__name__} is an agent that is not registered: put @register_agent() above it (from "
+            "mani_skill.agents.registration) to see it in a scene"
+        )
+    elif imported:
+        cls = imported[-1]
+        hint = f"{cls.__name__} is imported from {cls.__module__}: name that file, or inherit from it here"
+    else:
+        hint = (
+            "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from "
+            "tasks/minimal.py"
+        )
+    return refused(f"no class in {name} inherits BaseEnv; {hint}", file)

@@ -1,0 +1,131 @@
+"""Arguments of several commands, and what they turn into: where a page is, how a task is made, sizes of memory.
+
+Raises ValueError throughout, with a sentence that names the argument.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+
+import tyro
+
+from workbench.core.rules import DEGREES, Degree
+
+if TYPE_CHECKING:
+    from workbench.jobs.task import TaskOptions
+
+Backend = Literal["auto", "cpu", "gpu"]
+Rules = Annotated[
+    Degree | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(DEGREES)}}}",
+        instance_from_str=lambda given: cast(Degree, given[0]),
+        is_instance=lambda value: value is None or value in DEGREES,
+        str_from_instance=lambda value: [str(value)],
+        choices=DEGREES,
+    ),
+]
+"""None is each rule's own degree, and no word for the command line."""
+
+
+Imports = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import")]
+
+
+@dataclass(frozen=True)
+class PageArguments:
+    """Where a page is served, and to whom.
+
+    Args:
+        host: address to listen on; anything but this machine's own needs the token.
+        port: port of the page; 0 takes any free one.
+        socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
+            connect, by the ssh line that is printed.
+        token: ask for the token of the printed address (--no-token: this machine only).
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    socket: Path | None = None
+    token: bool = True
+
+
+@dataclass(frozen=True)
+class BatchArguments:
+    """How envs are run.
+
+    Args:
+        num_envs: environments to run at once.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
+    """
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    rules: Rules = None
+    imports: Imports = ()
+
+    def options(self) -> TaskOptions:
+        from workbench.jobs.task import TaskOptions
+
+        if not 1 <= self.num_envs <= 4096:
+            raise ValueError(f"--num-envs must be from 1 to 4096, not {self.num_envs}")
+        return TaskOptions(self.num_envs, self.backend, rules=self.rules, imports=imported(self.imports))
+
+
+@dataclass(frozen=True)
+class EnvArguments(BatchArguments):
+    """How the envs of a task are made.
+
+    Args:
+        seed: seed of the first env or episode; each further one counts up.
+        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+    """
+
+    seed: int = 0
+    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+
+    def options(self) -> TaskOptions:
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {self.seed}")
+        kwargs = dict(_env_argument(pair) for pair in self.env)
+        return replace(super().options(), seed=self.seed, env_kwargs=kwargs)
+
+
+def imported(names: Sequence[str]) -> tuple[str, ...]:
+    """Of each ``--import``: modules, which are not imported here."""
+    from workbench.authoring.loading.reference import find_module, is_module_name, not_found
+
+    for name in names:
+        if not is_module_name(name):
+            raise ValueError(f"--import takes the name of a module, as in --import lab.tasks; got {name!r}")
+        if find_module(name) is None:
+            raise ValueError(f"--import {name}: {not_found(name)}")
+    return tuple(names)
+
+
+def _env_argument(pair: str) -> tuple[str, Any]:
+    name, equals, value = pair.partition("=")
+    if not equals or not name.isidentifier():
+        raise ValueError(f"--env takes name=value, as in --env robot_uids=fetch; got {pair!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def history_bytes(text: str) -> int:
+    """Of ``--history``: ``256MB``, ``1.5 GB`` or a plain number."""
+    from workbench.session.process.memory_limit import size_in_bytes
+
+    size = size_in_bytes(text)
+    if size is None or not 2**20 <= size <= 2**40:
+        raise ValueError(f"--history takes a size from 1MB on, such as 256MB or 2GB; got {text!r}")
+    return int(size)

@@ -1,0 +1,347 @@
+"""The commands and their arguments, as ``workbench --help`` shows them.
+
+What a command does is in a module named for it. Heavy imports wait until a command is chosen, so that ``--help``
+and a mistyped option answer at once.
+"""
+
+from __future__ import annotations
+
+# First of all: a file in the current folder could have the name of anything that is imported below.
+import workbench.machine.processes.own_path  # noqa: F401
+
+# isort: split
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from workbench.cli.arguments import (
+    BatchArguments,
+    EnvArguments,
+    Imports,
+    PageArguments,
+    Rules,
+    history_bytes,
+    imported,
+)
+from workbench.cli.terminal import Exit, print_problem, refuse, say
+from workbench.jobs.record_options import RecordArguments
+from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.software_vulkan import use_private_driver
+from workbench.machine.text import guard_terminal
+
+Task = Annotated[str, tyro.conf.Positional]
+"""A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
+
+_FEW = EnvArguments(num_envs=4)
+
+app = tyro.extras.SubcommandApp()
+
+
+@app.command(name="open")
+def open_page(
+    task: Task,
+    /,
+    *,
+    envs: EnvArguments,
+    page: PageArguments,
+    recordings: Path = Path("recordings"),
+    history: str = "256MB",
+    memory_limit: str = "auto",
+    spare: bool = True,
+    trust: bool = False,
+    debug: bool = False,
+    debug_port: int | None = None,
+    debug_wait: bool = False,
+) -> int:
+    """Open a task in a browser page that follows its file.
+
+    Args:
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
+        recordings: folder for recorded episodes.
+        history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
+        memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
+            sets no limit. A process that uses more is ended and replaced.
+        spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
+            seconds more, and about 0.8 GB of memory less).
+        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
+        debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
+            stops for it. Whoever else can log in to this machine can attach as well.
+        debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
+        debug_wait: load the task only when a debugger has attached. Means --debug.
+    """
+    from workbench.authoring.loading.reference import why_not_there
+
+    if (why := why_not_there(task)) is not None:
+        return refuse(why)
+    from workbench.cli.page import open_in_terminal
+    from workbench.session.process.debugger import port_for_debugger
+    from workbench.session.process.memory_limit import parse_memory
+    from workbench.session.process.supervisor import WorkerOptions
+    from workbench.ui.server.gated_server import DoorOptions
+
+    try:
+        options = envs.options()
+        past = history_bytes(history)
+        debug = debug or debug_wait or debug_port is not None
+        if debug and page.socket is not None:
+            raise ValueError(
+                "--debug opens a port that every user of this machine can connect to, which --socket is there to avoid: "
+                "leave one of them out"
+            )
+        at_port = port_for_debugger(debug_port) if debug else None
+        worker = WorkerOptions(parse_memory(memory_limit), spare, at_port, debug_wait)
+        at = DoorOptions(**vars(page))
+    except ValueError as error:
+        return refuse(str(error))
+    return open_in_terminal(task, options, at, worker, recordings, past, trust)
+
+
+@app.command
+def record(
+    recording: Annotated[RecordArguments, tyro.conf.PositionalRequiredArgs],
+    envs: EnvArguments = _FEW,
+    debug: bool = False,
+) -> int:
+    """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
+
+    Args:
+        debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
+            it. Whoever else can log in to this machine can attach as well.
+    """
+    from workbench.authoring.loading.reference import why_not_there
+
+    if (why := why_not_there(recording.task)) is not None:
+        return refuse(why)
+    use_private_driver()
+    with quick_imports():
+        from workbench.cli.record import record_in_terminal
+        from workbench.jobs.record import RecordOptions
+        from workbench.session.process.debugger import debug_here
+
+    try:
+        options = envs.options()
+        if debug and recording.workers > 1:
+            raise ValueError("--debug is for one process: leave out --workers")
+        if debug:
+            debug_here(say)
+    except ValueError as error:
+        return refuse(str(error))
+    return record_in_terminal(RecordOptions(**vars(recording), options=options))
+
+
+@app.command
+def review(
+    folder: Annotated[Path, tyro.conf.Positional] = Path("recordings"),
+    /,
+    *,
+    page: PageArguments,
+    rules: Rules = None,
+    task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
+    imports: Imports = (),
+    trust: bool = False,
+) -> int:
+    """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
+
+    Args:
+        folder: where the recordings are, in folders below it too: .rrd, .h5 and .json of the workbench, and .h5
+            with .json of ManiSkill's RecordEpisode.
+        rules: what happens where a task that is opened from here breaks a rule of GPU simulation: stop, warn, or off
+            to check none. If not given, what writes over the state of other envs stops, all else is a warning.
+        task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
+            itself has need none.
+        imports: a module that registers ids that recordings name, such as lab.tasks, imported in the processes that
+            run their tasks; repeatable.
+        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
+    """
+    if not folder.is_dir():
+        return refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab make one")
+    for file in task:
+        if not file.is_file():
+            return refuse(f"there is no file {file}")
+    from workbench.recording.reader.reading import start_reading
+
+    # While the page is imported, so that its first rows need not wait for it.
+    start_reading()
+    from workbench.cli.page import review_in_terminal
+    from workbench.jobs.task import TaskOptions
+    from workbench.session.process.memory_limit import parse_memory
+    from workbench.session.process.supervisor import WorkerOptions
+    from workbench.ui.server.gated_server import DoorOptions
+
+    try:
+        at = DoorOptions(**vars(page))
+        base = TaskOptions(rules=rules, imports=imported(imports))
+    except ValueError as error:
+        return refuse(str(error))
+    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), base, trust)
+
+
+@app.command
+def rescore(
+    places: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    task: str | None = None,
+    recorded_source: bool = False,
+    use_env_states: bool = False,
+    *,
+    batch: BatchArguments,
+    csv: Path | None = None,
+    json: Path | None = None,
+    trust: bool = False,
+) -> int:
+    """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise (on the page: Judge again).
+
+    Args:
+        places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
+        task: a task file, file.py:ClassName, package.module:ClassName or id to judge all of them with, in place of the
+            one each names.
+        recorded_source: judge each by the text that it was recorded with.
+        use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
+        csv: also write the table to this file, as CSV.
+        json: also write the table to this file, as JSON.
+        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
+            it, and without a terminal to ask in, nothing is run and the exit code is 4.
+    """
+    with quick_imports():
+        from workbench.cli.rescore import RescoreOptions, run_rescore
+
+    if task is not None and recorded_source:
+        return refuse("--task and --recorded-source name two versions to judge with: give one of them")
+    for table in (csv, json):
+        if table is not None and not table.resolve().parent.is_dir():
+            return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
+    try:
+        base = batch.options()
+    except ValueError as error:
+        return refuse(str(error))
+    use_private_driver()
+    from workbench.authoring.problem import TaskError
+    from workbench.cli.terminal import not_trusted
+    from workbench.session.clearance import NotTrusted
+
+    what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)
+    try:
+        return run_rescore(what, csv, json, trust)
+    except NotTrusted as error:
+        for line in not_trusted(error):
+            refuse(line)
+        return Exit.NOT_TRUSTED
+    except TaskError as error:
+        print_problem(error.problem)
+        return Exit.FAILED
+    except (OSError, ValueError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted")
+
+
+@app.command
+def share(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    mp4: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    html: bool = False,
+    sheet: bool = False,
+    out: Path = Path("."),
+) -> int:
+    """Make films, moving 3-D pages and sheets of pictures of recordings.
+
+    Args:
+        files: recordings, or folders of them.
+        mp4: a film of the camera of this name, of "scene" (the 3-D view), or of "cameras" (each of them); repeatable.
+        html: the moving 3-D view as one HTML file that needs no server and no network.
+        sheet: what each camera saw over time, on one picture.
+        out: folder for what is made; nothing that is there is written over.
+    """
+    from workbench.cli.share import share_in_terminal
+
+    use_private_driver()
+    return share_in_terminal(files, mp4, html, sheet, out)
+
+
+@app.command
+def export(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    lerobot: Path,
+    only_successes: bool = False,
+    only_fitting: bool = False,
+    task: str | None = None,
+    fps: int | None = None,
+    cameras: tuple[str, ...] | None = None,
+    state: tuple[str, ...] = (),
+    environment_state: tuple[str, ...] = (),
+) -> int:
+    """Make a dataset for training of recordings.
+
+    Args:
+        files: recordings, or folders of them.
+        lerobot: folder that becomes a LeRobot dataset (version 3); must not exist yet.
+        only_successes: leave out recordings that reach success at no step.
+        only_fitting: leave out recordings that cannot be read, or lack what the first one has (cameras, dimensions), and
+            say which; else such a one ends it.
+        task: the task in words, for policies that read; else its id.
+        fps: frames a second, of which the control rate is a whole multiple; else the control rate.
+        cameras: names of cameras; else all. Give none (--cameras) for a dataset without films.
+        state: observations that become observation.state, such as agent/qpos; else all that the robot knows of itself.
+        environment_state: observations that become observation.environment_state, such as extra; else none.
+    """
+    if fps is not None and fps < 1:
+        return refuse(f"--fps must be 1 or more, not {fps}")
+    from workbench.cli.share import export_in_terminal
+    from workbench.recording.lerobot.export import ExportOptions
+    from workbench.recording.lerobot.format import Choice
+
+    choice = Choice(state, environment_state, cameras)
+    return export_in_terminal(files, lerobot, ExportOptions(choice, only_successes, only_fitting, task, fps))
+
+
+@app.command
+def view(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    web: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 0,
+) -> int:
+    """Open recordings in rerun's own viewer: a window, or a page where there is no screen.
+
+    Args:
+        files: one or more .rrd files.
+        web: a page, also where there is a screen; it asks nobody but this program.
+        host: address to serve the page on.
+        port: port of the page; 0 takes any free one.
+    """
+    from workbench.cli.share import view_in_terminal
+
+    return view_in_terminal(files, web, host, port)
+
+
+@app.command
+def doctor() -> int:
+    """Say what this machine can do, and for each lack what to do about it."""
+    from workbench.machine.doctor import main
+
+    return main()
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry of the ``workbench`` command."""
+    guard_terminal()
+    try:
+        code: Any = app.cli(
+            prog="workbench",
+            description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
+            args=args,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
+        )
+    except KeyboardInterrupt:  # in the seconds before a command listens for it: importing torch takes some
+        code = refuse("interrupted")
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""``workbench rescore``: recorded episodes judged again in this process; a bar while it works, then the table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.progress import MofNCompleteColumn, TimeElapsedColumn
+from rich.table import Table
+
+from workbench.authoring.loading.reference import TaskName
+from workbench.authoring.problem import TaskError
+from workbench.cli.terminal import Exit, TerminalPrompt, can_ask, out, print_finding, progress_bar, warn
+from workbench.core.backends import gpu_left_alone
+from workbench.core.broken_rule import warn_of
+from workbench.core.rules import Finding
+from workbench.jobs.open_task import open_task
+from workbench.jobs.rescore_run import rescore
+from workbench.jobs.task import TaskOptions
+from workbench.jobs.verdict import Verdict
+from workbench.machine.files import replace_file
+from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.machine.text import plain_text
+from workbench.recording.episode.source import Source, UnreadableRecording
+from workbench.recording.reader.reading import sources_among
+from workbench.session.clearance import Clearances, NotCleared, NotTrusted
+from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore.recordings import (
+    Group,
+    group_episodes,
+    hidden_in_words,
+    judge_each,
+    with_renderer,
+)
+
+
+@dataclass(frozen=True)
+class RescoreOptions:
+    places: tuple[Path, ...]
+    """Files and folders."""
+    task: str | None = None
+    """Opened for all of them, in place of what each names."""
+    recorded_source: bool = False
+    use_env_states: bool = False
+    num_envs: int = 16
+    base: TaskOptions = field(default_factory=TaskOptions)
+    """Which backend, and what else is the same for all."""
+
+
+def rescore_all(
+    what: RescoreOptions,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_progress: Callable[[int, int, int], None] = lambda episodes, total, steps: None,
+    on_finding: Callable[[Finding], None] = warn_of,
+    clearances: Clearances | None = None,
+    on_notice: Callable[[str], None] = lambda notice: None,
+) -> tuple[list[Verdict[Source]], tuple[str, ...]]:
+    """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
+
+    Args:
+        on_progress: gets how many episodes are judged, of how many, and the control steps that were made.
+        clearances: says what of the code that the recordings name may run; None asks nobody.
+        on_notice: gets a sentence for each file beside a task that no import finds, before the task is opened.
+
+    Raises:
+        NotTrusted: a recording names code that nobody agreed to, and there is nobody to ask; or the answer to all was no.
+        FileNotFoundError, UnreadableRecording: there is nothing to judge.
+        TaskError: no task can be opened, or each raises; where others can be judged, it is said of its episodes.
+        CannotStepIn: as TaskError, where a recorded text cannot be opened.
+    """
+    torch.set_num_threads(1)  # see workbench.session.worker.loop.work
+    here = CurrentFolder()
+    files = [s for s in sources_among([place.absolute() for place in what.places]) if s.kind != "lerobot"]
+    if not files:
+        raise UnreadableRecording(
+            f"A LeRobot dataset cannot be judged again: {', '.join(map(str, what.places))}."
+        )
+    groups, verdicts = group_episodes(
+        files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
+    )
+    cleared = _cleared(groups, clearances or Clearances())
+    steps = 0
+    told: set[object] = set()
+
+    def tell_once(finding: Finding) -> None:
+        if finding.key not in told:  # a task may be opened several times, and break the rule each time
+            told.add(finding.key)
+            on_finding(finding)
+
+    def judge(group: Group, reference: TaskName) -> None:
+        nonlocal steps
+        for notice in hidden_in_words(reference):
+            if notice not in told:
+                told.add(notice)
+                on_notice(notice)
+        begin = partial(open_task, reference, on_activity=on_activity, on_finding=tell_once)
+        with here.again(stay=True):  # the task before may have gone to another one
+            try:
+                opened = begin(group.options)
+            except TaskError:
+                opened = begin(with_renderer(group.options))
+        before = steps
+
+        def tell(now: int) -> None:
+            nonlocal steps
+            steps = before + now
+            on_progress(len(verdicts), len(files), steps)
+
+        try:
+            for verdict in rescore(opened, group.files, use_env_states=what.use_env_states, on_steps=tell):
+                verdicts.append(verdict)
+                on_progress(len(verdicts), len(files), steps)
+        finally:
+            opened.env.close()
+
+    judge_each(groups, cleared, judge, lambda: verdicts, verdicts.extend)
+    place = {file.id: number for number, file in enumerate(files)}
+    verdicts.sort(key=lambda verdict: place[verdict.of.id])
+    return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
+
+
+def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
+    """What may be opened for each of the groups. Before any of them runs: who is not there to be asked gets all or nothing."""
+    cleared = clearances.clear_all([group.wanted for group in groups])
+    not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
+    refused = [one.question for one in not_cleared if one.question is not None]
+    reasons = [str(one) for one in not_cleared if one.trust_helps]
+    all_of_them = len(refused) + len(reasons) == len(groups) > 0
+    if all_of_them or (refused and not clearances.asks):
+        raise NotTrusted(list(dict.fromkeys(refused)), list(dict.fromkeys(reasons)))
+    return cleared
+
+
+def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust: bool) -> int:
+    """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
+    here = CurrentFolder()  # a task may go to another
+    if (left_alone := gpu_left_alone(what.base.backend)) is not None:
+        warn(left_alone)
+    asks = can_ask()  # before the bar takes the terminal
+    with progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
+        row = bar.add_task("reading the recordings", total=None)
+
+        def tell(episodes: int, total: int, steps: int) -> None:
+            bar.update(row, total=total, completed=episodes, description=f"judging, {steps} steps")
+
+        @contextmanager
+        def without_bar() -> Iterator[None]:
+            bar.stop()
+            yield
+            bar.start()
+
+        ask = TerminalPrompt(out, without_bar).ask if asks else None
+        verdicts, notes = rescore_all(
+            what,
+            lambda activity: bar.update(row, description=activity),
+            tell,
+            print_finding,
+            Clearances(ask=ask, all_trusted=trust),
+            warn,
+        )
+        bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
+    for path, text in ((csv, words.as_csv), (json, words.as_json)):
+        if path is not None:
+            with here.again():
+                replace_file(path, text(verdicts).encode())
+    print_verdicts(verdicts, out)
+    for note in (*notes, *words.not_carried(verdicts)):
+        warn(note)
+    if words.is_doubtful(verdicts):
+        warn(words.doubts(verdicts, words.PUT_IN))
+    return Exit.DONE
+
+
+def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
+    """The table, and a sentence over all of it.
+
+    Names of recordings take 55 characters. Where that leaves no room for the rest, as in a terminal of 80 columns, a
+    name has a line of its own, whole, so that it can be taken from there.
+    """
+    table = Table(box=None, pad_edge=False)
+    for name in ("episode", "seed", "steps", "return", "what changed", "drift"):
+        table.add_column(name, justify="right" if name in ("seed", "steps") else "left", overflow="fold")
+    for verdict in verdicts:
+        table.add_row(*map(escape, _cells(verdict)), style=_style(verdict))
+    if Measurement.get(out, out.options.update(max_width=10**6), table).maximum <= out.width:
+        out.print(table)
+    else:
+        for verdict in verdicts:
+            _print_lines(verdict, out)
+    out.print(escape(words.summary(verdicts)), soft_wrap=True)
+
+
+def _cells(verdict: Verdict[Source]) -> list[str]:
+    judged = not verdict.why_not
+    cells = [
+        verdict.of.name,
+        str(verdict.seed) if verdict.seed >= 0 else "",
+        str(verdict.length) if judged else "",
+        words.returns(verdict) if judged else "",
+        words.what_changed(verdict),
+        words.drift(verdict) if judged else "",
+    ]
+    return [plain_text(cell) for cell in cells]
+
+
+def _print_lines(verdict: Verdict[Source], out: Console) -> None:
+    name, seed, steps, total, changed, drift = _cells(verdict)
+    out.print(escape(name), style=_style(verdict), soft_wrap=True)
+    named = (("seed", seed), ("steps", steps), ("return", total), ("drift", drift))
+    facts = ", ".join(f"{what} {value}" for what, value in named if value)
+    for line in (changed, facts):
+        if line:
+            out.print(Padding(escape(line), (0, 0, 0, 4)), style=_style(verdict))
+
+
+def _style(verdict: Verdict[Source]) -> str:
+    return "yellow" if verdict.why_not else "bold" if verdict.differs else "dim"

@@ -1,0 +1,128 @@
+"""``workbench share`` and ``workbench export`` in a terminal: a bar while it is made, and what was made at the end."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rich.progress import TimeRemainingColumn
+
+from workbench.cli.terminal import progress_bar, refuse, say, say_addresses, warn
+from workbench.recording.episode.source import Source
+from workbench.recording.lerobot.export import DoesNotFit, ExportOptions
+from workbench.recording.reader.reading import sources_among
+from workbench.recording.rerun.viewer import has_screen, open_window, recordings_among, web_viewer_folder
+from workbench.ui.share.make import EVERY_CAMERA, Made, Wanted, make
+
+SCENE, CAMERAS = "scene", "cameras"
+
+
+def share_in_terminal(
+    files: Sequence[Path],
+    mp4: Sequence[str],
+    html: bool,
+    sheet: bool,
+    out: Path,
+) -> int:
+    """Returns the exit code."""
+
+    def wanted(sources: tuple[Source, ...]) -> list[Wanted]:
+        films = [
+            Wanted("scene", sources, out)
+            if name == SCENE
+            else Wanted("film", sources, out, EVERY_CAMERA if name == CAMERAS else name)
+            for name in mp4
+        ]
+        return [*films, *[Wanted("page", sources, out)] * html, *[Wanted("sheet", sources, out)] * sheet]
+
+    if not (mp4 or html or sheet):
+        return refuse("say what to make: --mp4 CAMERA, --mp4 scene, --html or --sheet")
+    return _make_all(files, wanted)
+
+
+def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
+    """Returns the exit code."""
+    return _make_all(files, lambda sources: [Wanted("lerobot", sources, folder, export=options)])
+
+
+def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], list[Wanted]]) -> int:
+    try:
+        wanted = wanted_of(sources_among(files))
+    except (OSError, ValueError) as error:
+        return refuse(str(error))
+    made: list[Made] = []
+    not_made: list[str] = []
+    try:
+        with progress_bar(TimeRemainingColumn()) as bar:
+            row = bar.add_task("reading", total=len(wanted))
+            for number, one in enumerate(wanted):
+
+                def told(done: float, doing: str, number: int = number) -> None:
+                    bar.update(row, completed=number + done, description=doing)
+
+                try:
+                    made.append(make(one, told))
+                    not_made += made[-1].not_made
+                except DoesNotFit as error:
+                    not_made.append(f"{error} With --only-fitting such recordings are left out.")
+                except ValueError as error:
+                    not_made.append(str(error))
+    except (OSError, RuntimeError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted; what was finished is kept")
+    finally:
+        for one in made:
+            for path in one.paths:
+                say(path if path.is_file() else f"{path}: {one.words}")
+    for why in not_made:
+        refuse(why)
+    return 2 if not_made else 0
+
+
+# --- ``workbench view`` in a terminal: rerun's own viewer, in a window or, where there is no screen, in a page ---
+
+
+def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
+    """Show them until the window is closed or Ctrl-C comes; returns the exit code."""
+    try:
+        if web or not has_screen(os.environ):
+            return _in_page(recordings_among(files), host, port)
+        viewer = open_window(files)
+    except (OSError, ValueError, RuntimeError) as error:
+        return refuse(str(error))
+    try:
+        viewer.wait()
+    except RuntimeError as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        say("closing")
+    finally:
+        viewer.close()
+    return 0
+
+
+def _in_page(files: Sequence[Path], host: str, port: int) -> int:
+    from workbench.ui.server.file_response import Offers
+    from workbench.ui.server.gated_server import DoorOptions, open_door
+    from workbench.ui.share.rerun_view import RerunPages
+
+    web_viewer_folder()
+    door = open_door(DoorOptions(host=host, port=port))
+    try:
+        address = RerunPages(door, Offers(door)).address(files)
+        if door.warning:
+            warn(door.warning)
+        say_addresses(door.addresses(address))
+        say(f"  remote  {door.ssh_hint}")
+        say("  Ctrl-C ends it.")
+        while True:
+            # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        say("closing")
+    finally:
+        door.close()
+    return 0

@@ -1,0 +1,1 @@
+"""Cameras: placed, rendered, measured and searched for."""

@@ -1,0 +1,380 @@
+"""Pictures of chosen cameras of one chosen env, and of nothing else.
+
+ManiSkill renders all cameras of all envs or none, and on a software driver a picture costs 50 ms. A
+page shows a few cameras of one env, so here only those are rendered, from that env's own sub-scene.
+
+What a camera must not see is the delicate part. ManiSkill hides a task's ``_hidden_objects`` from
+sensors and shows them to human cameras, on a stock CPU env by the visibility of the drawn body, in
+batched simulation by moving the object 99999 m away. Here visibility is used always, and an object
+that ManiSkill has moved away is put back while human cameras look; both are undone before returning,
+so a picture leaves no trace in the simulation. The pictures are those that ManiSkill itself would
+give for the state: its own shaders and texture transforms make them.
+
+The pictures that belong to a step, out of the observation where it has them already.
+
+A task that observes pictures (``obs_mode="rgb+depth"`` and the like) has drawn its sensors for this very step, and a
+picture takes 25 to 50 ms on a software renderer: a recording that draws them again would take twice as long as the
+episode. So what the observation holds is taken from there, and only the rest is drawn. Both are the same picture (tested),
+with two exceptions that are drawn: depth that does not fit into ManiSkill's whole millimetres, which end at 32.767 m, and
+shaders that give more than millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.render
+import torch
+from numpy.typing import NDArray
+
+from workbench.core import maniskill_private
+from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
+from workbench.core.cameras.place import rows_of_pose, settings_of
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.env_numbers import require_env
+from workbench.core.scene.scene_index import hidden_poses, scene_index
+from workbench.core.simulation.cpu_system import batched_system
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
+
+_MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
+_INT16_END = 32.767
+"""Metres. The minimal shader writes positions as int16 millimetres."""
+
+KINDS: tuple[CameraKind, ...] = ("sensor", "human")
+Request = tuple[str, CameraKind, Sequence[str]]
+"""Name, kind and modalities of a camera whose picture is wanted."""
+
+
+def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
+    """All cameras of a ManiSkill env: its sensors (the robot's too), then its human render cameras.
+
+    Empty where nothing can be rendered. Sensors that are no plain cameras are left out.
+    """
+    infos = []
+    for (kind, name), camera in cameras_of(env).items():
+        components = maniskill_private.camera_components(camera)
+        component = components[0]
+        gives = {m for modalities in camera.config.shader_config.texture_names.values() for m in modalities}
+        infos.append(
+            CameraInfo(
+                name=name,
+                kind=kind,
+                width=component.width,
+                height=component.height,
+                fovy=float(component.fovy),
+                near=float(component.near),
+                far=float(component.far),
+                intrinsic=np.array(component.get_intrinsic_matrix(), dtype=np.float32),
+                mount=mount_of(env, camera),
+                modalities=tuple(m for m in _MODALITIES if m in gives),
+                settings=settings_of(camera.config),
+                varies=_varies(camera.config, components),
+                site=maniskill_private.camera_site(camera.config),
+            )
+        )
+    return tuple(infos)
+
+
+def segmentation_names(env: Any) -> dict[int, str]:
+    """Body name of every id in a segmentation picture; 0, the background, is not among them.
+
+    Ids count the entities of a sub-scene, so they are the same in all envs that are built alike.
+    Where envs differ an id that means two things is called ``a | b``.
+    """
+    index = scene_index(env)
+    names: dict[int, list[str]] = {}
+    for row in index.entities:
+        for entity, name in zip(row, index.names, strict=True):
+            if entity is not None:
+                known = names.setdefault(int(entity.per_scene_id), [])
+                if name not in known:
+                    known.append(name)
+    return {number: " | ".join(known) for number, known in names.items()}
+
+
+def take_pictures(
+    env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
+) -> tuple[Picture, ...]:
+    """Render the cameras that are asked for, in env `env_index`; in the order asked.
+
+    Args:
+        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
+            tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a moment of the past can be looked at while the simulation is
+            elsewhere. A camera rides along with the body that it is mounted on; colours and lights are today's.
+
+    Raises:
+        IndexError: there is no such env.
+        ValueError: there is no such camera, or it cannot give what is asked of it.
+        RuntimeError: the renderer failed.
+    """
+    pictures: dict[int, Picture] = {}
+    for kind in KINDS:
+        chosen = [i for i, request in enumerate(requests) if request[1] == kind]
+        begun = begin_pictures(env, env_index, [requests[i] for i in chosen], poses)
+        pictures.update(zip(chosen, begun.finish(), strict=True))
+    return tuple(pictures[i] for i in range(len(requests)))
+
+
+@dataclass(frozen=True)
+class BegunPictures:
+    """Pictures that the renderer is at work on; see `begin_pictures`."""
+
+    _taken: tuple[tuple[Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
+
+    def finish(self) -> tuple[Picture, ...]:
+        """The pictures, in the order asked; waits until the renderer is done."""
+        return tuple(_read(*taken) for taken in self._taken)
+
+
+def begin_pictures(
+    env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
+) -> BegunPictures:
+    """Set the renderer to work on the cameras asked for, and return at once.
+
+    SAPIEN hands a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
+    threads of a software driver, draw while the simulation steps on (measured on two cores with
+    lavapipe: 26 control steps of 16 envs in 151 ms beside a picture that takes 51 ms alone). The scene is
+    drawn as it is now; it must not be closed, or shown to another camera, before `finish`.
+
+    Args:
+        requests: all of one kind, since sensors and human cameras see different objects.
+        poses: as in `take_pictures`.
+
+    Raises:
+        As `take_pictures`.
+    """
+    require_env(env_index, env.num_envs)
+    kinds = {kind for _, kind, _ in requests}
+    if len(kinds) > 1:
+        raise ValueError("pictures of sensors and of human cameras cannot be begun together")
+    cameras = cameras_of(env)
+    for name, kind, modalities in requests:
+        _check(name, kind, modalities, cameras)
+    if not requests:
+        return BegunPictures(())
+    scene = env.scene
+    if scene.gpu_sim_enabled:
+        scene.px.sync_poses_gpu_to_cpu()
+    sub_scene = scene.sub_scenes[env_index]
+    taken = []
+    components = [
+        maniskill_private.camera_components(cameras[kind, name])[env_index] for name, kind, _ in requests
+    ]
+    places = places_to_draw(env, env_index, poses)
+    with (
+        hidden_objects(env, env_index, shown=kinds == {"human"}),
+        drawn_at(places, components) as move_bodies,
+    ):
+        sub_scene.update_render()
+        move_bodies()
+        for (name, kind, modalities), component in zip(requests, components, strict=True):
+            component.take_picture()
+            pose = component.get_global_pose()
+            where = np.array([*pose.p, *pose.q], dtype=np.float32)
+            taken.append((cameras[kind, name], name, kind, env_index, tuple(modalities), where))
+    return BegunPictures(tuple(taken))
+
+
+def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
+    """Which entities of an env to draw elsewhere than they are; ask before anything is shown or hidden.
+
+    Args:
+        poses: as in `take_pictures`.
+    """
+    if poses is not None:
+        each = zip(scene_index(env).entities[env_index], poses, strict=True)
+        return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
+    px = batched_system(env.scene)
+    return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
+
+
+def cameras_of(env: Any) -> dict[CameraKey, Any]:
+    """The plain ones."""
+    return {
+        key: camera
+        for key, camera in maniskill_private.cameras(env).items()
+        if maniskill_private.camera_components(camera)
+    }
+
+
+def _varies(config: Any, components: Sequence[Any]) -> bool:
+    """Whether the poses differ between envs, or are not those of the config."""
+    said = rows_of_pose(config)
+    real = np.array([[*c.local_pose.p, *c.local_pose.q] for c in components])
+    return bool((said != said[:1]).any() or np.abs(real - said[:1]).max() > 1e-5)
+
+
+def mount_of(env: Any, camera: Any) -> str | None:
+    """Name of the body that a camera rides on; `camera` as `cameras_of` gives it."""
+    mount = camera.camera.mount
+    return None if mount is None else scene_index(env).name_of(maniskill_private.objects_of(mount)[0])
+
+
+def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[CameraKey, Any]) -> None:
+    camera = cameras.get((kind, name))  # type: ignore[call-overload]
+    if camera is None:
+        there = ", ".join(f"{n} ({k})" for k, n in cameras) or "none"
+        raise ValueError(f"there is no {kind} camera {name!r} to take a picture with; there are: {there}")
+    gives = {m for ms in camera.config.shader_config.texture_names.values() for m in ms}
+    for modality in modalities:
+        if modality not in _MODALITIES:
+            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_MODALITIES)}")
+        if modality not in gives:
+            pack = camera.config.shader_config.shader_pack
+            raise ValueError(f"camera {name!r} gives no {modality} with the shader pack {pack!r}")
+
+
+@contextmanager
+def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
+    """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
+    slot_of = scene_index(env).slot_of
+    true = (
+        {slot: pose for rows in hidden_poses(env) for slot, pose in zip(*rows, strict=True)} if shown else {}
+    )
+    changes: list[tuple[Any, str, Any]] = []
+    for actor in maniskill_private.hidden_objects(env):
+        for entity, env_of in zip(
+            maniskill_private.objects_of(actor), maniskill_private.envs_of(actor), strict=True
+        ):
+            body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+            if env_of != env_index or body is None:
+                continue
+            # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
+            changes.append((body, "visibility", (body.visibility or 1.0) if shown else 0.0))
+            pose = true.get(slot_of[id(entity)]) if id(entity) in slot_of else None
+            if pose is not None:
+                changes.append((entity, "pose", sapien.Pose(pose[:3], pose[3:])))
+    with temporarily(changes):
+        yield
+
+
+def _read(
+    camera: Any,
+    name: str,
+    kind: CameraKind,
+    env_index: int,
+    modalities: tuple[str, ...],
+    pose: NDArray[np.float32],
+) -> Picture:
+    component = maniskill_private.camera_components(camera)[env_index]
+    config = camera.config.shader_config
+    made: dict[str, torch.Tensor] = {}
+    depth = None
+    for texture, gives in config.texture_names.items():
+        if not set(gives) & set(modalities):
+            continue
+        data = component.get_picture(texture)
+        transformed = config.texture_transforms[texture](torch.from_numpy(data)[None])
+        made.update({m: image[0] for m, image in transformed.items() if m in modalities})
+        if "depth" in gives and "depth" in modalities:
+            depth = depth_in_metres(texture, data, made["depth"].numpy()[..., 0], component)
+    segmentation, position, normal = (made.get(m) for m in ("segmentation", "position", "normal"))
+    return Picture(
+        camera=name,
+        kind=kind,
+        env=env_index,
+        pose=pose,
+        rgb=np.ascontiguousarray(made["rgb"].numpy()) if "rgb" in made else None,
+        depth=depth,
+        segmentation=None if segmentation is None else segmentation.numpy()[..., 0].astype(np.int32),
+        position=None if position is None else position.numpy().astype(np.float32) / np.float32(1000.0),
+        normal=None if normal is None else np.ascontiguousarray(normal.numpy(), dtype=np.float32),
+        albedo=np.ascontiguousarray(made["albedo"].numpy()) if "albedo" in made else None,
+    )
+
+
+def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
+    """(H, W) metres, 0 for background, from the texture `data` and ManiSkill's own reading of it.
+
+    ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
+    in the default and ray tracing shaders, they are used as they are. The minimal shader's texture is
+    int16 itself: what lies beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
+    also wrap around) and read from the depth buffer instead.
+    """
+    if texture == "Position" and np.issubdtype(data.dtype, np.floating):
+        # A background of -0.0 would be printed as "-0.0 m".
+        return -data[..., 2] + np.float32(0.0)
+    if np.issubdtype(transformed.dtype, np.floating):
+        return transformed.astype(np.float32)
+    depth = transformed.astype(np.float32) / np.float32(1000.0)
+    beyond = (depth < 0.0) | (depth >= _INT16_END)
+    if beyond.any():
+        # Vulkan's depth in 0..1 of a perspective camera: z = f (1 - n / d) / (f - n).
+        buffer = component.get_picture("GbufferDepth")
+        z = buffer.reshape(*depth.shape, -1)[..., 0][beyond].astype(np.float64)
+        near, far = float(component.near), float(component.far)
+        depth[beyond] = near / np.maximum(1.0 - z * (far - near) / far, near / far)
+    return depth
+
+
+# --- of a step ---------------------------------------------------------------------------------------
+
+
+def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
+    """Which pictures of a task an episode keeps: of a sensor what a policy may see, of a human camera colour."""
+    asked = []
+    for camera in cameras:
+        wanted = ("rgb", "depth", "segmentation") if camera.kind == "sensor" else ("rgb",)
+        kept = tuple(modality for modality in wanted if modality in camera.modalities)
+        asked.append((camera.name, camera.kind, kept))
+    return tuple(asked)
+
+
+def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:
+    """Pictures of the cameras that are asked for, of the state that was observed last, env by env.
+
+    Depth and segmentation that were observed are as ManiSkill has them: int16, whole millimetres and ids. Raises as
+    `take_pictures`.
+    """
+    if not requests:
+        return []
+    seen = [_observed(task, env_idx, request) for request in requests]
+    drawn = [request for request, found in zip(requests, seen, strict=True) if found is None]
+    pictures: list[Picture] = []
+    for at, env in enumerate(env_idx):
+        made = iter(take_pictures(task.env, env, drawn) if drawn else ())
+        pictures += [next(made) if found is None else found[at] for found in seen]
+    return pictures
+
+
+def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[Picture] | None:
+    """Of each env; None where they have to be drawn."""
+    name, kind, modalities = request
+    seen: Any = task.obs.get("sensor_data", {}) if isinstance(task.obs, Mapping) else {}
+    images = seen.get(name) if kind == "sensor" else None
+    if not isinstance(images, Mapping) or not modalities or not set(modalities) <= set(images):
+        return None
+    camera: Any = maniskill_private.cameras(task.env).get(("sensor", name))
+    if camera is None or not (components := maniskill_private.camera_components(camera)):
+        return None
+    if camera.config.shader_config.shader_pack != "minimal":
+        return None
+    rows = {modality: images[modality][list(env_idx)].numpy(force=True) for modality in modalities}
+    depth, segmentation = rows.get("depth"), rows.get("segmentation")
+    if depth is not None and (depth.dtype != np.int16 or depth.min() < 0):
+        return None
+    scene: Any = task.env.scene
+    if scene.gpu_sim_enabled:
+        scene.px.sync_poses_gpu_to_cpu()
+    px = batched_system(scene)
+    elsewhere = {} if px is None else px.elsewhere(env_idx)
+    found = []
+    for at, env in enumerate(env_idx):
+        pose = camera_pose(components[env], elsewhere.get(env, NOWHERE_ELSE))
+        found.append(
+            Picture(
+                camera=name,
+                kind="sensor",
+                env=env,
+                pose=np.array([*pose.p, *pose.q], dtype=np.float32),
+                rgb=None if "rgb" not in rows else rows["rgb"][at],
+                depth=None if depth is None else depth[at, ..., 0],
+                segmentation=None if segmentation is None else segmentation[at, ..., 0],
+            )
+        )
+    return found

@@ -1,0 +1,129 @@
+"""A camera at any place in one env, for as long as it takes to look, and without a trace.
+
+To judge a placement that is only thought of, something has to take its picture. The env's own camera could be moved
+there and back, but it may be of another size and shader, and ManiSkill keeps its matrices. An entity of its own in
+the env's sub-scene would be one more in the list whose order our tables, snapshots and PhysX's packed state rely on,
+and would use up a number of the segmentation. So the camera lives in a second, empty ``sapien.Scene`` that shares
+the sub-scene's render system: it sees what that system draws, and the sub-scene never hears of it. (Measured with
+sapien 3.0.3: entities, packed poses, ids and pictures of the other cameras are equal before and after.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.render
+from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
+from numpy.typing import ArrayLike, NDArray
+
+from workbench.core.camera_data import CameraKind, CameraSettings
+from workbench.core.cameras.conventions import intrinsic_of, scaled_intrinsic
+from workbench.core.cameras.render import cameras_of, depth_in_metres, hidden_objects, places_to_draw
+from workbench.core.env_numbers import require_env
+from workbench.core.simulation.drawn_poses import drawn_at, temporarily
+
+_SHADER = PREBUILT_SHADER_CONFIGS["minimal"]
+_TEXTURE = "PositionSegmentation"
+
+
+@dataclass
+class TemporaryCamera:
+    """A camera that gives depth and segmentation, of what its kind of camera sees."""
+
+    _sub_scene: Any
+    _component: Any
+    _move_bodies: Any
+
+    def look(self, pose: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Segmentation (H, W), 0 for background, and depth (H, W) in metres, from a pose (7,) in the env's frame."""
+        p = np.asarray(pose, np.float32).tolist()
+        self._component.local_pose = sapien.Pose(p[:3], p[3:])
+        # A camera is where its entity was at the last update, whatever its pose says by now.
+        self._sub_scene.update_render()
+        self._move_bodies()
+        self._component.take_picture()
+        data = self._component.get_picture(_TEXTURE)
+        depth = depth_in_metres(_TEXTURE, data, -data[..., 2], self._component)
+        return data[..., 3].astype(np.int32), depth
+
+    def colours(self) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB of what was looked at last."""
+        return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
+
+
+@contextmanager
+def temporary_camera(
+    env: Any,
+    env_index: int,
+    kind: CameraKind,
+    settings: CameraSettings,
+    size: tuple[int, int] | None = None,
+    poses: NDArray[np.float32] | None = None,
+) -> Iterator[TemporaryCamera]:
+    """A camera in one env; nothing of the env may be changed, and no other picture taken, while it is there.
+
+    Args:
+        kind: sensors do not see what the task hides from them.
+        settings: its lens; its pose is for `look` to say.
+        size: width and height of the pictures, which show the same view; None for its own.
+        poses: (B, 7) where to draw the env's bodies; None for where the tensors have them.
+
+    Raises:
+        IndexError: there is no such env.
+        ValueError: the lens cannot be rendered.
+        RuntimeError: the env was made without a render device, or the renderer failed.
+    """
+    require_env(env_index, env.num_envs)
+    own, near, far = (settings.width, settings.height), settings.near, settings.far
+    size = size or own
+    k = scaled_intrinsic(intrinsic_of(settings), own, size)
+    if not 0 < near < far:
+        raise ValueError(f"the near plane must lie before the far plane, and both ahead: {near} m, {far} m")
+    scene = env.scene
+    sub_scene = scene.sub_scenes[env_index]
+    render_system = sub_scene.render_system
+    if render_system is None:
+        raise RuntimeError("the env was made without a render device, and so without cameras")
+    if scene.gpu_sim_enabled:
+        scene.px.sync_poses_gpu_to_cpu()
+    places = places_to_draw(env, env_index, poses)
+    with ExitStack() as after:
+        after.enter_context(hidden_objects(env, env_index, shown=kind == "human"))
+        move_bodies = after.enter_context(drawn_at(places))
+        beside = sapien.Scene([render_system])
+        entity = sapien.Entity()
+        with _minimal_shader(env):
+            component = sapien.render.RenderCameraComponent(size[0], size[1])
+            entity.add_component(component)
+            beside.add_entity(entity)
+        after.callback(beside.remove_entity, entity)
+        component.near, component.far = near, far
+        component.set_focal_lengths(k[0, 0], k[1, 1])
+        component.set_principal_point(k[0, 2], k[1, 2])
+        yield TemporaryCamera(sub_scene, component, move_bodies)
+
+
+@contextmanager
+def _minimal_shader(env: Any) -> Iterator[None]:
+    """SAPIEN makes every camera with the shader that was named last in the process."""
+    last = [*cameras_of(env).values()][-1:]
+    set_shader_pack(_SHADER)
+    try:
+        yield
+    finally:
+        for camera in last:
+            set_shader_pack(camera.config.shader_config)
+
+
+@contextmanager
+def undrawn(entities: Sequence[Any]) -> Iterator[None]:
+    """Do not draw these entities (None among them is passed over); afterwards they are as visible as before."""
+    bodies = [body for entity in entities if entity is not None for body in entity.components]
+    drawn = [body for body in bodies if isinstance(body, sapien.render.RenderBodyComponent)]
+    with temporarily((body, "visibility", 0.0) for body in drawn):
+        yield

@@ -1,0 +1,1 @@
+"""What is read out of a running env: for a person, and for a recording."""

@@ -1,0 +1,284 @@
+"""Reads one env out: observation, state dict, joints, contacts.
+
+The numbers are taken from where the task itself takes them: the observation is the last one that the env
+returned, the state is ``get_state_dict()``, joints and drive targets come from ManiSkill's batched tensors. So
+what is shown is what the author's code sees, on the CPU as on a GPU, and not a second opinion of SAPIEN's.
+
+With ``obs_mode="state"`` the observation is one row of numbers, and which of forty is the cube's height is the
+first thing one asks. ManiSkill throws the names away when it flattens, so they are found by observing once
+more and not flattening: that runs the author's hooks, which may count or draw random numbers, hence it is done
+once a version of the task, and everything that the task remembers is put back afterwards.
+
+A task asks for the impulse on a body it knows (`contacts`); a person who wonders why the peg will not go in
+wants to see everything that touches anything. PhysX on the CPU has that list, and ManiSkill gives it for a
+single env only (``scene.get_contacts()``). Here it is read for one env at a time, with the names under which
+the rest of the workbench shows the bodies; the other envs cost nothing.
+
+A contact here is what PhysX calls one: two collision *shapes* that are nearer than their contact offsets
+(1 cm each unless the task says otherwise). So a pair of bodies may come more than once, and a contact with a
+positive `separation` and no impulse is two shapes that are near and do not touch.
+"""
+
+from __future__ import annotations
+
+import operator
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien.physx as physx
+import torch
+from numpy.typing import NDArray
+
+from workbench.core import maniskill_private
+from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Section, Touching
+from workbench.core.capture.state_columns import apart, env_states, names_of_flat
+from workbench.core.env.evaluate_entries import flat_entries
+from workbench.core.env.task_env import TaskEnv, to_numpy
+from workbench.core.env_numbers import require_env
+from workbench.core.scene.scene_index import SceneIndex, scene_index
+from workbench.core.simulation.cpu_system import batched_system
+
+MOST_VALUES = 64
+"""Numbers of one array that are sent; a joint vector has fewer, a picture has more."""
+
+
+def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
+    """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
+
+    Costs about 1 ms a section for a Panda on a table, and does not change how the episode goes on.
+
+    Raises:
+        IndexError: there is no such env.
+    """
+    require_env(env, task.num_envs)
+    readers: dict[Section, Callable[[TaskEnv, int], Any]] = {
+        "observation": read_observation,
+        "state": read_state,
+        "joints": read_joints,
+        "contacts": read_contacts,
+    }
+    began = time.perf_counter()
+    read: dict[str, Any] = {}
+    refused: list[tuple[Section, str]] = []
+    for section, reader in readers.items():
+        if section not in sections:
+            continue
+        try:
+            read[section] = reader(task, env)
+        except NotImplementedError as error:
+            refused.append((section, str(error)))
+        except Exception as error:
+            # The author's own get_state_dict or observation hook: the others are still worth seeing.
+            refused.append((section, f"reading it raised {type(error).__name__}: {error}"))
+    return Inspection(
+        env=env,
+        elapsed_steps=int(task.env.elapsed_steps[env]),
+        refused=tuple(refused),
+        milliseconds=1000 * (time.perf_counter() - began),
+        **read,
+    )
+
+
+def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
+    """The last observation; a flattened one (N, D) taken apart by the names of what it was made of."""
+    leaves: list[Leaf] = []
+    for name, value in flat_entries({} if task.obs is None else task.obs):
+        # "state" is what ManiSkill calls the flattened part beside the pictures.
+        names = names_of_flat(task, value) if name in ("", "state") else None
+        if names is None:
+            leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
+        else:
+            leaves += [_leaf(*part) for part in apart(names, to_numpy(value[env]))]
+    return tuple(leaves)
+
+
+def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
+    """``get_state_dict()``; 13 numbers of a body and 13 + 2 J of an articulation by what they are."""
+    structs = scene_index(task.env).states
+    leaves: list[Leaf] = []
+    for name, value in env_states(task.env).items():
+        struct = structs.get(name)
+        if struct is None:
+            leaves.append(_leaf(name, _row(value, env, task.num_envs)))
+        elif env in maniskill_private.envs_of(struct):
+            leaves += [
+                _leaf(f"{name}/{part}", numbers) for part, numbers in _state_parts(to_numpy(value[env]))
+            ]
+    return tuple(leaves)
+
+
+def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
+    """Every articulation that this env has, robots first as they were built."""
+    found = []
+    for name, articulation in task.env.scene.articulations.items():
+        at = np.flatnonzero(np.asarray(maniskill_private.envs_of(articulation)) == env)
+        if not len(at):
+            continue
+        row = int(at[0])
+        joints = maniskill_private.objects_of(articulation)[row].active_joints
+        count = len(joints)
+        if not count:
+            continue
+        # SAPIEN's own names carry the env's number.
+        names = tuple(joint.name for joint in articulation.active_joints)
+        limits = to_numpy(articulation.get_qlimits()[row])[:count]
+        stiff = np.array([joint.stiffness > 0 for joint in joints])
+        found.append(
+            JointReadings(
+                articulation=name,
+                names=names,
+                kinds=tuple(str(joint.type) for joint in joints),
+                position=_floats(articulation.get_qpos()[row])[:count],
+                velocity=_floats(articulation.get_qvel()[row])[:count],
+                target=np.where(stiff, _floats(articulation.get_drive_targets()[row])[:count], np.nan),
+                low=limits[:, 0].astype(np.float32),
+                high=limits[:, 1].astype(np.float32),
+            )
+        )
+    return tuple(found)
+
+
+def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
+    """Pairs of bodies that touch in the last substep, strongest first.
+
+    Raises:
+        NotImplementedError: the env is simulated on the GPU.
+    """
+    pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
+    for contact in list_contacts(task.env, env):
+        first, second = contact.bodies
+        # Shapes that are near have a contact too; without a push and a gap apart they do not touch.
+        if not contact.impulses.any() and not (contact.separations <= 0).any():
+            continue
+        ordered = (first, second) if first <= second else (second, first)
+        pairs.setdefault(ordered, []).append((contact, 1 if ordered == (first, second) else -1))
+    touching = [_touching(bodies, contacts) for bodies, contacts in pairs.items()]
+    return tuple(sorted(touching, key=lambda pair: (-float(np.linalg.norm(pair.force)), pair.bodies)))
+
+
+def _touching(bodies: tuple[str, str], contacts: list[tuple[Contact, int]]) -> Touching:
+    timestep = np.float32(contacts[0][0].timestep)
+    impulses = np.concatenate([sign * contact.impulses for contact, sign in contacts])
+    impulse = impulses.sum(axis=0)
+    return Touching(
+        bodies=bodies,
+        force=impulse / timestep,
+        impulse=impulse,
+        points=np.concatenate([contact.points for contact, _ in contacts]),
+        forces=impulses / timestep,
+        separation=min(float(contact.separations.min()) for contact, _ in contacts),
+    )
+
+
+def _state_parts(row: NDArray) -> Iterator[tuple[str, NDArray]]:
+    """As `Actor.get_state` and `Articulation.get_state` lay them out."""
+    joints = (len(row) - 13) // 2
+    widths = [("p", 3), ("q", 4), ("v", 3), ("w", 3), ("qpos", joints), ("qvel", joints)]
+    if 13 + 2 * joints != len(row):
+        widths = [("", len(row))]
+    at = 0
+    for name, width in widths:
+        if width:
+            yield name, row[at : at + width]
+        at += width
+
+
+def _row(value: Any, env: int, num_envs: int) -> NDArray:
+    shape: tuple[int, ...] = tuple(getattr(value, "shape", ()))
+    # Only the row leaves the device: a picture of every env would be megabytes.
+    return to_numpy(value[env] if shape[:1] == (num_envs,) else value)
+
+
+def _leaf(name: str, value: NDArray, dtype: str | None = None) -> Leaf:
+    numeric = value.dtype.kind in "fiub" and value.size > 0
+    low, high = (float(value.min()), float(value.max())) if numeric else (np.nan, np.nan)
+    values = value.reshape(-1)[:MOST_VALUES].copy()
+    return Leaf(name, tuple(value.shape), dtype or str(value.dtype), values, low, high)
+
+
+def _floats(value: torch.Tensor) -> NDArray[np.float32]:
+    return to_numpy(value).astype(np.float32)
+
+
+# --- Which bodies of an env touch, where, and how hard: for people who look, not for rewards ---
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One pair of shapes in the last substep, with K points; float32, the env's own world frame."""
+
+    bodies: tuple[str, str]
+    """Names as in `SceneIndex.names`; the name of the ``sapien.Entity`` for what ManiSkill does not manage."""
+    points: NDArray[np.float32]
+    """(K, 3) metres."""
+    normals: NDArray[np.float32]
+    """(K, 3) unit vectors from the second body towards the first."""
+    impulses: NDArray[np.float32]
+    """(K, 3) newton seconds ON the first body, BY the second, in the last substep; friction is in it."""
+    separations: NDArray[np.float32]
+    """(K,) metres between the surfaces; negative where they overlap."""
+    timestep: float
+    """Seconds of a substep."""
+
+    @property
+    def impulse(self) -> NDArray[np.float32]:
+        """(3,) newton seconds on the first body: the sum of `impulses`."""
+        return self.impulses.sum(axis=0)
+
+    @property
+    def force(self) -> NDArray[np.float32]:
+        """(3,) newtons on the first body, the mean over the last substep. On the second: its negative."""
+        return self.impulse / np.float32(self.timestep)
+
+
+def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
+    """All contacts of one env in its last substep, ordered by their bodies' names, then by their points.
+
+    (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
+
+    A state that was set since (a reset, a restored snapshot) has no contacts of its own until the next step:
+    the list is still that of the last substep, as in stock ManiSkill.
+
+    Args:
+        env: a ManiSkill env (reset at least once; wrappers are looked through): batched on the CPU, or stock.
+
+    Raises:
+        IndexError: there is no such env.
+        NotImplementedError: the env is simulated on the GPU.
+    """
+    env, env_idx = maniskill_private.open_env(env), operator.index(env_idx)
+    require_env(env_idx, env.num_envs)
+    batched = batched_system(env.scene)
+    if batched is None and env.scene.gpu_sim_enabled:
+        raise NotImplementedError(
+            "PhysX on the GPU keeps no list of contacts that can be read: open the task with the CPU backend."
+        )
+    system = env.scene.px if batched is None else batched.systems[env_idx]
+    index, timestep = scene_index(env), env.scene.timestep
+    contacts = [_read(contact, index, timestep) for contact in system.get_contacts()]
+    return tuple(sorted(contacts, key=_place))
+
+
+def _place(contact: Contact) -> tuple[Any, ...]:
+    # Two shapes of one body may touch the same point: then they differ in depth.
+    return contact.bodies, contact.points.tolist(), contact.separations.tolist(), contact.impulses.tolist()
+
+
+def _read(contact: physx.PhysxContact, index: SceneIndex, timestep: float) -> Contact:
+    first, second = contact.bodies
+    points = contact.points
+    return Contact(
+        bodies=(index.name_of(first) or first.entity.name, index.name_of(second) or second.entity.name),
+        points=_rows([point.position for point in points]),
+        normals=_rows([point.normal for point in points]),
+        impulses=_rows([point.impulse for point in points]),
+        separations=np.array([point.separation for point in points], dtype=np.float32),
+        timestep=timestep,
+    )
+
+
+def _rows(vectors: Sequence[Any]) -> NDArray[np.float32]:
+    return np.array(vectors, dtype=np.float32).reshape(-1, 3)

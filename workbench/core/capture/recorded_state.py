@@ -1,0 +1,147 @@
+"""A recorded state put into an env that runs, and how far an env is from a recorded state.
+
+What a recording keeps of a state is what ManiSkill's ``get_state_dict`` gives: by the names of actors and
+articulations, poses, velocities and joints. The env it is put into may be of other code: an actor gone, one renamed,
+an arm with another joint. So everything is matched by name and shape, what matches is put back with ManiSkill's own
+setters (the same rows, the same device), and what does not is told by name with the reason.
+
+Controllers stand outside of that dict unless they keep a target of their own. Without one they are left as a reset
+leaves them, but at the joints as they are now, and so are the drive targets: else the first thing that a restored
+robot did would be to run to where it stood before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from workbench.core import maniskill_private
+from workbench.core.capture.recorded_run import pose_distances
+from workbench.core.env.evaluate_entries import flat_entries
+from workbench.core.env.partial_reset import active_controllers
+from workbench.core.env.task_env import to_numpy
+from workbench.core.scene.scene_index import present_states, scene_index
+from workbench.core.simulation.cpu_system import batched_system
+from workbench.core.simulation.state_layout import BODY
+from workbench.core.snapshots.cpu_state import renew_physics
+
+_POSE = 7
+
+
+def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
+    """What of a recorded state cannot be put into this env, and what of the env is in no such state: name and reason.
+
+    Args:
+        env: an unwrapped ManiSkill env, batched.
+        state: (D,) by name, as `RecordedRun.state` gives it.
+    """
+    missed: dict[str, str] = {}
+    structs = scene_index(env).states
+    for name, struct in structs.items():
+        if env_idx not in maniskill_private.envs_of(struct):
+            continue
+        value, width = state.get(name), BODY + 2 * maniskill_private.joints_of(struct)
+        if value is None or np.isnan(value).any():
+            missed[name] = "the recording has none of this name: it is as the reset left it"
+        elif value.shape != (width,):
+            missed[name] = f"it has {width} numbers now, and {value.shape[-1]} in the recording"
+    for name, value in state.items():
+        kind = name.partition("/")[0]
+        if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
+            missed[name] = "this env has none of this name"
+    return missed
+
+
+def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """Put a recorded state into each of these envs, but for its `misfits`. The others are not touched, and the
+    tensors are fetched."""
+    missed = {i: misfits(env, i, state) for i, state in states.items()}
+    for name, struct in scene_index(env).states.items():
+        fitting = [
+            i for i in maniskill_private.envs_of(struct).tolist() if i in states and name not in missed[i]
+        ]
+        rows = {i: states[i][name] for i in fitting}
+        if rows:
+            values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
+            struct.set_state(values, torch.tensor([*rows], device=env.device))
+    maniskill_private.apply_and_fetch(env)
+    _write_controllers(env, states)
+
+
+def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
+    """Let controllers and drive targets of these envs' robots be where the joints are."""
+    chosen = [int(i) for i in env_idx]
+    if env.agent is None or not chosen:
+        return
+    maniskill_private.set_reset_mask(env, chosen)
+    for controller in active_controllers(env):
+        controller.reset()
+    maniskill_private.set_reset_mask(env, list(range(env.num_envs)))
+    targets = env.scene.px.cuda_articulation_target_qpos.torch()
+    velocities = env.scene.px.cuda_articulation_target_qvel.torch()
+    for agent in maniskill_private.agents(env):
+        qpos = agent.robot.get_qpos()
+        rows = maniskill_private.data_rows_of_articulation(agent.robot)[chosen].long()
+        targets[rows, : qpos.shape[1]] = qpos[chosen]
+        velocities[rows] = 0.0
+    maniskill_private.apply_and_fetch(env)
+
+
+def new_physics(env: Any, env_idx: Sequence[int]) -> None:
+    """Let PhysX forget what these envs did before; on a GPU there is no way to."""
+    if batched_system(env.scene) is not None:
+        renew_physics(env.scene, [int(i) for i in env_idx])
+
+
+def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
+    """(N, D) of every actor and articulation of the env, by the names of a recording; NaN in envs without it."""
+    return {name: to_numpy(state) for name, state in present_states(env).items()}
+
+
+def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
+    """How far one env's state is from a recorded one: metres of the body that is furthest, and radians of the body
+    or joint (of a sliding joint: metres) that is turned most. What only one of them has does not count.
+
+    Args:
+        now, was: (D,) by name.
+    """
+    both = [
+        (value, was[name])
+        for name, value in now.items()
+        # A controller's state is no pose, however many numbers it has.
+        if name.startswith(("actors/", "articulations/"))
+        and name in was
+        and was[name].shape == value.shape
+        # An env that lacks it has NaN throughout.
+        and not np.isnan(value).all()
+        and not np.isnan(was[name]).all()
+    ]
+    if not both:
+        return 0.0, 0.0
+    metres, radians = pose_distances(*(np.stack([pair[k][:_POSE] for pair in both]) for k in (0, 1)))
+    joints = [
+        np.abs(np.subtract(*pair, dtype=np.float64)[BODY : (BODY + len(pair[0])) // 2]) for pair in both
+    ]
+    turned = np.concatenate([radians, *joints]).max()
+    return float(metres.max()), float(turned) if np.isfinite(turned) else float("inf")
+
+
+def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
+    """Whether all that both have is equal to the last bit, velocities included."""
+    both = [name for name in was if name in now and now[name].shape == was[name].shape]
+    return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
+
+
+def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """What controllers with a target of their own remember, where it was recorded (``controller/arm/target_qpos``)."""
+    if env.agent is None:
+        return
+    for name, value in flat_entries(env.agent.get_controller_state(), "controller"):
+        for i, state in states.items():
+            recorded = state.get(name)
+            if recorded is not None and recorded.shape == tuple(value.shape[1:]):
+                value[i] = torch.as_tensor(recorded, dtype=value.dtype, device=value.device)

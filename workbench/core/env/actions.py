@@ -1,0 +1,187 @@
+"""The action of a task as one flat vector with names, bounds and a value that means "hold still".
+
+ManiSkill's action space is a box without names, or for several robots a dict of boxes. A person who
+moves sliders needs to know that dimension 7 is the gripper; and "hold still" is not zero: zero is a
+half-open gripper, and for absolute joint control it is a pose at the middle of the joint limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.controllers.base_controller import CombinedController
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.core.scene.scene_index import once_a_scene
+
+_EE_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class ActionPart:
+    """The slice of the flat action that one controller of one robot reads."""
+
+    robot: str | None
+    """Key of the action dict for several robots, else None."""
+    controller: Any
+    """A ManiSkill BaseController; its configuration is that of its own class."""
+    names: tuple[str, ...]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+
+
+@once_a_scene
+def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
+    """The parts in the order of the flat action; empty for a task without a robot."""
+    if env.agent is None:
+        return ()
+    controllers: Any = env.agent.controller
+    robots = controllers.items() if isinstance(controllers, dict) else [(None, controllers)]
+    parts = []
+    for robot, controller in robots:
+        combined = isinstance(controller, CombinedController)
+        named = controller.controllers.items() if combined else [(None, controller)]
+        for name, part in named:
+            space: Any = part.single_action_space
+            prefix = "/".join(str(p) for p in (robot, name) if p is not None)
+            dimensions = [f"{prefix}/{d}" if prefix else d for d in _dimension_names(part)]
+            low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
+            parts.append(ActionPart(robot, part, tuple(dimensions), low, high))
+    return tuple(parts)
+
+
+def bounds(parts: tuple[ActionPart, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(A,) lowest and (A,) highest value of the flat action."""
+    if not parts:
+        return np.zeros(0, np.float32), np.zeros(0, np.float32)
+    return np.concatenate([p.low for p in parts]), np.concatenate([p.high for p in parts])
+
+
+def width(parts: tuple[ActionPart, ...]) -> int:
+    """A, of the flat action."""
+    return sum([len(part.names) for part in parts])
+
+
+def action_of(
+    parts: tuple[ActionPart, ...], num_envs: int, rows: Mapping[int, NDArray]
+) -> NDArray[np.float32]:
+    """(N, A) with these rows (A,) by env; zeros in the others."""
+    action = np.zeros((num_envs, width(parts)), np.float32)
+    for env, row in rows.items():
+        action[env] = row
+    return action
+
+
+def random_action(
+    parts: tuple[ActionPart, ...], num_envs: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """(N, A) uniform within the bounds; dimensions without bounds are drawn from -1 to 1."""
+    low, high = bounds(parts)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    return rng.uniform(low, high, (num_envs, len(low))).astype(np.float32)
+
+
+def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.float32]:
+    """(N, A) the action that leaves every joint where it is, as far as the controllers can say.
+
+    Delta and velocity controllers: zero. Absolute joint position: the present qpos, through the
+    inverse of ManiSkill's ``clip_and_scale_action``. Absolute end-effector pose: zero, since its
+    inverse would need the controller's frame; such a robot is better held by ``step(None)``.
+    """
+    columns = [_hold(part, num_envs) for part in parts]
+    return np.concatenate(columns, axis=1) if columns else np.zeros((num_envs, 0), np.float32)
+
+
+def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.float32]) -> Any:
+    """What ``env.step`` takes: a tensor (N, A), a dict of them for several robots, None for none."""
+    if not parts:
+        return None
+    action = torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32)).to(env.device)
+    if parts[0].robot is None:
+        return action
+    split = torch.split(action, [len(p.names) for p in parts], dim=1)
+    robots = dict.fromkeys(p.robot for p in parts)
+    return {r: torch.cat([s for p, s in zip(parts, split, strict=True) if p.robot == r], 1) for r in robots}
+
+
+def to_flat_action(
+    env: BaseEnv, parts: tuple[ActionPart, ...], action: Any, whose: str = "the action"
+) -> NDArray[np.float32]:
+    """(N, A) from whatever a policy returned: array or tensor, (A,) or (N, A), or a dict of robots.
+
+    Args:
+        whose: what is wrong is said of this.
+
+    Raises:
+        ValueError: the shape does not fit, or a value is not finite.
+    """
+    if isinstance(action, dict):
+        robots = dict.fromkeys(p.robot for p in parts)
+        action = np.concatenate([_numpy(action[robot]) for robot in robots], axis=-1)
+    flat = _numpy(action)
+    expected = (env.num_envs, width(parts))
+    if flat.shape == expected[1:]:
+        flat = np.broadcast_to(flat, expected)
+    if flat.shape != expected:
+        raise ValueError(_wrong_shape(whose, flat.shape, expected, env.control_mode))
+    # The sum is quick, and may be infinite where no number is.
+    if not math.isfinite(np.add.reduce(flat, axis=None)) and not np.isfinite(flat).all():
+        raise ValueError(f"{whose} holds NaN or infinity")
+    return np.array(flat)
+
+
+def _wrong_shape(whose: str, shape: tuple[int, ...], expected: tuple[int, int], mode: Any) -> str:
+    said = f"{whose} has shape {shape}, expected {expected} (envs, dimensions)"
+    if not shape or shape[-1] == expected[1]:
+        return said
+    # Several robots have a mode each.
+    modes = ", ".join(f"{one}" for one in mode.values()) if isinstance(mode, dict) else str(mode)
+    return (
+        f"{said}: it is {shape[-1]} wide, and the control mode {modes} takes {expected[1]}. Name the one that it is written "
+        "for with --env control_mode=..., or return as many"
+    )
+
+
+def _numpy(values: Any) -> NDArray[np.float32]:
+    values = values.numpy(force=True) if isinstance(values, torch.Tensor) else values
+    return np.asarray(values, dtype=np.float32)
+
+
+def _dimension_names(controller: Any) -> list[str]:
+    count = controller.single_action_space.shape[0]
+    if isinstance(controller, PDEEPosController):
+        names: list[str] = list(_EE_AXES)
+    else:
+        names = [joint.name for joint in controller.joints]
+        controlled = getattr(controller, "control_joint_indices", None)
+        if controlled is not None:
+            names = [names[i] for i in controlled.tolist()]
+    return names[:count] if len(names) >= count else [f"{i}" for i in range(count)]
+
+
+def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
+    controller: Any = part.controller
+    count = len(part.names)
+    if not _is_joint_position(controller) or controller.config.use_delta:
+        return np.zeros((num_envs, count), np.float32)
+    qpos = controller.qpos
+    controlled = getattr(controller, "control_joint_indices", None)
+    if controlled is not None:
+        qpos = qpos[:, controlled.long()]
+    if controller.config.normalize_action:
+        low, high = controller.action_space_low, controller.action_space_high
+        qpos = (2 * qpos - (high + low)) / (high - low)
+    return np.clip(qpos.cpu().numpy(), part.low, part.high).astype(np.float32)
+
+
+def _is_joint_position(controller: object) -> bool:
+    return isinstance(controller, PDJointPosController) and not isinstance(controller, PDEEPosController)

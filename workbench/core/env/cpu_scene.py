@@ -1,0 +1,427 @@
+"""A ManiSkill task class made to run N envs on the CPU.
+
+ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU, and its refusal is four small things: the name of
+the simulation backend, one ``is_cuda()``, the scene that ``_setup_scene`` builds, and how cameras are
+grouped. `batched_class` puts a mixin in front of the task class that answers those four, so the
+author's class is used as it is, and stock ``gym.make`` stays stock.
+
+Each env gets its own ``PhysxCpuSystem`` and its own ``RenderSystem``: exact (nothing of a neighbour can
+reach it), and a picture of env i renders env i alone.
+
+How many PhysX scenes a process can hold, told before it is too late.
+
+Each PhysX scene takes one of the process's thread-local keys (``PxTlsAlloc`` in PhysX's NpScene), of which Linux
+has 1024 (``PTHREAD_KEYS_MAX``); some twenty are taken once SAPIEN and torch are imported. Who takes the last one
+kills the process in native code, at whatever asks for a key next: "Couldn't create autoTSSkey mapping". So
+the free keys are counted, by taking all and giving them back, before the scenes of a batch are made.
+
+A constructor that leaves out its parent's: found by what is missing after it, and told at its ``def``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
+
+import sapien
+import sapien.physx as physx
+import sapien.render
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.multi_agent import MultiAgent
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.envs.utils.system.backend import BackendInfo
+from mani_skill.render.utils import can_render
+
+from workbench.core.broken_rule import (
+    Place,
+    frames_of_the_task,
+    in_brackets,
+    place_of,
+    place_of_hook,
+    warn_of,
+)
+from workbench.core.env.partial_reset import (
+    KeptControllers,
+    in_ascending_order,
+    others,
+    seeded,
+    told_whose_fault,
+)
+from workbench.core.env.strict import StrictMixin
+from workbench.core.maniskill_private import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
+from workbench.core.rules import Degree, Finding, degrees_of
+from workbench.core.simulation.accessors import install_struct_access
+from workbench.core.simulation.contact_queries import CpuArray
+from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, drawn_at
+from workbench.core.snapshots.snapshot import begin_anew
+from workbench.core.snapshots.task_state import note_constructed, note_scene
+
+SIM_BACKEND = "physx_cpu_batched"
+"""Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
+
+
+_NO_WINDOW = (
+    'render_mode="human" and render_human() open SAPIEN\'s viewer on one scene; batched on the CPU there are many, '
+    "and none is needed: `workbench open` with this task's file or id shows all envs in the browser. For pictures "
+    'use render_mode="rgb_array", "sensors" or "all" and render().'
+)
+
+
+class BatchedSimDevice:
+    """Stands for ``sapien.Device("cpu")`` where ManiSkill asks ``_sim_device.is_cuda()``.
+
+    It asks in order to know whether drive targets must be applied after an action: here they must.
+    """
+
+    def is_cuda(self) -> bool:
+        return True
+
+    def __repr__(self) -> str:
+        return "BatchedSimDevice(cpu)"
+
+
+class CpuCameraGroup:
+    """One camera of every env, with the interface of SAPIEN's ``RenderCameraGroup``."""
+
+    def __init__(self, cameras: list[sapien.render.RenderCameraComponent]) -> None:
+        self._cameras = cameras
+
+    def take_picture(self) -> None:
+        for camera in self._cameras:
+            camera.take_picture()
+
+    def get_picture_cuda(self, name: str) -> CpuArray:
+        """(N, H, W, C) texture `name` of every env, on the CPU."""
+        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._cameras]
+        return CpuArray(torch.stack(pictures))
+
+
+class BatchedCpuScene(ManiSkillScene):
+    """N sub-scenes, each with its own CPU physics and render system, as one ManiSkill scene."""
+
+    def __init__(
+        self,
+        sub_scenes: list[sapien.Scene],
+        threads: int | None,
+        system_class: type[BatchedCpuSystem] = BatchedCpuSystem,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(sub_scenes, **kwargs)
+        self.px = system_class(sub_scenes, threads)  # type: ignore[assignment]
+        self.gpu_sim_enabled = True
+
+    def create_actor_builder(self) -> Any:
+        # ManiSkill adds a plane's collision shape once a builder, since on the GPU all envs share one
+        # physics scene: here every env but the first would lack its ground.
+        return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
+
+    def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
+        # A camera on a link is given a GPU pose index in GPU simulation; a CPU body has none, and the
+        # camera is moved with its entity anyway.
+        self.gpu_sim_enabled = False
+        try:
+            return super()._sapien_add_camera(*args, **kwargs)
+        finally:
+            self.gpu_sim_enabled = True
+
+    def _sapien_update_render(
+        self, update_sensors: bool = True, update_human_render_cameras: bool = True
+    ) -> None:
+        chosen: list[dict[str, Any]] = [self.sensors] * update_sensors + [
+            self.human_render_cameras
+        ] * update_human_render_cameras
+        for cameras in chosen:
+            for name, sensor in cameras.items():
+                if sensor.camera.camera_group is None:
+                    group = CpuCameraGroup(sensor.camera._render_cameras)
+                    sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
+        px: BatchedCpuSystem = self.px  # type: ignore[assignment]
+        every = [*self.sensors.values(), *self.human_render_cameras.values()]
+        elsewhere = px.elsewhere(range(len(self.sub_scenes)))
+        for env, sub_scene in enumerate(self.sub_scenes):
+            components = (sensor.camera._render_cameras[env] for sensor in every)
+            with drawn_at(elsewhere.get(env, NOWHERE_ELSE), components) as move_bodies:
+                sub_scene.update_render()
+                move_bodies()
+
+    def _gpu_apply_all(self) -> None:
+        if self._needs_fetch:
+            raise RuntimeError(
+                "self.scene._gpu_apply_all() was called twice without self.scene._gpu_fetch_all() between: "
+                "on the GPU that is an error too. Fetch after every apply, and once before the end of "
+                f"_initialize_episode, after which ManiSkill applies. The first call{self._applied_at}."
+            )
+        self._applied_at = in_brackets(place_of(frames_of_the_task())) or " was ManiSkill's own"
+        self.px.apply_changes()  # type: ignore[union-attr]
+        self._needs_fetch = True
+
+    def step(self) -> None:
+        self.px.step()
+
+
+class BatchedCpuMixin:
+    """Goes in front of a task class; see the module's text."""
+
+    num_envs: int
+    _system_class = BatchedCpuSystem
+    _workbench_task: type[BaseEnv]
+    """The author's class, without this mixin."""
+    _workbench_threads: int | None
+    """How many threads step the envs; None for all cores."""
+    _kept_controllers: KeptControllers | None = None
+    begins_anew = False
+    """Whether each reset is an exact point, from which an episode can be had again to the last bit."""
+    _to_begin: list[int] | None = None
+    """While in a reset: the envs that were initialised and are to begin anew."""
+    _sim_freq: int
+    _sim_steps_per_control: int
+    _set_scene_config: Any
+    sim_config: Any
+    agent: Any
+    device: torch.device
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        if kwargs.get("parallel_in_single_scene"):
+            raise ValueError(
+                "parallel_in_single_scene is not possible with the batched CPU core: the page "
+                "shows all envs side by side without it."
+            )
+        if kwargs.get("render_mode") == "human":
+            raise ValueError(_NO_WINDOW)
+        kwargs["sim_backend"] = "physx_cpu"
+        super().__init__(*args, **kwargs)
+        refuse_unbuilt_env(self, self._workbench_task, kwargs.get("num_envs", 1))  # type: ignore[arg-type]
+        note_constructed(self)  # type: ignore[arg-type]
+
+    @property
+    def gpu_sim_enabled(self) -> bool:
+        """True for ManiSkill's own code, which is to take its batched path; see `seams.asks_for_a_gpu`."""
+        return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
+
+    def render_human(self) -> Any:
+        raise RuntimeError(_NO_WINDOW)
+
+    @property
+    def backend(self) -> BackendInfo:
+        return self._backend
+
+    @backend.setter
+    def backend(self, value: BackendInfo) -> None:
+        # BaseEnv.__init__ compares this name with those for which it refuses num_envs > 1.
+        self._backend = replace(value, sim_backend=SIM_BACKEND)
+
+    @property
+    def _sim_device(self) -> BatchedSimDevice:
+        return BatchedSimDevice()
+
+    @_sim_device.setter
+    def _sim_device(self, value: sapien.Device) -> None:
+        """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
+
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        untouched = others(self, options)
+        options, seeds = in_ascending_order(options or {}, seed, self)
+        # For as many seeds as there are envs ManiSkill has an answer: they are those of the whole batch.
+        if not untouched or seeds is None or len(seeds) == 1:
+            given: Any = nullcontext()
+        else:
+            given, seed = seeded(self, options["env_idx"].tolist(), seeds), None
+        self._kept_controllers = KeptControllers(self, untouched) if untouched else None
+        self._to_begin = [] if self.begins_anew else None
+        try:
+            with told_whose_fault(self, untouched), given:
+                return super().reset(seed=seed, options=options)  # type: ignore[misc]
+        except BaseException:
+            self.drop_writes()
+            raise
+        finally:
+            self._kept_controllers = self._to_begin = None
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        super()._initialize_episode(env_idx, options)  # type: ignore[misc]
+        if self._to_begin is not None:
+            self._to_begin = env_idx.tolist()
+
+    def _load_agent(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_agent(*args, **kwargs)  # type: ignore[misc]
+        refuse_unbuilt_agent(self.agent)
+
+    def _after_reconfigure(self, options: dict[str, Any]) -> None:
+        super()._after_reconfigure(options)  # type: ignore[misc]
+        note_scene(self)  # type: ignore[arg-type]
+
+    def get_info(self) -> dict[str, Any]:
+        # In a reset BaseEnv asks for this right after it reset the controllers, of all envs.
+        if self._kept_controllers is not None:
+            self._kept_controllers.put_back()
+        if self._to_begin and not self.scene._needs_fetch:
+            # Now, when what the reset wrote is applied and fetched, and before `evaluate` writes anything.
+            begin_anew(self, self._to_begin)
+            self._to_begin = None
+        return super().get_info()  # type: ignore[misc]
+
+    def _step_action(self, action: Any) -> Any:
+        # Substeps may be done in a row only if nothing of the author's runs between them.
+        px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
+        unwatched = substeps_are_unwatched(self, self._workbench_task)
+        try:
+            with px.merging(self._sim_steps_per_control if unwatched else 1):
+                return super()._step_action(action)  # type: ignore[misc]
+        except BaseException:
+            self.drop_writes()
+            raise
+
+    def drop_writes(self) -> None:
+        """Forget what was written to the simulation's tensors and not applied."""
+        # What a hook that raised had written (a NaN, say) would else be applied by every reset that follows,
+        # and what it had applied and not fetched would make the next one raise.
+        if self.scene is not None and self.scene._gpu_sim_initialized:
+            px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
+            px.drop_writes()
+            self.scene._gpu_fetch_all()
+
+    def _setup_scene(self) -> None:
+        require_scenes(self.num_envs)
+        self._set_scene_config()
+        sub_scenes = []
+        for _ in range(self.num_envs):
+            systems: list[Any] = [physx.PhysxCpuSystem()]
+            if can_render(self.backend.render_device):
+                systems.append(sapien.render.RenderSystem(self.backend.render_device))
+            sub_scenes.append(sapien.Scene(systems))
+        self.scene = BatchedCpuScene(
+            sub_scenes,
+            self._workbench_threads,
+            self._system_class,
+            sim_config=self.sim_config,
+            device=self.device,
+            backend=self.backend,  # type: ignore
+        )
+        self.scene.px.timestep = 1.0 / self._sim_freq
+
+
+def batched_class(
+    task: type[BaseEnv],
+    threads: int | None = None,
+    rules: Degree | None = None,
+    on_finding: Callable[[Finding], None] = warn_of,
+) -> type[BaseEnv]:
+    """`task` with the batched CPU simulation in front of it; `task` itself is left as it is.
+
+    Args:
+        rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
+        on_finding: called with each place where a rule is broken that does not stop the task, the first time.
+    """
+    install_index_seams(batched_system)
+    install_struct_access()
+    namespace = {
+        "__module__": task.__module__,
+        "__doc__": task.__doc__,
+        "__qualname__": task.__qualname__,
+        "_workbench_task": task,
+        "_workbench_threads": threads,
+    }
+    if all(degree == "off" for degree in degrees_of(rules).values()):
+        return type(task.__name__, (BatchedCpuMixin, task), namespace)
+    namespace |= {"_rule_choice": rules, "_on_finding": staticmethod(on_finding)}
+    return type(task.__name__, (StrictMixin, BatchedCpuMixin, task), namespace)
+
+
+# --- how many scenes a process can hold --------------------------------------------------------------
+
+
+_SPARE = 8
+"""For threads, drivers and libraries that start later, and the scene that a restore makes beside the old one."""
+
+
+def require_scenes(count: int) -> None:
+    """Raise if this process cannot hold `count` PhysX scenes more.
+
+    Raises:
+        ValueError: says how many it can.
+    """
+    free = free_thread_keys()
+    if free is not None and count > free - _SPARE:
+        raise ValueError(
+            f"num_envs={count} is more than this process has room for: PhysX takes one of Linux's 1024 thread-local "
+            f"keys for each env, and {max(free - _SPARE, 0)} are left here. Use fewer envs, close envs that "
+            "are not needed, or divide the envs among processes."
+        )
+
+
+def free_thread_keys() -> int | None:
+    """How many more ``pthread_key_create`` would give; None where there is no such limit to find out."""
+    if not sys.platform.startswith("linux"):
+        return None
+    library = ctypes.CDLL(None)
+    key, taken = ctypes.c_uint(), []
+    while library.pthread_key_create(ctypes.byref(key), None) == 0:
+        taken.append(key.value)
+    for value in taken:
+        library.pthread_key_delete(ctypes.c_uint(value))
+    return len(taken)
+
+
+# --- constructors ------------------------------------------------------------------------------------
+
+
+class ForgottenInit(RuntimeError):
+    """Without it nothing is there, and the first use of anything fails far away ("weak reference to 'NoneType'")."""
+
+    def __init__(self, message: str, place: Place | None) -> None:
+        super().__init__(message)
+        self.place = place
+
+
+def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None:
+    """After the constructor of `task`.
+
+    Raises:
+        ForgottenInit: ``BaseEnv.__init__`` was not called, or not with the number of envs.
+    """
+    if env.scene is None:
+        cls, place = _culprit(task, BaseEnv, silent=True)
+        raise ForgottenInit(
+            f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
+            f"{in_brackets(place)}. Call it there, behind what the hooks need of it: ManiSkill builds the scene and resets in it.",
+            place,
+        )
+    if env.num_envs != num_envs:
+        cls, place = _culprit(task, BaseEnv, silent=False)
+        raise ForgottenInit(
+            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on"
+            f"{in_brackets(place)}. Give its keyword arguments to super().__init__(*args, **kwargs).",
+            place,
+        )
+
+
+def refuse_unbuilt_agent(agent: Any) -> None:
+    """After ``_load_agent``.
+
+    Raises:
+        ForgottenInit: ``BaseAgent.__init__`` was not called.
+    """
+    for robot in agent.agents if isinstance(agent, MultiAgent) else [agent]:
+        if isinstance(robot, BaseAgent) and not hasattr(robot, "robot"):
+            cls, place = _culprit(type(robot), BaseAgent, silent=True)
+            raise ForgottenInit(
+                f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
+                f"{in_brackets(place)}. Call it there.",
+                place,
+            )
+
+
+def _culprit(cls: type, base: type, silent: bool) -> tuple[type, Place | None]:
+    """The first class that has a constructor; with `silent` rather the first whose constructor names no other."""
+    every = cls.__mro__[: cls.__mro__.index(base)]
+    own = [owner for owner in every if hasattr(vars(owner).get("__init__"), "__code__")]
+    named = [owner for owner in own if "__init__" in vars(owner)["__init__"].__code__.co_names]
+    at_fault = [owner for owner in own if silent and owner not in named] or own
+    return (at_fault[0], place_of_hook(at_fault[0], "__init__")) if own else (cls, None)

@@ -1,0 +1,119 @@
+"""New code on a live env: another class, or other cameras, and the scene as it was.
+
+What an env *is* lies in its attributes and in its scene; what it *does*, in its class. So an author's edited class
+can be put on an env that runs, in a microsecond and without moving a body, as long as nothing that the old class
+built would have been built otherwise (`workbench.authoring.reload.level` decides that). Cameras are the one part of a
+scene that can be taken out and made anew, since physics knows nothing of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import Any
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
+
+from workbench.core import maniskill_private
+from workbench.core.env.cpu_scene import BatchedCpuMixin, batched_class
+from workbench.core.env.strict import StrictMixin
+from workbench.core.simulation.cpu_system import batched_system
+from workbench.core.snapshots.snapshot import in_this_state, restore_memory, restore_snapshot, take_snapshot
+
+
+def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
+    """Let `env` go on as an env of `task`; its state, scene and attributes are untouched.
+
+    Args:
+        env: an unwrapped env, batched on the CPU or on the GPU.
+        task: the author's class. Not checked: that it would have built the same scene is the caller's to know.
+    """
+    own: Any = type(env)
+    if not issubclass(own, BatchedCpuMixin):
+        env.__class__ = task
+        return
+    if issubclass(own, StrictMixin):
+        env.__class__ = batched_class(task, own._workbench_threads, own._rule_choice, own._on_finding)
+    else:
+        env.__class__ = batched_class(task, own._workbench_threads, "off")
+
+
+def can_exchange_cameras(env: BaseEnv) -> bool:
+    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone."""
+    plain = all(
+        maniskill_private.camera_components(camera) for camera in maniskill_private.cameras(env).values()
+    )
+    return plain and batched_system(env.scene) is not None
+
+
+def exchange_cameras(env: BaseEnv) -> None:
+    """Take the env's cameras out of its scene and make those that its class configures now.
+
+    No picture may be under way. What the class raises leaves the env without the cameras that were not made:
+    call this again with a class that works.
+    """
+    if not env.scene.can_render():
+        return
+    for camera in maniskill_private.cameras(env).values():
+        for component in maniskill_private.camera_components(camera):
+            # The entity stays, empty: with one fewer, SAPIEN would number the others anew in a scene that a
+            # restored snapshot makes (see `cpu_state`), and segmentation pictures name bodies by number.
+            component.entity.remove_component(component)
+    maniskill_private.forget_cameras(env)
+    with torch.random.fork_rng(devices=[]):
+        maniskill_private.set_up_sensors(env)
+
+
+def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
+    """Call hooks of resets and steps as ManiSkill does, to see that they work, and undo what they did.
+
+    What they write to the simulation is not applied, so PhysX knows nothing of it and goes on to the last bit as
+    it would have. Only where a hook applies or steps on its own is the state put back from a snapshot.
+
+    Args:
+        hooks: ``_initialize_episode``, which is tried on all envs and on one, and hooks without arguments.
+
+    Returns:
+        What could not be undone, by name, and why: attributes that these hooks made, say.
+
+    Raises:
+        Exception: whatever a hook raises; the env is as it was.
+    """
+    every = list(range(env.num_envs))
+
+    def call() -> None:
+        for hook in sorted(hooks):
+            if hook != "_initialize_episode":
+                getattr(env, hook)()
+                continue
+            for chosen in [every, every[:1]] if env.num_envs > 1 else [every]:
+                maniskill_private.set_reset_mask(env, chosen)
+                env._initialize_episode(torch.tensor(chosen, device=env.device), {})
+
+    return undone(env, call)
+
+
+def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
+    """Do something with the author's hooks, and undo what they did; returns and raises as `rehearse_hooks`."""
+    every = list(range(env.num_envs))
+    kept = take_snapshot(env)
+    try:
+        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+            do()
+    finally:
+        maniskill_private.set_reset_mask(env, every)
+        own = isinstance(env, BatchedCpuMixin)
+        if own:
+            env.drop_writes()
+        if own and all(in_this_state(env, i, kept, i) for i in every):
+            _, missed = restore_memory(env, kept.memory, every, every, whole=True)
+        else:
+            missed = restore_snapshot(env, kept).not_carried
+    return missed
+
+
+def keep_observation_space(env: BaseEnv, obs: Any) -> None:
+    """Let the env's spaces be those of this observation; the edited hook may return another shape."""
+    if env.obs_mode != "none":
+        env.update_obs_space(common.to_cpu_tensor(obs))

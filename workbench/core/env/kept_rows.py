@@ -1,0 +1,327 @@
+"""Rows of other envs, in what a task keeps on itself, that a partial reset changed, and the line that did it.
+
+A task that is reset in part must change the rows of ``env_idx`` only: of tensors, arrays, lists and Poses on itself, in
+dicts and in objects of its own (`task_members` finds them). Nothing raises when it does not:
+``self.target = torch.rand((self.num_envs, 2))`` gives every env another target in the middle of its episode.
+
+Values are compared before and after, so that what was computed anew and came out the same is no fault. Where they
+differ, the author must be told the assignment: the line after which they were others, found by looking at them after
+each line of the author's while the reset runs. That is done in the first partial reset of a class, and again after one
+that found something without a line; a debugger that is there already is left its place, and `find_assignment` then reads
+the line off the source.
+
+A partial reset, watched for what it does to rows of other envs in what the task keeps on itself, and told of.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Collection, Sequence
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.core.broken_rule import (
+    BrokenRules,
+    Frame,
+    files_of_task,
+    find_assignment,
+    frames_of_the_task,
+    is_installed,
+    place_of_hook,
+)
+from workbench.core.maniskill_private import task_class
+from workbench.core.simulation.strict_system import envs_named
+from workbench.core.snapshots.task_attributes import Walk, look_over
+from workbench.core.snapshots.task_state import is_per_env, version_of
+
+MOST_LINES = 2000
+"""Lines of the author's after which values are looked at, in one reset."""
+_ROUNDED = 1e-5
+"""What is computed anew of the same poses differs by so much at most: 1e-7 of a rotation was seen."""
+_ITEM = re.compile(r"\[(\d+)\]")
+
+
+class KeptRows:
+    """What a task keeps for each env, as it is when this is made.
+
+    Args:
+        env: In the middle of an episode.
+        chosen: The envs that are about to be reset.
+    """
+
+    def __init__(self, env: BaseEnv, chosen: Sequence[int]) -> None:
+        self.env, self._count = env, len(chosen)
+        self._elsewhere = np.setdiff1d(np.arange(env.num_envs), np.asarray(chosen, dtype=np.int64))
+        walk = look_over(env)
+        self._single, self._groups = _paths(walk, env.num_envs)
+        self.before = {path: _copy(value) for path, value in self._read(walk).items()}
+
+    def changes(self) -> dict[str, tuple[int, ...]]:
+        """Where rows of other envs are others now, as the task writes it without ``self.``; and of which envs: none where
+        there are rows of those only that are reset, and the others are lost."""
+        now = self._read(look_over(self.env))
+        found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
+        return {path: envs for path, envs in found.items() if envs is not None}
+
+    def changed(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
+        """The paths whose rows elsewhere are others now.
+
+        Args:
+            seen: what was at each path the last time, which is brought up to date: the same tensor, not written
+                since, is not compared again.
+        """
+        now = self._read(look_over(self.env))
+        for path, before in self.before.items():
+            value = now.get(path)
+            version = version_of(value) if isinstance(value, torch.Tensor) else -1
+            last = seen.get(path)
+            if version >= 0 and last is not None and last[0] is value and last[1] == version:
+                continue
+            seen[path] = value, version, self._difference(before, value) is not None
+        return {path for path, (_, _, differs) in seen.items() if differs}
+
+    def _read(self, walk: Walk) -> dict[str, Any]:
+        """What is at the paths; of what is an env's each, a list."""
+        now = {leaf.path: leaf.value for leaf in walk.leaves}
+        read = {path: now[path] for path in self._single if path in now}
+        for path, each in self._groups.items():
+            if all(one in now for one in each):
+                read[path] = [now[one] for one in each]
+        return read
+
+    def _difference(self, before: Any, now: Any) -> tuple[int, ...] | None:
+        """Of which envs, as `changes` has it; None where nothing of other envs is another."""
+        elsewhere = self._elsewhere
+        if isinstance(before, list) and isinstance(now, list):
+            if len(now) == len(before):
+                return self._named([not _same(before[i], now[i]) for i in elsewhere])
+            return () if len(now) == self._count else None
+        if not isinstance(before, (torch.Tensor, np.ndarray)) or not isinstance(now, type(before)):
+            return None  # another kind of thing has its name now
+        if now.shape == before.shape:
+            return self._named(_differ(_array(before)[elsewhere], _array(now)[elsewhere]))
+        if now.ndim and len(now) == self._count and now.shape[1:] == before.shape[1:]:
+            return ()
+        return tuple(elsewhere.tolist()) if is_per_env(now, len(before)) else None
+
+    def _named(self, differs: Any) -> tuple[int, ...] | None:
+        rows = np.reshape(differs, (len(self._elsewhere), -1)).any(axis=1)
+        return tuple(self._elsewhere[rows].tolist()) or None
+
+
+def _is_the_tasks(path: str) -> bool:
+    # What a robot and its controllers remember is ManiSkill's to reset (`partial_reset.KeptControllers`).
+    return path != "agent" and not path.startswith(("agent.", "agent["))
+
+
+def _paths(walk: Walk, num_envs: int) -> tuple[list[str], dict[str, list[str]]]:
+    """Of what has a row for each env; and of what is an env's each (a list of N tensors), by that of all of them."""
+    single, items = [], {}
+    for leaf in walk.leaves:
+        if not _is_the_tasks(leaf.path):
+            continue
+        if is_per_env(leaf.value, num_envs):
+            single.append(leaf.path)
+        elif isinstance(leaf.value, (torch.Tensor, np.ndarray)) and (item := _ITEM.search(leaf.path)):
+            around = leaf.path[: item.start()], leaf.path[item.end() :]
+            items.setdefault(around, {})[int(item[1])] = leaf.path
+    groups = {
+        f"{before}[i]{after}": [paths[i] for i in range(num_envs)]
+        for (before, after), paths in items.items()
+        if paths.keys() == set(range(num_envs))
+    }
+    return single, groups
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        return value.detach().clone()
+    if isinstance(value, list):
+        return [_copy(item) for item in value]
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _array(value: torch.Tensor | np.ndarray) -> np.ndarray:
+    if isinstance(value, np.ndarray):
+        return value
+    value = value.detach()
+    return (value.float() if value.dtype == torch.bfloat16 else value).cpu().numpy()
+
+
+def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Where they do; NaN does not differ from itself."""
+    if a.dtype.kind in "fc" and b.dtype.kind in "fc":
+        return ~np.isclose(a, b, rtol=_ROUNDED, atol=_ROUNDED, equal_nan=True)
+    return np.asarray((a != b) & ~((a != a) & (b != b)))
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, (torch.Tensor, np.ndarray)) and isinstance(b, type(a)):
+        a, b = _array(a), _array(b)
+        return a.shape == b.shape and not _differ(a, b).any()
+    return type(a) is type(b) and (a is b or bool(a == b) or bool(a != a and b != b))
+
+
+# --- lines -------------------------------------------------------------------------------------------
+
+
+class _Lines:
+    """Looks at the rows after each line of the author's, and remembers after which they were others."""
+
+    def __init__(self, rows: KeptRows) -> None:
+        self.rows = rows
+        self._files: Collection[str] = ()
+        self._left = MOST_LINES
+        self._seen: dict[str, tuple[Any, int, bool]] = {}
+        self._at: Frame | None = None
+        """The line that runs."""
+        self.found: dict[str, tuple[Frame, ...]] = {}
+
+    def start(self) -> None:
+        if sys.gettrace() is not None or not self.rows.before:
+            return  # a debugger's, or that of a measurement of coverage
+        self._files = files_of_task(task_class(self.rows.env))
+        frame: FrameType | None = sys._getframe(1)
+        while (
+            frame is not None
+        ):  # whoever called the reset and goes on after it, as the task's own `reset` does
+            if self._is_the_tasks(frame):
+                frame.f_trace = self._traced
+                self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
+            frame = frame.f_back
+        sys.settrace(self._called)
+
+    def stop(self) -> None:
+        if sys.gettrace() == self._called:
+            self._look()
+            sys.settrace(None)
+
+    def _is_the_tasks(self, frame: FrameType) -> bool:
+        file = frame.f_code.co_filename
+        return file in self._files or not is_installed(file)
+
+    def _called(self, frame: FrameType, event: str, argument: Any) -> Any:
+        return self._traced if self._is_the_tasks(frame) else None
+
+    def _traced(self, frame: FrameType, event: str, argument: Any) -> Any:
+        if event == "line":
+            self._look()
+            self._at = frame, frame.f_lasti, frame.f_lineno
+        elif event == "return":
+            self._look()
+            back = frame.f_back
+            while back is not None and back.f_trace != self._traced:
+                back = back.f_back
+            self._at = None if back is None else (back, back.f_lasti, back.f_lineno)
+        return self._traced
+
+    def _look(self) -> None:
+        if self._at is None or self._left == 0:
+            return
+        self._left -= 1
+        changed = self.rows.changed(self._seen)
+        frame = self._at[0]
+        for path in changed - self.found.keys():
+            self.found[path] = (self._at, *frames_of_the_task(frame.f_back))
+        for path in self.found.keys() - changed:
+            del self.found[path]
+
+
+# --- told of -----------------------------------------------------------------------------------------
+
+
+_TRIES = 3
+"""Partial resets of a class in which a line is looked for."""
+
+
+class ResetWatch:
+    """Of one env. Between `start` and `tell` or `stop` it looks at the rows.
+
+    Args:
+        rules: What is told.
+    """
+
+    def __init__(self, rules: BrokenRules) -> None:
+        self._rules = rules
+        self._lines: _Lines | None = None
+        self._chosen: tuple[int, ...] = ()
+        self._task: type | None = None
+        self._tries = 0
+        """Left of `_TRIES`."""
+        self._seeks = False
+        """Lines are looked for in the next reset."""
+        self.whole = False
+        """The task has a ``reset`` of its own, which is watched from its beginning to its end."""
+
+    @property
+    def looks(self) -> bool:
+        return self._lines is not None
+
+    def start(self, env: BaseEnv, task: type, chosen: Sequence[int]) -> None:
+        """Envs `chosen` are about to be reset."""
+        if self._task is not task:
+            self._task, self._tries, self._seeks = task, _TRIES, True
+        self._chosen = tuple(chosen)
+        self._lines = _Lines(KeptRows(env, chosen))
+        if self._seeks:
+            self._lines.start()
+
+    def go_on(self, env: BaseEnv) -> None:
+        """The same reset goes on after something that it need not answer for."""
+        assert self._task is not None
+        self.start(env, self._task, self._chosen)
+
+    def stop(self) -> None:
+        """Look no further; tells nothing."""
+        if self._lines is not None:
+            self._lines.stop()
+            self._lines = None
+
+    def tell(self, over: bool = True) -> None:
+        """Tell of what the reset did, or did so far where it is not over.
+
+        Raises:
+            BrokenRule: of a rule that stops.
+        """
+        lines = self._lines
+        if lines is None:
+            return
+        self.stop()
+        found = lines.rows.changes()
+        if over or found:
+            # Only where a line is missing need the next reset be slowed down.
+            self._tries -= self._seeks
+            self._seeks = self._tries > 0 and not found.keys() <= lines.found.keys()
+        for path, envs in found.items():
+            self._tell(path, envs, lines.found.get(path, ()), lines.rows.env.num_envs)
+
+    def _tell(self, path: str, envs: tuple[int, ...], frames: tuple[Frame, ...], total: int) -> None:
+        assert self._task is not None
+        shown = path.removesuffix(".raw_pose")
+        if not envs:
+            rule = "rows-lost"
+            message = (
+                f"self.{shown} is left with a row for each of the {len(self._chosen)} envs that are being reset, where "
+                f"it had one for each of {total}: write `self.{path}[env_idx] = ...` instead of replacing it."
+            )
+        else:
+            rule = "rows-rewritten"
+            index = path if "[i]" in path else f"{path}[env_idx]"
+            of = " for each i of env_idx" if "[i]" in path else ""
+            message = (
+                f"self.{shown} is changed in {envs_named(envs)}, which {_are(envs)} not being reset and "
+                f"in the middle of an episode. Change the rows of env_idx only: `self.{index} = ...`{of}."
+            )
+        place = None
+        if not frames:
+            place = find_assignment(self._task, path) or place_of_hook(self._task, "_initialize_episode")
+        self._rules.breaks(rule, message, frames or None, place, subject=path)
+
+
+def _are(envs: Sequence[int]) -> str:
+    return "is" if len(envs) == 1 else "are"

@@ -1,0 +1,174 @@
+"""A reset of some envs that leaves the others alone, and says whose fault it is when it cannot.
+
+Two things go wrong in ``BaseEnv.reset(options={"env_idx": ...})`` that a single env never meets. First,
+ManiSkill 3.0.1 resets the controllers of every env: it sets the reset mask back to all ones and only then
+calls ``controller.reset()``, though each controller asks that mask which envs it may touch. A controller with
+``use_target`` drives towards a target that it remembers, so in each env that was *not* reset the target jumps
+to where the joints happen to be, and the env no longer does what it would do alone. So what the
+controllers of the other envs remember is kept aside and put back before the first observation.
+
+Second, many tasks have never been reset in part: a hook that makes ``num_envs`` rows where ``len(env_idx)``
+are wanted, or replaces a buffer of N rows by one of the subset's. The exception is then a torch message
+about sizes, often raised in a hook that is right. The traceback stays as it is, and gets a note that names the
+task's line and the buffers that shrank.
+
+Nor has ManiSkill one order of rows: its setters give them to the envs of a mask, lowest first, and a task its own
+as ``self.x[env_idx]``. So envs are reset in ascending order, in whichever they are named.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.structs import Pose
+
+from workbench.core.broken_rule import BrokenRule, Place, files_of_task, find_assignment
+from workbench.core.env.kept_rows import KeptRows
+from workbench.core.env_numbers import env_numbers, envs_of_batch
+from workbench.core.maniskill_private import agents, drawing_from, set_episode_seeds, task_class
+
+_CORE = str(Path(__file__).parents[1])
+
+
+class KeptControllers:
+    """What the active controllers remember of some envs: start, target and whatever else has a row an env."""
+
+    def __init__(self, env: Any, kept_envs: list[int]) -> None:
+        self._rows = torch.tensor(kept_envs, dtype=torch.long, device=env.device)
+        self._kept: list[tuple[BaseController, str, torch.Tensor]] = []
+        for controller in active_controllers(env):
+            for name, value in vars(controller).items():
+                rows = value.raw_pose if isinstance(value, Pose) else value
+                if isinstance(rows, torch.Tensor) and rows.shape[:1] == (env.num_envs,):
+                    self._kept.append((controller, name, rows[self._rows].clone()))
+
+    def put_back(self) -> None:
+        for controller, name, rows in self._kept:
+            value = getattr(controller, name)
+            (value.raw_pose if isinstance(value, Pose) else value)[self._rows] = rows
+
+
+def active_controllers(env: Any) -> list[BaseController]:
+    """The controllers in use, those within combined ones singly; none for a task without a robot."""
+    single: list[BaseController] = []
+    for agent in agents(env):
+        combined = isinstance(agent.controller, CombinedController)
+        single += agent.controller.controllers.values() if combined else [agent.controller]
+    return single
+
+
+def others(env: Any, options: dict[str, Any] | None) -> list[int]:
+    """The envs that a reset with these options does not touch; empty for a reset of all."""
+    chosen = _chosen(env, options or {})
+    return [] if chosen is None else sorted(set(range(env.num_envs)).difference(chosen))
+
+
+def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
+    """The envs that are to be reset, as named; None for all. ManiSkill takes -1 for the last, and none at all."""
+    named = options.get("env_idx")
+    if named is None:
+        return None
+    count = env.num_envs
+    chosen = [i + count if -count <= i < 0 else i for i in env_numbers(named)]
+    return envs_of_batch(chosen, count) if chosen else []
+
+
+def in_ascending_order(
+    options: dict[str, Any], seeds: Any, env: Any
+) -> tuple[dict[str, Any], list[int] | None]:
+    """Options of a partial reset with the envs in ascending order, and with them what has a row for each as named.
+
+    Args:
+        seeds: what ``reset`` is given.
+
+    Returns:
+        the options, and the seeds if there is one for each of several envs that are reset and not of all.
+
+    Raises:
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask, or names an env that is not there, or one twice.
+    """
+    chosen = _chosen(env, options)
+    if chosen is None:
+        return options, None
+    order = sorted(range(len(chosen)), key=chosen.__getitem__)
+    one_each = np.ndim(seeds) == 1 and len(seeds) == len(chosen)
+    rows = torch.tensor([chosen[k] for k in order], dtype=torch.long, device=env.device)
+    made = {**options, "env_idx": rows}
+    states = options.get("reset_to_env_states", {})
+    if "obs" in states:
+        # ManiSkill puts them to `env_idx` row by row; the states themselves, as `set_state` does, lowest env first.
+        made["reset_to_env_states"] = {**states, "obs": _rows(states["obs"], order)}
+    return made, [int(seeds[k]) for k in order] if one_each else None
+
+
+def _rows(value: Any, order: list[int]) -> Any:
+    if isinstance(value, dict):
+        return {name: _rows(held, order) for name, held in value.items()}
+    return value[order] if np.ndim(value) else value
+
+
+@contextmanager
+def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
+    """Within this a reset of these envs, lowest first, starts their episodes from these seeds.
+
+    ``BaseEnv.reset(seed=[...])`` takes the seeds for those of the whole batch, whichever envs are reset.
+    """
+    set_episode_seeds(env, env_idx, seeds)
+    devices = [env.device] if env.device.type == "cuda" else []
+    with torch.random.fork_rng(devices=devices), drawing_from(env, env_idx[0]):
+        torch.manual_seed(seeds[0])
+        yield
+
+
+@contextmanager
+def told_whose_fault(env: Any, untouched: list[int]) -> Iterator[None]:
+    """Add a note to an exception that leaves a reset by way of the task's own code."""
+    chosen = sorted(set(range(env.num_envs)).difference(untouched))
+    rows = KeptRows(env, chosen) if untouched else None
+    try:
+        yield
+    except BrokenRule:
+        raise  # says it all
+    except Exception as error:
+        line = _line_of_the_task(error, env)
+        lost = [] if rows is None else [path for path, envs in rows.changes().items() if not envs]
+        if line is not None or lost:
+            error.add_note(_note(env, chosen, line, lost))
+        raise
+
+
+def _note(env: BaseEnv, chosen: list[int], line: Place | None, lost: list[str]) -> str:
+    where = "." if line is None else f": {Path(line[0]).name}:{line[1]}, in {line[2]}."
+    note = f"This error is {type(env).__name__}'s own, not the batched core's{where}"
+    if len(chosen) == env.num_envs:
+        return note
+    note += (
+        f" Envs {chosen} of {env.num_envs} were being reset: _initialize_episode must make len(env_idx) rows, "
+        "not num_envs, and write what it keeps on self as `self.x[env_idx] = ...`."
+    )
+    for path in lost:
+        place = find_assignment(task_class(env), path)
+        at = "" if place is None else f" ({Path(place[0]).name}:{place[1]})"
+        note += f" It replaced self.{path}: {env.num_envs} rows before, {len(chosen)} now{at}."
+    return note + " ManiSkill's GPU simulation runs the same code."
+
+
+def _line_of_the_task(error: Exception, env: BaseEnv) -> Place | None:
+    """The innermost line in a file of the task's classes; None where the core broke below it."""
+    files, found = files_of_task(task_class(env)), None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = frame.f_code.co_filename
+        if file in files:
+            found = file, line, frame.f_code.co_name
+        elif file.startswith(_CORE) and not isinstance(error, ValueError):
+            # A ValueError is how the core refuses what it is given; anything else from there may be its own mistake.
+            found = None
+    return found

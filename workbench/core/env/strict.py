@@ -1,0 +1,182 @@
+"""The rules, checked: what would go wrong on the GPU is told here, at the line that does it.
+
+The batched CPU core runs a task through the code that the GPU runs, so most mistakes that the GPU does not
+forgive stop here too. The rest are silent: a write that the next fetch takes back, a neighbour's episode
+changed by a partial reset, a reward of shape (). `rules` lists them, with what happens where one is broken:
+
+* state set and not applied, applied or read without a fetch after a step, links read before their
+  articulation's new qpos reached them (`strict_system`, at the line that wrote or read);
+* SAPIEN's own setters, which the GPU does not look at (`struct_access`, at the line that called);
+* in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or
+  changed in what the task keeps on itself (here; `kept_rows` finds the assignment);
+* returns of ``evaluate``, the reward and the observation hooks without a row for each env (`entries`).
+
+What the GPU refuses in any case (a pose of another batch size, a static actor moved, two applies without a
+fetch, state touched while the scene is loaded) is refused whatever the degree, see `struct_access`.
+
+Only what goes wrong is told, by comparing values: ManiSkill's own tasks hear nothing, but for those that
+break a rule (``tests/core/env/test_strict.py`` lists them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.core.broken_rule import (
+    BrokenRule,
+    BrokenRules,
+    WrongReturn,
+    place_of_hook,
+    warn_of,
+)
+from workbench.core.env.evaluate_entries import wrong_evaluate, wrong_observation, wrong_reward
+from workbench.core.env.kept_rows import ResetWatch
+from workbench.core.env.partial_reset import others
+from workbench.core.rules import Degree, Finding, degrees_of
+from workbench.core.simulation.accessors import guard_scenes
+from workbench.core.simulation.strict_system import StrictCpuSystem
+
+_REWARD_HOOK = {
+    "dense": "compute_dense_reward",
+    "normalized_dense": "compute_normalized_dense_reward",
+    "sparse": "compute_sparse_reward",
+}
+
+
+class StrictMixin:
+    """Goes in front of a batched task class; see the module's text."""
+
+    num_envs: int
+    scene: Any
+    _workbench_task: type[BaseEnv]
+    _system_class = StrictCpuSystem
+    _rule_choice: Degree | None = None
+    """The degree of all rules; None for each rule's own."""
+    _on_finding: Callable[[Finding], None] = staticmethod(warn_of)
+    _wrong_obs: tuple[str, str] | None = None
+    """The hook, and what is wrong, of an observation that is being put together."""
+
+    @cached_property
+    def broken_rules(self) -> BrokenRules:
+        """What the task broke so far; of the env, whatever becomes of its scene and its class."""
+        return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
+
+    def _setup_scene(self) -> None:
+        super()._setup_scene()  # type: ignore[misc]
+        self._strict_system.rules = self.broken_rules
+        guard_scenes(self._strict_system)
+
+    @property
+    def _strict_system(self) -> StrictCpuSystem:
+        return self.scene.px
+
+    def step(self, action: Any) -> Any:
+        with self.broken_rules.during("step"):
+            stepped = super().step(action)  # type: ignore[misc]
+        self.broken_rules.step += 1
+        return stepped
+
+    # --- partial resets ------------------------------------------------------------------------------
+
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        untouched, watch = others(self, options), self._watch
+        partial = bool(untouched)
+        with self.broken_rules.during("reset", confirms=partial or self.num_envs == 1):
+            watch.whole = partial and self._workbench_task.reset is not BaseEnv.reset
+            try:
+                if watch.whole:
+                    chosen = sorted(set(range(self.num_envs)).difference(untouched))
+                    watch.start(self, self._workbench_task, chosen)  # type: ignore[arg-type]
+                made = super().reset(seed=seed, options=options)  # type: ignore[misc]
+                watch.tell()
+                return made
+            finally:
+                watch.stop()
+                watch.whole = False
+
+    @cached_property
+    def _watch(self) -> ResetWatch:
+        return ResetWatch(self.broken_rules)
+
+    def _clear_sim_state(self) -> None:
+        reset = self.scene._reset_mask
+        if not bool(reset.all()):
+            self._strict_system.refuse_standing_writes(reset)
+        super()._clear_sim_state()  # type: ignore[misc]
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        system, reset = self._strict_system, self.scene._reset_mask.clone()
+        if bool(reset.all()):
+            return super()._initialize_episode(env_idx, options)  # type: ignore[misc]
+        state = system.copy_of_state()
+        system.being_reset, system.stepped_in_reset = reset, False
+        system.told_elsewhere.clear()
+        system.hook_of_reset = place_of_hook(self._workbench_task, "_initialize_episode")
+        watch = self._watch
+        if not watch.looks:
+            watch.start(self, self._workbench_task, torch.nonzero(reset)[:, 0].tolist())  # type: ignore[arg-type]
+        try:
+            super()._initialize_episode(env_idx, options)  # type: ignore[misc]
+            system.being_reset = None
+            system.refuse_changes_elsewhere(state, reset)
+            watch.tell(over=not watch.whole)
+        finally:
+            system.being_reset = None
+            watch.stop()
+
+    # --- returns -------------------------------------------------------------------------------------
+
+    def evaluate(self) -> dict[str, Any]:
+        evaluated = super().evaluate()  # type: ignore[misc]
+        self._returned("evaluate-rows", "evaluate", wrong_evaluate(evaluated, self.num_envs))
+        return evaluated
+
+    def get_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
+        reward = super().get_reward(obs=obs, action=action, info=info)  # type: ignore[misc]
+        hook = _REWARD_HOOK.get(self.reward_mode)  # type: ignore[attr-defined]
+        if hook is not None:
+            self._returned("reward-rows", hook, wrong_reward(reward, self.num_envs, info))
+        return reward
+
+    def _get_obs_extra(self, info: dict[str, Any]) -> Any:
+        obs = super()._get_obs_extra(info)  # type: ignore[misc]
+        self._observed("_get_obs_extra", obs)
+        return obs
+
+    def _get_obs_agent(self) -> Any:
+        obs = super()._get_obs_agent()  # type: ignore[misc]
+        self._observed("_get_obs_agent", obs)
+        return obs
+
+    def get_obs(self, *args: Any, **kwargs: Any) -> Any:
+        self._wrong_obs = None
+        try:
+            obs = super().get_obs(*args, **kwargs)  # type: ignore[misc]
+        except Exception as error:
+            if self._wrong_obs is None or isinstance(error, BrokenRule):
+                raise
+            # ManiSkill cannot put it together ("Sizes of tensors must match"): the rule's words are the better ones.
+            hook, said = self._wrong_obs  # type: ignore[misc]
+            place = place_of_hook(self._workbench_task, hook)
+            raise WrongReturn(said, hook, "observation-rows", place) from error
+        finally:
+            self._wrong_obs = None
+        if self._watch.whole and not self._watch.looks:
+            # From here on only the task's own reset is at work: what `evaluate` keeps for all is no matter of it.
+            self._watch.go_on(self)  # type: ignore[arg-type]
+        return obs
+
+    def _observed(self, hook: str, obs: Any) -> None:
+        said = wrong_observation(obs, self.num_envs)
+        if said is not None:
+            self._wrong_obs = hook, said
+            self._returned("observation-rows", hook, said)
+
+    def _returned(self, rule: str, hook: str, said: str | None) -> None:
+        if said is not None:
+            self.broken_rules.returned(rule, hook, said, place_of_hook(self._workbench_task, hook))

@@ -1,0 +1,341 @@
+"""A running task: N envs behind one small interface that gives plain arrays.
+
+Everything that shows, checks, records or replays a task asks here, and never ManiSkill itself. The
+class underneath is the author's own, made batched on the CPU (`cpu_scene`) or handed to ManiSkill's
+GPU simulation, and the caller need not know which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
+from numpy.typing import NDArray
+
+from workbench.core.backends import Backend, choose_backend, keep_render_device
+from workbench.core.broken_rule import BrokenRules, warn_of
+from workbench.core.env import actions
+from workbench.core.env.assets import refuse_downloads, require_assets, robots_of
+from workbench.core.env.cpu_scene import batched_class, refuse_unbuilt_env
+from workbench.core.env.evaluate_entries import FLAGS, flat_entries, split_entries
+from workbench.core.env.partial_reset import in_ascending_order, seeded
+from workbench.core.env.step_result import StepResult
+from workbench.core.env_numbers import envs_of_batch
+from workbench.core.maniskill_private import episode_seeds, flatten_observation, keep_observation
+from workbench.core.rules import Degree, Finding, degrees_of
+from workbench.core.scene.scene_index import read_poses
+from workbench.core.snapshots.snapshot import (
+    RestoreReport,
+    Snapshot,
+    remembering,
+    restore_snapshot,
+    take_snapshot,
+)
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """How a task is made."""
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU if it works."""
+    render: bool = True
+    """False makes no render system: no pictures, and nothing asked of a graphics driver."""
+    threads: int | None = None
+    """Threads that step the envs of the CPU core; None for one on each core that the process may use."""
+    rules: Degree | None = None
+    """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
+    on_finding: Callable[[Finding], None] = warn_of
+    """Called with each place where a rule is broken that does not stop the task, the first time."""
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... A
+    ``render_backend`` among them is used instead of the one that is found."""
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
+        if self.backend not in get_args(Backend):
+            raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, not {self.backend!r}")
+        degrees_of(self.rules)  # raises for what is no degree
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
+
+
+def make_env(
+    task: type[BaseEnv],
+    options: EnvOptions,
+    *,
+    asset_ids: Sequence[str] = (),
+    default_kwargs: Mapping[str, Any] | None = None,
+) -> BaseEnv:
+    """The task class with N envs, unwrapped, and with a reward whatever its class implements.
+
+    Raises:
+        MissingAssets: the task or its robot needs a download; names it and the command.
+        BackendUnavailable: ``backend="gpu"`` on a machine that cannot.
+        Exception: whatever the author's class raises while it builds.
+    """
+    reward = {"reward_mode": default_reward_mode(task)}
+    return build_env(task, options, asset_ids=asset_ids, default_kwargs={**reward, **(default_kwargs or {})})
+
+
+def build_env(
+    task: type[BaseEnv],
+    options: EnvOptions,
+    *,
+    asset_ids: Sequence[str] = (),
+    default_kwargs: Mapping[str, Any] | None = None,
+) -> BaseEnv:
+    """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it; raises as `make_env`.
+
+    What is not among the keyword arguments is left to the class: the reward mode then is the first of
+    ``SUPPORTED_REWARD_MODES``, implemented or not.
+    """
+    kwargs = {**(default_kwargs or {}), **options.kwargs, "num_envs": options.num_envs}
+    require_assets(task.__name__, asset_ids, robots_of(task, kwargs))
+    # None is ManiSkill's other word for "none".
+    wanted = (kwargs.get("render_backend", "found") or "none") if options.render else "none"
+    # A process has one render device: another must not be looked for when one is named.
+    backend = choose_backend(options.backend, render=wanted == "found")
+    kwargs["render_backend"] = backend.render_backend if wanted == "found" else wanted
+    if kwargs["render_backend"] != "none":
+        keep_render_device(kwargs["render_backend"])
+    with refuse_downloads(task.__name__):
+        if backend.simulation == "gpu":
+            env = task(sim_backend="physx_cuda", **kwargs)
+            refuse_unbuilt_env(env, task, options.num_envs)
+            return env
+        return batched_class(task, options.threads, options.rules, options.on_finding)(**kwargs)
+
+
+def default_reward_mode(task: type[BaseEnv]) -> str:
+    """The richest reward that the class really implements.
+
+    ManiSkill's own default is ``normalized_dense`` whether or not the class has one, and the first
+    step of a task without a dense reward then raises a bare NotImplementedError.
+    """
+    wanted = ("normalized_dense", "dense", "sparse", "none")
+    method = {"normalized_dense": "compute_normalized_dense_reward", "dense": "compute_dense_reward"}
+    for mode in wanted:
+        hook = method.get(mode)
+        implemented = hook is None or getattr(task, hook) is not getattr(BaseEnv, hook)
+        if mode in task.SUPPORTED_REWARD_MODES and implemented:
+            return mode
+    return "none"
+
+
+class TaskEnv:
+    """N envs of one task: reset, step, and what they look like, in plain arrays."""
+
+    def __init__(
+        self,
+        env: BaseEnv,
+        max_episode_steps: int | None = None,
+        check: Callable[[Mapping[str, Any], Any], None] | None = None,
+        obs: Any = None,
+    ) -> None:
+        """
+        Args:
+            env: an unwrapped ManiSkill env (see `make_env`).
+            max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
+            check: called with what ``evaluate`` and the reward returned, before either is converted;
+                raises if the task broke its contract.
+            obs: the last observation of an env that goes on, as its ``obs_mode`` gives it.
+        """
+        self.env = env
+        self.max_episode_steps = max_episode_steps
+        self.obs: Any = obs
+        """The last observation, as the task's ``obs_mode`` gives it."""
+        self._check = check
+
+    @property
+    def num_envs(self) -> int:
+        return self.env.num_envs
+
+    @property
+    def parts(self) -> tuple[actions.ActionPart, ...]:
+        return actions.action_parts(self.env)
+
+    @property
+    def control_dt(self) -> float:
+        """Simulated seconds in one control step."""
+        return self.env.control_timestep
+
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        env_idx: Sequence[int] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> StepResult:
+        """Start new episodes in all envs, or in those of `env_idx`.
+
+        All at once is ManiSkill's own ``reset(seed=[...])``. For a subset, ManiSkill seeds torch with the
+        seed of env 0, whichever envs are reset, so that a seed given for env 3 means nothing; here a
+        partial reset draws from the seed of the lowest env, and ``reset(seed=7, env_idx=[3])`` starts the
+        episode that a single stock env starts with ``reset(seed=7)``. In which order envs are named, each
+        with its seed, makes no difference.
+
+        Args:
+            seed: one seed for the whole batch (the i-th env that is reset gets ``seed + i``), or one for
+                each env that is reset; None goes on with the task's own random numbers.
+            options: further ``options`` for the task's own ``reset``.
+        """
+        chosen = envs_of_batch(range(self.num_envs) if env_idx is None else env_idx, self.num_envs)
+        seeds = _seed_list(seed, len(chosen))
+        if env_idx is None:
+            self.obs, info = self.env.reset(seed=seeds, options=dict(options or {}))
+        else:
+            self.obs, info = self._partial_reset(chosen, seeds, options or {})
+        info = {key: value for key, value in info.items() if key != "reconfigure"}
+        if self._check is not None:
+            self._check(info, None)
+        return self.result(info, np.zeros(self.num_envs), None)
+
+    def _partial_reset(
+        self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        # Here too, as GPU simulation has only ManiSkill's own reset.
+        options, seeds = in_ascending_order({**further, "env_idx": chosen}, seeds, self.env)
+        if seeds is None:
+            return self.env.reset(options=options)
+        with seeded(self.env, sorted(chosen), seeds):
+            return self.env.reset(options=options)
+
+    def step(self, action: NDArray[np.float32] | None) -> StepResult:
+        """One control step of all envs with a flat action (N, A), or None to leave the targets alone."""
+        env_action = None if action is None else actions.to_env_action(self.env, self.parts, action)
+        self.obs, reward, terminated, _, info = self.env.step(env_action)
+        if self._check is not None:
+            self._check(info, reward)
+        return self.result(info, reward, action, terminated)
+
+    def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
+        """Everything that decides how the episodes of these envs (None: of all) go on; see `snapshot`."""
+        return take_snapshot(self.env, env_idx)
+
+    def restore(
+        self,
+        snapshot: Snapshot,
+        env_idx: Sequence[int] | None = None,
+        source: int | Sequence[int] | None = None,
+        fresh_physics: bool = True,
+    ) -> tuple[StepResult, RestoreReport]:
+        """Put envs back, as `restore_snapshot` does, and observe and evaluate what is there now.
+
+        The step's reward is zero, as after a reset: a reward is for an action, and none was made.
+        """
+        report = restore_snapshot(self.env, snapshot, env_idx, source, fresh_physics)
+        return self.judge(), report
+
+    def judge(self, action: NDArray[np.float32] | None = None) -> StepResult:
+        """What the task says of the present moment: evaluate, observation, reward. Nothing moves.
+
+        Args:
+            action: (N, A) that led here, which the reward may ask for; None gives rewards of zero, as after a
+                reset: a reward is for an action, and none was made.
+        """
+        reward: Any = None
+        with remembering(self.env):
+            info = self.env.get_info()
+            obs = self.env.get_obs(info, unflattened=True)
+            if action is not None:
+                flat = actions.to_env_action(self.env, self.parts, action)
+                made: Any = common.to_tensor(flat, device=self.env.device) if self.parts else None
+                reward = self.env.get_reward(obs=obs, action=made, info=info)
+            self.obs = flatten_observation(self.env, obs)
+            keep_observation(self.env, self.obs)
+        if self._check is not None:
+            self._check(info, reward)
+        return self.result(info, np.zeros(self.num_envs) if reward is None else reward, action)
+
+    @property
+    def observes_pictures(self) -> bool:
+        """Whether every step draws the scene for the observation."""
+        return self.env.obs_mode not in ("state", "state_dict", "none")
+
+    @property
+    def episode_seeds(self) -> NDArray[np.int64]:
+        """(N,) the seeds that the envs were last reset with."""
+        return np.array(episode_seeds(self.env), dtype=np.int64)
+
+    @property
+    def broken_rules(self) -> BrokenRules | None:
+        """What the task broke of the rules of GPU simulation; None where none is checked."""
+        return getattr(self.env, "broken_rules", None)
+
+    def close(self) -> None:
+        self.env.close()
+
+    def result(
+        self,
+        info: Mapping[str, Any],
+        reward: Any,
+        action: NDArray[np.float32] | None,
+        terminated: Any = None,
+        truncated: Any = None,
+        look: bool = True,
+    ) -> StepResult:
+        """What a step or a reset (no action) gave, also one that went past this object; `look` for `StepResult.sound_obs`.
+
+        Where it is not said which episodes ended, `info` and the time limit say it.
+        """
+        count = self.num_envs
+        elapsed = _column(self.env.elapsed_steps, np.int32, count)
+        if terminated is None:
+            flags = [_column(info[key], bool, count) for key in FLAGS if key in info]
+            terminated = np.logical_or.reduce(flags) if flags else False
+        if truncated is None:
+            truncated = self.max_episode_steps is not None and elapsed >= self.max_episode_steps
+        evaluate, others = split_entries(info, count)
+        return StepResult(
+            elapsed_steps=elapsed,
+            reward=_column(reward, np.float32, count),
+            terminated=_column(terminated, bool, count),
+            truncated=_column(truncated, bool, count),
+            evaluate=evaluate,
+            others=others,
+            poses=read_poses(self.env),
+            action=None if action is None else np.array(action, dtype=np.float32),
+            sound_obs=_sound(self.obs, count) if look else None,
+        )
+
+
+def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None:
+    if seed is None:
+        return None
+    seeds = [seed + i for i in range(count)] if isinstance(seed, int) else [int(s) for s in seed]
+    if len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds for {count} envs")
+    return seeds
+
+
+def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
+    """As `StepResult.sound_obs`; what is no batch of floats is sound."""
+    sound = np.ones(num_envs, bool)
+    for name, value in flat_entries(obs):
+        # Pictures are large, and the simulator's own.
+        if name.startswith("sensor_data/") or not isinstance(value, torch.Tensor):
+            continue
+        if value.is_floating_point() and value.ndim and len(value) == num_envs:
+            sound &= to_numpy(torch.isfinite(value.reshape(num_envs, -1)).all(dim=1))
+    return sound
+
+
+def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
+    """(N, ...), a copy: one value for all envs, as of a task that is written for one env, is repeated for each."""
+    array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
+    batched = array.ndim > 0 and len(array) == num_envs
+    return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()
+
+
+def to_numpy(value: Any) -> NDArray[Any]:
+    """A copy on the host, so that what was returned does not change with the next step."""
+    if isinstance(value, torch.Tensor):
+        return value.numpy(force=True).copy()
+    return np.array(value)

@@ -1,0 +1,433 @@
+"""The private names of ManiSkill 3.0.1 that the core leans on, all of them, in one place.
+
+ManiSkill's structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``; bodies of
+a CPU system raise on both. The structs are made deep inside ManiSkill's builders, so the four cached
+properties that ask are replaced, once a process, by ones that ask our system when (and only when) the
+struct belongs to a batched CPU scene. A stock scene in the same process gets the original code.
+
+What drawing and pictures read of ManiSkill's structs is here too, one small function each.
+``tests/core/test_maniskill_private.py`` and ``tests/core/test_scene_seams.py`` name every attribute used here, so that an
+upgrade fails loudly there and not in the middle of an author's task.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, cached_property, wraps
+from itertools import islice
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.multi_agent import MultiAgent
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.structs.actor import Actor
+from mani_skill.utils.structs.articulation import Articulation
+from mani_skill.utils.structs.articulation_joint import ArticulationJoint
+from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
+from mani_skill.utils.structs.link import Link
+from mani_skill.utils.structs.pose import Pose
+from mani_skill.utils.structs.render_camera import RenderCamera
+from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import CallSite, CameraKey, CameraKind
+
+
+@cache
+def install_index_seams(batched_system: Callable[[Any], Any]) -> None:
+    """Let ManiSkill's structs find their rows in a batched CPU system: `batched_system(scene)`, None for any other scene.
+    Safe to call again."""
+    stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
+    stock_set_ee_action = PDEEPosController.set_action
+
+    def link_data(self: Any) -> torch.Tensor:
+        # Only velocities are read this way (`Link.pose` reads the system's tensor itself), and the
+        # root's are fetched with every step: a root alone must not pay for all links.
+        system = batched_system(self.scene)
+        if system is not None and not self.is_root.all():
+            system.fetch_link_velocities()
+        return stock_body_data(self)
+
+    def set_ee_action(self: Any, action: torch.Tensor) -> None:
+        if batched_system(self.scene) is None:
+            stock_set_ee_action(self, action)
+        else:
+            _set_ee_action_of_each_env(self, action)
+
+    def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
+        """Let the cached property `name` of a batched CPU scene's struct be where `find` has each of its `things`."""
+        stock = owner.__dict__[name].func
+
+        def rows(self: Any) -> torch.Tensor:
+            system = batched_system(self.scene)
+            if system is None:
+                return stock(self)
+            place = system.row_of if find == "row" else system.index_of
+            return torch.tensor(
+                [place(thing) for thing in getattr(self, things)], device=self.device, dtype=dtype
+            )
+
+        value = cached_property(rows)
+        # Assigned after the class body it has no name, and raises when it is first read.
+        value.__set_name__(owner, name)
+        setattr(owner, name, value)
+
+    find_rows(PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", "row", torch.int64)
+    find_rows(Articulation, "_data_index", "_objs", "index", torch.int32)
+    find_rows(ArticulationJoint, "_data_index", "_physx_articulations", "index", torch.int32)
+    Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
+    PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
+
+
+def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
+    """``PDEEPosController.set_action`` as a single CPU env does it, for every env.
+
+    ManiSkill has two inverse kinematics: on the CPU a solver that runs until the pose is reached, for one
+    env; on the GPU one damped step along the Jacobian, for all. For the same ``pd_ee_delta_pos`` action they
+    aim 1.3 cm apart (mean of 30 random ones, 3.8 cm at most), and the second takes any translation as one
+    along the root's axes, whatever the config's ``frame``. An env here is to equal stock's, so the first is
+    called for each: 0.1 ms an env and control step.
+    """
+    action = controller._preprocess_action(action)
+    controller._step = 0
+    start = controller._start_qpos = controller.qpos
+    use_target = controller.config.use_target
+    before = controller._target_pose if use_target else controller.ee_pose_at_base
+    goal = controller._target_pose = controller.compute_target_pose(before, action)
+    solver, qpos = controller.kinematics, controller.articulation.get_qpos()
+    solved = [solver.compute_ik(pose=goal[i : i + 1], q0=qpos[i : i + 1]) for i in range(len(qpos))]
+    # Where the pose cannot be reached the arm stays, as in stock.
+    target = torch.cat([start[i : i + 1] if row is None else row for i, row in enumerate(solved)])
+    controller._target_qpos = target.to(start.dtype)
+    if controller.config.interpolate:
+        controller._step_size = (controller._target_qpos - start) / controller._sim_steps
+    else:
+        controller.set_drive_targets(controller._target_qpos)
+
+
+_BETWEEN_SUBSTEPS = ("_step_action", "_before_simulation_step", "_after_simulation_step")
+
+
+def substeps_are_unwatched(env: Any, task: type) -> bool:
+    """Whether only ManiSkill's own code runs between the substeps of a control step.
+
+    Its own hooks read and write nothing of the simulation there: ``BaseEnv``'s are empty, and its
+    controllers' ``before_simulation_step`` writes at most drive targets into a tensor that is not applied
+    before the next control step. A task, robot or controller that brings its own is taken to look.
+
+    Args:
+        task: the class of `env` without our mixin.
+    """
+    for hook in _BETWEEN_SUBSTEPS:
+        if getattr(task, hook) is not getattr(BaseEnv, hook) or hook in vars(env):
+            return False
+    of_agents = {type(a).before_simulation_step for a in (env.agent, *agents(env)) if a is not None}
+    if not of_agents <= {BaseAgent.before_simulation_step, MultiAgent.before_simulation_step}:
+        return False
+    return all(
+        "before_simulation_step" not in vars(part)
+        and type(part).before_simulation_step.__module__.startswith("mani_skill.agents.controllers.")
+        for robot in agents(env)
+        for part in (robot.controller, *getattr(robot.controller, "controllers", {}).values())
+    )
+
+
+def asks_for_a_gpu(caller: FrameType) -> bool:
+    """Whether who asks for ``env.gpu_sim_enabled`` wants to know of a GPU, and not which code path to take.
+
+    One does: ``CPUGymWrapper`` refuses what is simulated on a GPU. It works on a batched CPU env of
+    one, so it is told the truth; everybody else decides by the answer whether to apply and fetch.
+    """
+    return caller.f_code is CPUGymWrapper.__init__.__code__
+
+
+def episode_seeds(env: BaseEnv) -> np.ndarray | None:
+    """(N,) the seeds that the envs were last reset with; None before the first reset."""
+    return env._episode_seed
+
+
+def draws_its_own_seeds(env: BaseEnv) -> bool:
+    """Whether a reset without a seed draws one for each env: ``enhanced_determinism``."""
+    return env._enhanced_determinism
+
+
+def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> None:
+    """Seed the numpy randomness of some envs, and leave the others' as it is.
+
+    ``BaseEnv.reset(seed=[...], options={"env_idx": ...})`` takes the list for all envs: the seeds of a
+    subset would replace, and shorten, the seeds of the whole batch.
+    """
+    keep_episode_seeds(env, env_idx, seeds)
+    env._batched_episode_rng[env_idx] = BatchedRNG.from_seeds(seeds, backend=env._batched_rng_backend)
+    env._episode_rng = env._batched_episode_rng[0]
+
+
+@contextmanager
+def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
+    """Within this ``_episode_rng``, from which the robot's first joints are drawn, is the generator of that env.
+
+    ManiSkill keeps it for code that was written for one env, and it is env 0's for good: a partial reset of env 3
+    would draw on from wherever env 0's episode got to, whatever its own seed. Nor does ``enhanced_determinism``
+    draw other seeds than those that were set, which it does in a reset that is given none.
+    """
+    env._episode_rng = env._batched_episode_rng[index]
+    draws_seeds, env._enhanced_determinism = env._enhanced_determinism, False
+    try:
+        yield
+    finally:
+        env._episode_rng = env._batched_episode_rng[0]
+        env._enhanced_determinism = draws_seeds
+
+
+def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: Any) -> None:
+    """Say that these envs were reset with these seeds; their generators are left as they are."""
+    every = np.array(env._episode_seed, dtype=np.int64)
+    every[env_idx] = seeds
+    env._episode_seed = every
+
+
+def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
+    """Say to ManiSkill's setters which envs are being reset: ``scene._reset_mask``; all of them between resets."""
+    mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+    mask[env_idx] = True
+    env.scene._reset_mask = mask
+
+
+def keep_observation(env: BaseEnv, obs: Any) -> None:
+    """What ``reset`` and ``step`` do with what they observed: ``_last_obs``."""
+    env._last_obs = obs
+
+
+def last_observation(env: BaseEnv) -> Any:
+    """What ``reset`` or ``step`` observed last, before any wrapper: ``_last_obs``."""
+    return env._last_obs
+
+
+def open_env(env: Any) -> BaseEnv:
+    """The env under its wrappers: ``base_env`` of ManiSkillVectorEnv, ``unwrapped`` of all others.
+
+    Raises:
+        TypeError: there is no ManiSkill env.
+        RuntimeError: it was closed.
+    """
+    env = getattr(getattr(env, "base_env", env), "unwrapped", env)
+    if not isinstance(env, BaseEnv):
+        raise TypeError(f"a ManiSkill env is wanted, not {type(env).__name__}")
+    if env.scene is None:
+        raise RuntimeError("this env was closed: there is no simulation any more")
+    return env
+
+
+def task_class(env: BaseEnv) -> type[BaseEnv]:
+    """The author's class, without what the CPU core puts in front of it."""
+    return getattr(type(env), "_workbench_task", type(env))
+
+
+def apply_and_fetch(env: BaseEnv) -> None:
+    """Let the simulation have what was written to its tensors, and the tensors what comes of it."""
+    env.scene._gpu_apply_all()
+    env.scene.px.gpu_update_articulation_kinematics()  # type: ignore[union-attr]
+    env.scene._gpu_fetch_all()
+
+
+def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
+    """Each env's numpy generators: of its episodes, and of the seeds of its episodes."""
+    return {"episode": env._batched_episode_rng.rngs, "main": env._batched_main_rng.rngs}
+
+
+# --- what drawing and pictures read ----------------------------------------------------------------
+
+
+def objects_of(struct: Any) -> list[Any]:
+    """The SAPIEN objects behind an Actor, Link or Articulation: ``_objs``, one an env that has it.
+
+    An Actor's are entities, a Link's are link components, an Articulation's are physx articulations.
+    """
+    return struct._objs
+
+
+def envs_of(struct: Any) -> NDArray[np.int64]:
+    """The env of each of `objects_of`: ``_scene_idxs``."""
+    return struct._scene_idxs.cpu().numpy().astype(np.int64)
+
+
+def data_rows_of(struct: Any) -> torch.Tensor:
+    """The row of each of `objects_of` in ``px.cuda_rigid_body_data``: ``_body_data_index``.
+
+    Only where ``scene.gpu_sim_enabled``, for what is not static, and after ``gpu_init``.
+    """
+    return struct._body_data_index
+
+
+def agents(env: Any) -> list[Any]:
+    """One for each robot of ``env.agent``; none for a task without a robot."""
+    agent = env.agent
+    return agent.agents if isinstance(agent, MultiAgent) else [] if agent is None else [agent]
+
+
+def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
+    """Its row of each env in the tensors of joints, ``px.cuda_articulation_qpos`` and its kin: ``_data_index``."""
+    return articulation._data_index
+
+
+def joints_of(struct: Any) -> int:
+    """How many active joints an Articulation has, ``max_dof``; 0 for an Actor."""
+    return int(getattr(struct, "max_dof", 0))
+
+
+def hidden_objects(env: Any) -> list[Any]:
+    """What the task hides from its sensors: ``_hidden_objects``, Actors (merged ones too)."""
+    return env._hidden_objects
+
+
+def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
+    """Where an actor that is hidden now really is, (M, 7) or (7,), or None if it is not hidden.
+
+    ``Actor.hide_visual`` cannot switch off drawing in GPU simulation: it keeps the pose in
+    ``before_hide_pose`` and moves the actor 99999 m away. On a stock CPU env nothing moves.
+    """
+    if not actor.hidden or not actor.scene.gpu_sim_enabled:
+        return None
+    return actor.before_hide_pose  # type: ignore[attr-defined]
+
+
+def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:
+    """What ``obs_mode="state"`` flattens, with its names: ``_get_obs_state_dict``. Runs the author's hooks."""
+    return env._get_obs_state_dict(info)
+
+
+def cameras(env: Any) -> dict[CameraKey, Any]:
+    """``_sensors``, tactile ones too, then ``_human_render_cameras``; an env without a render device has neither."""
+    lists: tuple[tuple[CameraKind, str], ...] = (("sensor", "_sensors"), ("human", "_human_render_cameras"))
+    return {(kind, name): c for kind, held in lists for name, c in getattr(env, held, {}).items()}
+
+
+def forget_cameras(env: Any) -> None:
+    """Leave no camera in the env's and its scene's lists, for `set_up_sensors` to fill them again."""
+    env._sensors, env._human_render_cameras = {}, {}
+    env.scene.camera_groups.clear()
+    env.scene.sensors, env.scene.human_render_cameras = {}, {}
+
+
+def set_up_sensors(env: Any) -> None:
+    """What ``_reconfigure`` does last: configs of sensors and human cameras, and the cameras themselves."""
+    env._setup_sensors({"reconfigure": True})
+
+
+def flatten_observation(env: Any, obs: Any) -> Any:
+    """What ``step`` does to an observation after the reward has seen it: ``_flatten_raw_obs``."""
+    return env._flatten_raw_obs(obs)
+
+
+def camera_components(camera: Any) -> list[Any]:
+    """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
+
+    Empty for what is no plain camera: tactile sensors, or the stereo depth camera (which ManiSkill
+    3.0.1 cannot build: its constructor wants an argument that BaseEnv does not pass).
+    """
+    inner = getattr(camera, "camera", None)
+    return inner._render_cameras if isinstance(inner, RenderCamera) else []
+
+
+# --- what placing a camera writes ------------------------------------------------------------------
+
+
+_note_camera: Callable[[Any, FrameType], None] | None = None
+
+
+@contextmanager
+def noting_cameras(note: Callable[[Any, FrameType], None]) -> Iterator[None]:
+    """Within this `note` is called with every ``CameraConfig`` that is made, and the frame that makes it."""
+    global _note_camera
+    mark_camera_configs()
+    before, _note_camera = _note_camera, note
+    try:
+        yield
+    finally:
+        _note_camera = before
+
+
+def camera_configs(env: Any) -> dict[CameraKey, Any]:
+    """What the camera hooks give now, before keywords of ``gym.make`` change it."""
+    of_agent = {} if env.agent is None else parse_camera_configs(env.agent._sensor_configs)
+    sensors = {**parse_camera_configs(env._default_sensor_configs), **of_agent}
+    people = parse_camera_configs(env._default_human_render_camera_configs)
+    return {
+        **{("sensor", name): config for name, config in sensors.items()},
+        **{("human", name): config for name, config in people.items()},
+    }
+
+
+def mark_camera_configs() -> None:
+    """Let every ``CameraConfig`` of this process keep where it was made, for `camera_site`, and at what its pose was
+    said to look, for `camera_target`. Of tasks that are imported after this. Safe to call again."""
+    stock = CameraConfig.__init__
+    if hasattr(stock, "_workbench_stock"):
+        return
+    stock_look_at = sapien_utils.look_at
+    looked: deque[tuple[Pose, Any]] = deque(maxlen=64)
+    """The last poses of ``look_at``, and their targets. Tensors are not read before a camera is made: on a GPU that waits."""
+
+    @wraps(stock)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        stock(self, *args, **kwargs)
+        self._workbench_site = _place_of_call(sys._getframe(1))
+        own = self.pose.raw_pose
+        same = (to for pose, to in reversed(looked) if torch.equal(pose.raw_pose.to(own.device), own))
+        self._workbench_target = next(same, None)
+        if _note_camera is not None:
+            _note_camera(self, sys._getframe(1))
+
+    @wraps(stock_look_at)
+    def look_at(eye: Any, target: Any, *args: Any, **kwargs: Any) -> Pose:
+        pose = stock_look_at(eye, target, *args, **kwargs)
+        looked.append((pose, target))
+        return pose
+
+    init._workbench_stock = stock  # type: ignore[attr-defined]
+    CameraConfig.__init__ = init  # type: ignore[method-assign]
+    sapien_utils.look_at = look_at
+
+
+def _place_of_call(frame: FrameType) -> CallSite:
+    code = frame.f_code
+    # Of a call over several lines `f_lineno` may be one within.
+    start = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,))[0]
+    return CallSite(code.co_filename, start or frame.f_lineno, code.co_qualname)
+
+
+def camera_site(config: Any) -> CallSite | None:
+    """Where a config was made; None where that was not kept."""
+    return getattr(config, "_workbench_site", None)
+
+
+def camera_target(config: Any) -> Any:
+    """What ``look_at`` was given as its target when it made the config's pose; None where another thing made it."""
+    return getattr(config, "_workbench_target", None)
+
+
+def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components: list[Any]) -> None:
+    """Make a ``Camera`` one of this config and these components, which are set up as the config says."""
+    kind, name = key
+    camera.config = config
+    (env._sensor_configs if kind == "sensor" else env._human_render_camera_configs)[name] = config
+    inner: RenderCamera = camera.camera
+    if inner._render_cameras is not components:
+        inner._render_cameras = components
+        # Made again, by name, when the scene is next drawn for all envs.
+        inner.camera_group = None  # type: ignore[assignment]
+        env.scene.camera_groups.pop(name, None)
+    inner._cached_model_matrix = None  # type: ignore[assignment]
+    inner._cached_extrinsic_matrix = None  # type: ignore[assignment]
+    inner._cached_intrinsic_matrix = None  # type: ignore[assignment]
+    inner._cached_local_pose = None  # type: ignore[assignment]

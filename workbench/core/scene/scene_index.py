@@ -1,0 +1,317 @@
+"""What a built scene is made of, found out once: its bodies, where their poses lie, and what has a state.
+
+A viewer, a recorder and a timeline each want the pose of every body of every env, thirty times a second. Asked one by
+one a body costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. So it is settled once a scene which row of which
+tensor belongs to which (env, body), and a frame is one gather from ``px.cuda_rigid_body_data``, where ManiSkill keeps
+poses in its GPU simulation and in our batched CPU one. Static bodies are not in it and do not move: theirs are kept here.
+
+Two things would make that array a lie. A body that is hidden from the sensors in GPU simulation has
+been moved 99999 m away (SAPIEN cannot switch off drawing there); its true pose is what ManiSkill kept
+aside (`hidden_poses`). And objects that differ from env to env (`Actor.merge`) are one body by the merged name, or
+every env would have its own column with NaN in all other rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import sapien
+import torch
+from numpy.typing import NDArray
+
+from workbench.core import maniskill_private
+from workbench.core.scene.shapes import BodyKind
+
+_T = TypeVar("_T")
+
+
+def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
+    """``find(env)``, called once for each scene that the env has; the scene holds what it gave, which goes with it."""
+    name = f"_workbench {find.__module__}.{find.__qualname__}"
+
+    @wraps(find)
+    def known(env: Any) -> _T:
+        held = vars(env.scene)
+        if name not in held:
+            held[name] = find(env)
+        return held[name]
+
+    return known
+
+
+@dataclass(frozen=True)
+class SceneIndex:
+    """The bodies of one built scene."""
+
+    names: tuple[str, ...]
+    """(B,) an actor's name, or ``articulation/link``; unique."""
+    kinds: tuple[BodyKind, ...]
+    """(B,)"""
+    owners: tuple[str, ...]
+    """(B,) the actor's name again, or the articulation's."""
+    hidden: tuple[bool, ...]
+    """(B,) True for what the task hides from its sensors."""
+    entities: NDArray[np.object_]
+    """(N, B) the ``sapien.Entity`` of each body in each env, None where an env lacks it."""
+    states: dict[str, Any]
+    """ManiSkill's structs by their names in its state dict: ``actors/cube`` but for static ones, ``articulations/panda``."""
+    actors: tuple[tuple[Any, NDArray[np.int64]], ...]
+    """Every Actor that can be hidden, merged ones and their parts alike, with the slots of its entities: where they are
+    in the flattened (N * B) array of bodies, -1 for one that is not there."""
+    fixed: NDArray[np.float32]
+    """(N, B, 7) poses of static bodies; NaN elsewhere. Only used with `rows`."""
+    rows: Any
+    """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``, for `rows_of`; None on a stock CPU env."""
+    slots: NDArray[np.int64]
+    """(K,) where each of `rows` goes."""
+    slot_of: dict[int, int]
+    """``id`` of an entity to its slot. The entities are held by `entities`, so ids stay theirs."""
+
+    def name_of(self, entity: Any) -> str | None:
+        """The body that an entity is, or the entity of a SAPIEN component; None for what ManiSkill does not manage."""
+        slot = self.slot_of.get(id(_entity(entity)))
+        return None if slot is None else self.names[slot % len(self.names)]
+
+
+@once_a_scene
+def scene_index(env: Any) -> SceneIndex:
+    """The index of the scene that a ManiSkill env (unwrapped, reset at least once) has now.
+
+    Bodies are all actors, then all links of all articulations, each by the name of the merged view
+    that it is part of, if any.
+
+    Raises:
+        NotImplementedError: the env was made with ``parallel_in_single_scene``.
+    """
+    scene = env.scene
+    if scene.parallel_in_single_scene:
+        raise NotImplementedError(
+            "parallel_in_single_scene puts all envs into one sub-scene, which the workbench cannot take "
+            "apart. Make the env without it: the page shows all envs side by side."
+        )
+    names: list[str] = []
+    kinds: list[BodyKind] = []
+    owners: list[str] = []
+    columns: list[list[Any]] = []
+    for owner, name, structs in _named_structs(scene):
+        # Nothing forbids an actor that is called "panda/panda_hand".
+        while name in names:
+            name += "'"
+        names.append(name)
+        kinds.append("link" if owner else structs[0].px_body_type)
+        owners.append(owner or name)
+        columns.append(structs)
+    shape = (env.num_envs, len(names))
+    entities = np.full(shape, None, dtype=object)
+    fixed = np.full((*shape, 7), np.nan, dtype=np.float32)
+    slots: list[NDArray[np.int64]] = []
+    rows: list[torch.Tensor] = []
+    for body, structs in enumerate(columns):
+        for struct in structs:
+            envs = maniskill_private.envs_of(struct)
+            for e, thing in zip(envs, maniskill_private.objects_of(struct), strict=True):
+                entity = entities[e, body] = _entity(thing)
+                if kinds[body] == "static":
+                    fixed[e, body] = [*entity.pose.p, *entity.pose.q]
+            if kinds[body] != "static" and scene.gpu_sim_enabled:
+                slots.append(envs * len(names) + body)
+                rows.append(maniskill_private.data_rows_of(struct))
+    slot_of = {id(entity): slot for slot, entity in enumerate(entities.ravel()) if entity is not None}
+    hidden = {
+        id(entity)
+        for actor in maniskill_private.hidden_objects(env)
+        for entity in maniskill_private.objects_of(actor)
+    }
+    actors = {id(actor): actor for actor in [*scene.actors.values(), *scene.actor_views.values()]}
+    registry = scene.state_dict_registry
+    moving = {f"actors/{a.name}": a for a in registry.actors.values() if a.px_body_type != "static"}
+    return SceneIndex(
+        names=tuple(names),
+        kinds=tuple(kinds),
+        owners=tuple(owners),
+        hidden=tuple(any(id(entity) in hidden for entity in column) for column in entities.T),
+        entities=entities,
+        states={**moving, **{f"articulations/{a.name}": a for a in registry.articulations.values()}},
+        actors=tuple(
+            (
+                actor,
+                np.array(
+                    [slot_of.get(id(entity), -1) for entity in maniskill_private.objects_of(actor)], np.int64
+                ),
+            )
+            for actor in actors.values()
+        ),
+        fixed=fixed,
+        rows=row_index(torch.cat([torch.zeros(0, dtype=torch.int64, device=scene.device), *rows]))
+        if scene.gpu_sim_enabled
+        else None,
+        slots=np.concatenate([np.zeros(0, np.int64), *slots]),
+        slot_of=slot_of,
+    )
+
+
+def read_poses(env: Any) -> NDArray[np.float32]:
+    """(N, B, 7) float32 pose of every body in its env's own frame: p in metres, q as wxyz.
+
+    NaN for bodies that an env does not have. What is hidden now is where it would be if it were shown.
+    """
+    index = scene_index(env)
+    poses = index.fixed.copy()
+    flat = poses.reshape(-1, 7)
+    if index.rows is None:
+        # A stock CPU env, which has no such tensor and moves nothing in order to hide it.
+        for slot, entity in enumerate(index.entities.ravel()):
+            if entity is not None:
+                flat[slot] = [*entity.pose.p, *entity.pose.q]
+        return poses
+    # Gathered on the tensor's own device: one small copy to the host, not the whole buffer.
+    moved = rows_of(env.scene.px.cuda_rigid_body_data, index.rows)[:, :7]
+    flat[index.slots] = moved if isinstance(moved, np.ndarray) else moved.cpu().numpy()
+    for slots, kept in hidden_poses(env):
+        flat[slots[slots >= 0]] = kept[slots >= 0]
+    return poses
+
+
+def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+    """Of each Actor that is hidden now: the slots (M,) of its entities, and where they really are (M, 7).
+
+    On the CPU the poses are what ManiSkill keeps of them, to be written to, and no copy.
+    """
+    for actor, slots in scene_index(env).actors:
+        if actor.hidden and (kept := maniskill_private.pose_before_hiding(actor)) is not None:
+            yield slots, kept.cpu().numpy()
+
+
+def present_states(env: Any) -> dict[str, Any]:
+    """(N, D) of each of `SceneIndex.states`, as its ``get_state()`` lays it out; NaN in the envs without it.
+
+    Of a batched env. Tensors, or on the CPU arrays; copies of the simulation's own.
+    """
+    return state_rows(env).states()
+
+
+class StateRows(NamedTuple):
+    """What the states of a moment are made of: copies, in as few calls as there are tensors."""
+
+    still: list[int]
+    places: dict[str, tuple[Any, int | None, Any, int]]
+    data: Any
+    """(N, B, 13)"""
+    qpos: Any
+    qvel: Any
+    asked: dict[str, Any]
+    """States that are in none of these."""
+
+    def states(self) -> dict[str, Any]:
+        """As `present_states`."""
+        data = self.data
+        if self.still:
+            data[:, self.still, 7:] = 0.0
+        join: Any = np.hstack if isinstance(data, np.ndarray) else torch.hstack
+        states: dict[str, Any] = {}
+        for name, (_, column, joints, dof) in self.places.items():
+            if name in self.asked:
+                states[name] = self.asked[name]
+            elif joints is None:
+                states[name] = data[:, column]
+            else:
+                states[name] = join([data[:, column], self.qpos[joints, :dof], self.qvel[joints, :dof]])
+        return states
+
+
+def state_rows(env: Any) -> StateRows:
+    """Of the present moment, for who has time for `present_states` later."""
+    rows, still, places = _places_of_states(env)
+    px = env.scene.px
+    asked = {
+        name: in_every_env(env, struct, struct.get_state())
+        for name, (struct, column, joints, _) in places.items()
+        if column is None or (joints is None and struct.hidden)
+    }
+    qpos, qvel = px.cuda_articulation_qpos.torch(), px.cuda_articulation_qvel.torch()
+    qpos, qvel = (q.numpy().copy() if q.is_cpu else q.clone() for q in (qpos, qvel))
+    return StateRows(still, places, rows_of(px.cuda_rigid_body_data, rows), qpos, qvel, asked)
+
+
+@once_a_scene
+def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, int | None, Any, int]]]:
+    """Rows (N, B) of ``cuda_rigid_body_data``; which of the B are moved by the task and have no velocity; of each state
+    its struct and, if all envs have it, which of the B it is, and of an articulation its rows (N,) and joints."""
+    every, rows, still = np.arange(env.num_envs), [], []
+    places: dict[str, tuple[Any, int | None, Any, int]] = {}
+    for name, struct in scene_index(env).states.items():
+        if not np.array_equal(maniskill_private.envs_of(struct), every):
+            places[name] = struct, None, None, 0
+            continue
+        if name.startswith("actors/"):
+            if struct.px_body_type != "dynamic":
+                still.append(len(rows))
+            places[name], body = (struct, len(rows), None, 0), struct
+        else:
+            joints = row_index(maniskill_private.data_rows_of_articulation(struct))
+            places[name], body = (struct, len(rows), joints, maniskill_private.joints_of(struct)), struct.root
+        rows.append(maniskill_private.data_rows_of(body).long())
+    none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
+    return row_index(torch.stack(rows, dim=1) if rows else none), still, places
+
+
+def in_every_env(env: Any, struct: Any, value: Any) -> Any:
+    """(N, ...) of what a struct gives for the envs that have it, NaN in the others; all NaN where there is no such
+    struct that could say which envs they are."""
+    if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
+        return value
+    whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)
+    envs = () if struct is None else maniskill_private.envs_of(struct)
+    if len(envs) == len(value):
+        whole[torch.as_tensor(envs, device=value.device)] = value
+    return whole
+
+
+def row_index(rows: torch.Tensor) -> Any:
+    """(K,) rows of a tensor of the simulation, as `rows_of` takes them: on its own device, on the CPU an array."""
+    return rows.long().numpy() if rows.is_cpu else rows.long()
+
+
+def rows_of(tensor: Any, rows: Any) -> Any:
+    """(K, D) of a tensor of the simulation, copied; an array on the CPU, where numpy's calls on a few hundred numbers
+    take a quarter of torch's."""
+    data = tensor.torch()
+    return data.numpy().take(rows, axis=0) if data.is_cpu else data[rows]
+
+
+def _named_structs(scene: Any) -> Iterator[tuple[str, str, list[Any]]]:
+    """The articulation ("" for an actor), the name, and the structs of each body in turn."""
+    for name, actors in _merged(scene.actors, scene.actor_views):
+        yield "", name, actors
+    for name, articulations in _merged(scene.articulations, scene.articulation_views):
+        links: dict[str, list[Any]] = {}
+        for articulation in articulations:
+            for link in articulation.links:
+                links.setdefault(link.name, []).append(link)
+        for link_name, same in links.items():
+            yield name, f"{name}/{link_name}", same
+
+
+def _merged(structs: dict[str, Any], views: dict[Any, Any]) -> Iterator[tuple[str, list[Any]]]:
+    """The structs by name, together those that are parts of one merged view."""
+    view_of: dict[int, str] = {}
+    for name, view in views.items():
+        # Two objects of one env under one view (merging is not bound to one an env) cannot be one
+        # column of the array: those keep their own names.
+        if len(set(maniskill_private.envs_of(view))) == len(maniskill_private.objects_of(view)):
+            for thing in maniskill_private.objects_of(view):
+                view_of.setdefault(id(thing), str(name if name is not None else view.name))
+    grouped: dict[str, list[Any]] = {}
+    for name, struct in structs.items():
+        labels = {view_of.get(id(thing)) for thing in maniskill_private.objects_of(struct)}
+        label = labels.pop() if len(labels) == 1 else None
+        grouped.setdefault(name if label is None else label, []).append(struct)
+    yield from grouped.items()
+
+
+def _entity(thing: Any) -> sapien.Entity:
+    return thing if isinstance(thing, sapien.Entity) else thing.entity

@@ -1,0 +1,245 @@
+"""Fewer triangles that look the same: what makes a robot fit into a browser.
+
+The Panda that ManiSkill ships has 136,000 triangles, the camera on its wrist 425,000; a browser that
+draws in software manages some 200,000 in all. Most of those triangles are far smaller than a pixel.
+Quadric edge collapse (fast_simplification, Garland and Heckbert's method) takes them out, if the mesh is
+first made whole: exporters write every triangle with three vertices of its own, and an edge that no
+two triangles share is a border that the method will not move. So vertices at one place are welded,
+the mesh is reduced, and normals are made anew, sharp where the surface has an edge and smooth
+elsewhere. A texture's seams must stay seams: there, vertices are welded only where the uv agrees.
+
+A floor is another case. ManiSkill builds it as a hundred by hundred grid of squares; a flat rectangle
+whose uv is linear looks exactly the same as two triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import fast_simplification
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from workbench.core.scene.shapes import Mesh
+
+_CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
+"""Neighbouring faces that bend less than this are shaded as one smooth surface."""
+_DENSE = 60_000
+"""Above so many faces a mesh is a whole CAD assembly, whose vertices are snapped to a grid at once:
+quadric collapse alone would take seconds and get stuck."""
+_CLUSTER_CELLS = 64
+_COARSEST_CELLS = 16
+_WELD_CELLS = 1_000_000
+_MOST_PIECES = 200
+_LEAST_FACES = 48
+
+
+def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
+    """`mesh` with about `max_faces` triangles; as it is when it has no more than that.
+
+    One of many loose pieces may keep up to twice as many, and a textured one more, because the edges of
+    its pieces of texture are kept as they are.
+    """
+    if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
+        return mesh
+    cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE else _CLUSTER_CELLS
+    welded = _weld(mesh.vertices, mesh.faces, mesh.uvs, cells)
+    while True:
+        vertices, faces, uvs = welded
+        if len(faces) > max_faces:
+            vertices, faces, uvs = _collapse(vertices, faces, uvs, max_faces)
+        # Hundreds of loose pieces (screws, vents) cannot shrink; only a coarser grid joins them.
+        if len(faces) <= 2 * max_faces or mesh.uvs is not None or cells <= _COARSEST_CELLS:
+            break
+        cells = min(int(0.7 * cells), _CLUSTER_CELLS)
+        welded = _weld(*welded, cells)
+    if len(faces) == 0:
+        return mesh
+    reduced = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
+    if mesh.normals is None or len(mesh.faces) > _DENSE:
+        return reduced
+    return replace(reduced, normals=_normals_of_source(reduced, mesh))
+
+
+def with_normals(mesh: Mesh) -> Mesh:
+    """`mesh` with normals made from its faces: smooth, but sharp at edges of more than 40 degrees.
+
+    Vertices are split where faces that meet there get different normals.
+    """
+    corners = mesh.faces.reshape(-1).astype(np.int64)
+    triangles = mesh.vertices[mesh.faces].astype(np.float64)
+    weighted = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(weighted, axis=1, keepdims=True)
+    unit = weighted / np.maximum(length, 1e-20)
+
+    # Every pair (a, b) of corners that share a vertex: b's face counts for a's normal if it bends
+    # little against a's face.
+    order = np.argsort(corners, kind="stable")
+    counts = np.bincount(corners, minlength=len(mesh.vertices))
+    start = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    sharing = counts[corners[order]]
+    a = np.repeat(order, sharing)
+    step = np.arange(len(a)) - np.repeat(np.cumsum(sharing) - sharing, sharing)
+    b = order[np.repeat(start[corners[order]], sharing) + step]
+    smooth = np.einsum("ij,ij->i", unit[a // 3], unit[b // 3]) >= _CREASE_COSINE
+    normals = np.stack(
+        [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)],
+        axis=1,
+    ).astype(np.float64)
+    # A face without area sums to nothing, and a zero normal is drawn black.
+    empty = np.linalg.norm(normals, axis=1) < 1e-20
+    normals[empty] = [0.0, 0.0, 1.0]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    key = np.concatenate([corners[:, None], np.round(normals * 64).astype(np.int64)], axis=1)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    chosen = corners[first]
+    return Mesh(
+        vertices=mesh.vertices[chosen],
+        faces=inverse.reshape(-1, 3).astype(np.uint32),
+        normals=normals[first].astype(np.float32),
+        uvs=None if mesh.uvs is None else mesh.uvs[chosen],
+    )
+
+
+def flat_rectangle(mesh: Mesh) -> Mesh | None:
+    """The same rectangle as two triangles, or None if `mesh` is not one.
+
+    Only rectangles along the axes of the mesh's own frame, one layer, with uv linear in position.
+    """
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    extent = high - low
+    normal_axis = int(np.argmin(extent))
+    u, v = [axis for axis in range(3) if axis != normal_axis]
+    if extent[normal_axis] > 1e-5 * max(extent[u], extent[v]) or min(extent[u], extent[v]) <= 0:
+        return None
+    triangles = mesh.vertices[mesh.faces].astype(np.float64)
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, normal_axis] / 2
+    side = np.sign(areas.sum())
+    if side == 0 or (np.sign(areas) == -side).any():
+        return None
+    if abs(abs(areas.sum()) - extent[u] * extent[v]) > 1e-4 * extent[u] * extent[v]:
+        return None
+    corners = np.tile(low, (4, 1))
+    corners[[1, 2], u] = high[u]
+    corners[[2, 3], v] = high[v]
+    uvs = None
+    if mesh.uvs is not None:
+        at = np.column_stack([mesh.vertices[:, [u, v]], np.ones(len(mesh.vertices))]).astype(np.float64)
+        linear = np.linalg.lstsq(at, mesh.uvs.astype(np.float64), rcond=None)[0]
+        if np.abs(at @ linear - mesh.uvs).max() > 1e-3:
+            return None
+        uvs = (np.column_stack([corners[:, [u, v]], np.ones(4)]) @ linear).astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32)
+    across = np.cross(corners[1] - corners[0], corners[3] - corners[0])[normal_axis]
+    if np.sign(across) != side:
+        faces = faces[:, ::-1].copy()
+    normals = np.zeros((4, 3), dtype=np.float32)
+    normals[:, normal_axis] = side
+    return Mesh(corners.astype(np.float32), faces, normals, uvs)
+
+
+def drop_uvs(mesh: Mesh) -> Mesh:
+    """`mesh` without texture coordinates, for a material that has no texture."""
+    return mesh if mesh.uvs is None else replace(mesh, uvs=None)
+
+
+def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
+    """(V, 3) normals of the nearest vertices of `source` that face the same way.
+
+    A few large faces make a round surface look dented when their own normals shade it.
+    """
+    assert reduced.normals is not None and source.normals is not None
+    count = min(8, len(source.vertices))
+    near = np.asarray(KDTree(source.vertices).query(reduced.vertices, k=count)[1]).reshape(-1, count)
+    candidates = source.normals[near]
+    alike = np.einsum("vkj,vj->vk", candidates, reduced.normals)
+    # The nearest that agrees; where a face was folded over none does, and the most alike is taken.
+    choice = np.where(
+        (alike > _CREASE_COSINE).any(axis=1), (alike > _CREASE_COSINE).argmax(axis=1), alike.argmax(axis=1)
+    )
+    every = np.arange(len(near))
+    chosen = candidates[every, choice]
+    return np.where(alike[every, choice][:, None] > 0, chosen, reduced.normals).astype(np.float32)
+
+
+def _weld(
+    vertices: NDArray[np.float32], faces: NDArray, uvs: NDArray[np.float32] | None, cells: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
+    """One vertex for all that lie in one cell of a grid (and have one uv); faces that vanish are dropped."""
+    extent = float(np.ptp(vertices, axis=0).max()) or 1.0
+    grid = np.round((vertices - vertices.min(axis=0)) / extent * cells).astype(np.int64)
+    key = (grid[:, 0] << 42) | (grid[:, 1] << 21) | grid[:, 2]
+    if uvs is not None:
+        texel = np.round(uvs.astype(np.float64) * 8192).astype(np.int64)
+        key = np.unique(np.column_stack([key, texel]), axis=0, return_inverse=True)[1].reshape(-1)
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    welded = inverse.reshape(-1)[faces]
+    if cells < _WELD_CELLS:
+        # Surfaces that a coarse grid lays upon each other would be drawn twice, and flicker.
+        welded = welded[np.sort(np.unique(np.sort(welded, axis=1), axis=0, return_index=True)[1])]
+    whole = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
+    return vertices[first], welded[whole], None if uvs is None else uvs[first]
+
+
+def _collapse(
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int64],
+    uvs: NDArray[np.float32] | None,
+    max_faces: int,
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
+    # The method's thresholds are absolute: a mesh of a few centimetres would be collapsed in any order.
+    extent = float(np.ptp(vertices, axis=0).max())
+    points = vertices.astype(np.float64) / extent
+    triangles = np.ascontiguousarray(faces, dtype=np.int32)
+    if uvs is None:
+        new_points, new_faces = _collapse_pieces(points, triangles, max_faces)
+        # Where a quadric is nearly singular its optimum can lie anywhere: a spike out of the surface.
+        distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
+        spike = distance > 0.04
+        new_points[spike] = points[nearest[spike]]
+        return (new_points * extent).astype(np.float32), new_faces, None
+    # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
+    collapses = fast_simplification.simplify(
+        points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True
+    )[-1]
+    new_points, new_faces, new_index = fast_simplification.replay_simplification(points, triangles, collapses)
+    # The old vertex that lies nearest to where its group ended up lends its uv.
+    order = np.argsort(-np.linalg.norm(points - new_points[new_index], axis=1), kind="stable")
+    new_uvs = np.zeros((len(new_points), 2), dtype=np.float32)
+    new_uvs[new_index[order]] = uvs[order]
+    return (new_points * extent).astype(np.float32), new_faces.astype(np.int64), new_uvs
+
+
+def _collapse_pieces(
+    points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Collapse each connected piece by itself, with a share of the triangles after its area.
+
+    To a quadric a flat disc costs nothing to lose; taken together with a round housing, the lid goes first.
+    """
+    count = len(points)
+    edges = coo_matrix(
+        (np.ones(2 * len(faces)), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), (count, count)
+    )
+    pieces, label = connected_components(edges, directed=False)
+    label = label[faces[:, 0]]
+    corner = points[faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    share = np.bincount(label, area, minlength=pieces) / max(area.sum(), 1e-20)
+    new_points, new_faces, used = [], [], 0
+    for piece in np.unique(label) if pieces <= _MOST_PIECES else [None]:
+        own = faces if piece is None else faces[label == piece]
+        target = max_faces if piece is None else max(_LEAST_FACES, int(share[piece] * max_faces))
+        index, flat = np.unique(own, return_inverse=True)
+        vertices, triangles = points[index], flat.reshape(-1, 3).astype(np.int32)
+        if len(triangles) > target:
+            simpler = fast_simplification.simplify(vertices, triangles, target_count=target)
+            vertices, triangles = simpler[0], simpler[1]
+        new_points.append(vertices)
+        new_faces.append(triangles.astype(np.int64) + used)
+        used += len(vertices)
+    return np.concatenate(new_points), np.concatenate(new_faces)

@@ -1,0 +1,1 @@
+"""N CPU physics systems behind the interface of one GPU system."""

@@ -1,0 +1,274 @@
+"""ManiSkill's setters and getters of state, with words for what goes wrong in them.
+
+In GPU simulation, and so here, the setter of an Actor writes the rows of the envs that are being reset,
+and a value of another batch size stops in torch: "shape mismatch: value tensor of shape [4, 7] cannot be
+broadcast to indexing result of shape [2, 7]". That names no actor and no reset. A static actor stops in
+an assertion, its velocity in a KeyError. The setters are therefore wrapped, once a process: the
+error comes from the author's own call, names the object, and says what batch was wanted. A stock scene
+gets the stock setter and nothing else.
+
+Where rules are checked, `StrictCpuSystem` is told of every read and write besides.
+
+SAPIEN's own setters of state, which the GPU's simulation does not look at.
+
+``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env. In GPU simulation the state lives
+on the GPU, and the call changes an object that nobody reads. Here SAPIEN's objects are the
+simulation, so the call would work, and the task that was tried out would not be the task that trains.
+Where rules are checked, these setters tell of it, at the author's line.
+
+SAPIEN's classes are shared by all scenes of a process: the setters are replaced once, when the first
+scene with rules is built, and do what they did for every object that belongs to none, before a
+scene is complete, and when the core itself calls them.
+"""
+
+from __future__ import annotations
+
+import sys
+import weakref
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import sapien
+import sapien.physx as physx
+import torch
+from mani_skill.utils import common
+from mani_skill.utils.structs.actor import Actor
+from mani_skill.utils.structs.articulation import Articulation
+from mani_skill.utils.structs.articulation_joint import ArticulationJoint
+from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct, PhysxRigidDynamicComponentStruct
+from mani_skill.utils.structs.link import Link
+from mani_skill.utils.structs.pose import vectorize_pose
+
+from workbench.core.simulation.cpu_system import batched_system
+from workbench.core.simulation.mirrors import Group
+from workbench.core.simulation.strict_system import StrictCpuSystem
+
+Index = Callable[[Any], torch.Tensor]
+
+STATE_PROPERTIES: tuple[tuple[type, str, Group], ...] = (
+    (Actor, "pose", "bodies"),
+    (PhysxRigidDynamicComponentStruct, "linear_velocity", "bodies"),
+    (PhysxRigidDynamicComponentStruct, "angular_velocity", "bodies"),
+    (Link, "pose", "links"),
+    (PhysxRigidBodyComponentStruct, "linear_velocity", "links"),
+    (PhysxRigidBodyComponentStruct, "angular_velocity", "links"),
+    (Articulation, "root_linear_velocity", "links"),
+    (Articulation, "root_angular_velocity", "links"),
+    (Articulation, "qpos", "joints"),
+    (Articulation, "qvel", "joints"),
+    (Articulation, "qf", "forces"),
+    (ArticulationJoint, "qpos", "joints"),
+    (ArticulationJoint, "qvel", "joints"),
+    (ArticulationJoint, "drive_target", "targets"),
+    (ArticulationJoint, "drive_velocity_target", "targets"),
+)
+"""Where ManiSkill keeps what an author reads and sets, and what it is fetched and applied with."""
+
+TARGET_SETTERS = ("set_joint_drive_targets", "set_joint_drive_velocity_targets")
+
+
+@cache
+def install_struct_access() -> None:
+    """Put the words into ManiSkill's setters and getters. Safe to call again."""
+    for owner, name, group in STATE_PROPERTIES:
+        stock: property = owner.__dict__[name]
+        getter = _told_reads(stock.fget, name, group)  # type: ignore[arg-type]
+        setter = None if stock.fset is None else _told_writes(stock.fset, name, group)
+        setattr(owner, name, property(getter, setter, doc=stock.__doc__))
+    for name in TARGET_SETTERS:
+        setattr(Articulation, name, _told_writes(Articulation.__dict__[name], "drive targets", "targets"))
+
+
+def _rows(struct: Any, group: Group) -> torch.Tensor:
+    """Rows of the group's tensor that hold `struct`, one an env."""
+    if group in ("bodies", "links"):
+        body: Any = struct.root if isinstance(struct, Articulation) else struct
+        return body._body_data_index
+    return struct._data_index
+
+
+def _told_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Callable[[Any], Any]:
+    velocity = name.endswith("velocity")
+
+    def get(self: Any) -> Any:
+        system = self.scene.px
+        if velocity and group == "bodies" and self.px_body_type == "static" and batched_system(self.scene):
+            raise RuntimeError(f"'{self.name}' is static: it has no velocity on the GPU, nor here.")
+        # A hidden actor's pose is not in the tensors, nor is a static one's.
+        if type(system) is StrictCpuSystem and group != "targets" and system.laid_out:
+            if not (group == "bodies" and (self.px_body_type == "static" or self.hidden)):
+                system.about_to_read(self, group, _rows(self, group))
+        return stock(self)
+
+    return get
+
+
+def _told_writes(stock: Callable[..., None], name: str, group: Group) -> Callable[..., None]:
+    # "targets" is what an author may call the value of `set_joint_drive_targets`.
+    def put(self: Any, targets: Any, *args: Any, **kwargs: Any) -> None:
+        system = batched_system(self.scene)
+        if system is None:
+            return stock(self, targets, *args, **kwargs)
+        if group == "bodies" and self.px_body_type == "static":
+            raise RuntimeError(
+                f"'{self.name}' is static: on the GPU, and here, a static actor cannot be moved once the scene "
+                "is built. Give it its initial_pose before build_static(), or build it with build_kinematic()."
+            )
+        if group == "targets" and not system.laid_out:
+            raise RuntimeError(
+                f"A drive target of '{getattr(self, 'articulation', self).name}' was set before the simulation is "
+                "initialised: in _load_agent and _load_scene it has none yet, on the GPU or here. Set one that stays in "
+                "_after_reconfigure(self, options), and one of each episode in _initialize_episode, with "
+                "articulation.set_joint_drive_targets(targets, joints=[...])."
+            )
+        if type(system) is StrictCpuSystem and system.laid_out and not (group == "bodies" and self.hidden):
+            system.about_to_write(self, group, _rows(self, group)[_mask(self)])
+        try:
+            stock(self, targets, *args, **kwargs)
+        except (RuntimeError, IndexError) as error:
+            if group == "targets" and isinstance(self, ArticulationJoint):
+                _explain_single_joint(self, name, error)
+            _explain(self, targets, name, error)
+            raise
+
+    return put
+
+
+def _mask(struct: Any) -> torch.Tensor:
+    """(M,) which of the objects behind `struct` a setter writes now."""
+    return struct.scene._reset_mask[struct._scene_idxs.long()]
+
+
+def _explain_single_joint(joint: ArticulationJoint, name: str, error: Exception) -> None:
+    """Raise in better words if it was ManiSkill's own index of a joint that `error` stopped at."""
+    wanted, every = int(_mask(joint).sum()), len(joint._objs)
+    if not 1 < wanted < every:
+        return
+    setter = "set_joint_drive_targets" if name == "drive_target" else "set_joint_drive_velocity_targets"
+    raise RuntimeError(
+        f"ManiSkill's own fault, not yours: joint.set_{name}() of '{joint.name}' fails where {wanted} of {every} envs are "
+        f"reset, on the GPU as here (it puts the rows of {wanted} envs together with the joints of {every}). Set it through "
+        f"the articulation instead: joint.articulation.{setter}(targets, joints=[joint]) with targets of shape ({wanted}, 1)."
+    ) from error
+
+
+def _explain(struct: Any, value: Any, name: str, error: Exception) -> None:
+    """Raise in better words if it was the batch size of `value` that `error` stopped at."""
+    wanted = int(_mask(struct).sum())
+    value = vectorize_pose(value) if name == "pose" else common.to_tensor(value)
+    if value.ndim < 2 or len(value) in (1, wanted):
+        return
+    reset = (
+        "one for each env that is being reset, len(env_idx)"
+        if wanted != len(struct._objs)
+        else "one for each env that has it"
+    )
+    raise ValueError(
+        f"The {name.replace('_', ' ')} of '{struct.name}' was set with a batch of {len(value)} (shape "
+        f"{tuple(value.shape)}), but {wanted} {'row is' if wanted == 1 else 'rows are'} wanted: {reset}."
+    ) from error
+
+
+# --- SAPIEN's own setters ----------------------------------------------------------------------------
+
+
+_MOTION = "Actor.set_linear_velocity() and Actor.set_angular_velocity()"
+_ROOT = "the Articulation's setters (set_root_pose(), set_root_linear_velocity() ...)"
+GUARDED: dict[type, dict[str, str]] = {
+    sapien.Entity: {"pose": "Actor.set_pose()"},
+    sapien.Component: {"pose": "Actor.set_pose()", "entity_pose": "Actor.set_pose()"},
+    physx.PhysxRigidDynamicComponent: {
+        "linear_velocity": _MOTION,
+        "angular_velocity": _MOTION,
+        "kinematic_target": "Actor.set_pose()",
+    },
+    physx.PhysxArticulation: {
+        "qpos": "Articulation.set_qpos()",
+        "qvel": "Articulation.set_qvel()",
+        "qf": "Articulation.set_qf()",
+        "pose": _ROOT,
+        "root_pose": _ROOT,
+        "root_linear_velocity": _ROOT,
+        "root_angular_velocity": _ROOT,
+    },
+    physx.PhysxArticulationJoint: {
+        "drive_target": "Articulation.set_joint_drive_targets()",
+        "drive_velocity_target": "Articulation.set_joint_drive_velocity_targets()",
+    },
+    physx.PhysxRigidBodyComponent: {
+        "add_force_at_point": "Actor.apply_force()",
+        "add_force_torque": "Actor.apply_force()",
+    },
+}
+"""Properties with a setter of the same name, ``set_...``, and methods; and what to use in their place."""
+
+_strict_systems: weakref.WeakSet[StrictCpuSystem] = weakref.WeakSet()
+"""Asked for their scenes each time, since a restored snapshot gives an env another scene."""
+
+
+def guard_scenes(system: StrictCpuSystem) -> None:
+    """Let the setters of what is in the scenes of `system` raise, once it is laid out."""
+    _install()
+    _strict_systems.add(system)
+
+
+@cache
+def _install() -> None:
+    for owner, names in GUARDED.items():
+        for name, instead in names.items():
+            stock = owner.__dict__[name]
+            if isinstance(stock, property):
+                guarded = _guarded(stock.fset, f"{owner.__name__}.{name} = ...", instead)
+                setattr(owner, name, property(stock.fget, guarded, doc=stock.__doc__))
+                name = f"set_{name}"
+            if name in owner.__dict__:
+                setattr(owner, name, _guarded(owner.__dict__[name], f"{owner.__name__}.{name}()", instead))
+
+
+def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
+    stock = getattr(stock, "__func__", stock)  # pybind11's methods are wrapped in an instancemethod
+
+    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+        if _strict_systems and not sys._getframe(1).f_globals.get("__name__", "").startswith(
+            "workbench.core."
+        ):
+            _refuse(self, called, instead)
+        return stock(self, *args, **kwargs)
+
+    call.__doc__, call.__wrapped__ = stock.__doc__, stock  # type: ignore[attr-defined]
+    return call
+
+
+def _refuse(owner: Any, called: str, instead: str) -> None:
+    entity = _entity(owner)
+    if entity is None or entity.scene is None:
+        return
+    for system in _strict_systems:
+        env = next((i for i, scene in enumerate(system.scenes) if scene is entity.scene), None)
+        if env is None or not system.laid_out:
+            continue
+        name = owner.name if isinstance(owner, physx.PhysxArticulation) else entity.name
+        if system.being_reset is not None and not bool(system.being_reset[env]):
+            system.rules.breaks(
+                "other-env-written",
+                f"{called} on '{name}' writes env {env}, which is not being reset (on the GPU it does nothing). Use "
+                f"{instead} of ManiSkill's object, which sets those that are being reset.",
+            )
+        else:
+            system.rules.breaks(
+                "behind-the-tensors",
+                f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing. Use {instead} "
+                "of ManiSkill's object, which sets all envs, or those that are being reset.",
+            )
+
+
+def _entity(owner: Any) -> Any:
+    """The entity of a physical thing; None for cameras, lights and whatever else has a pose."""
+    if isinstance(owner, physx.PhysxArticulation):
+        return owner.links[0].entity
+    if isinstance(owner, physx.PhysxArticulationJoint):
+        return owner.child_link.entity
+    if isinstance(owner, sapien.Entity):
+        return owner if owner.find_component_by_type(physx.PhysxRigidBaseComponent) is not None else None
+    return owner.entity if isinstance(owner, physx.PhysxRigidBaseComponent) else None

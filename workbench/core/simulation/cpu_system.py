@@ -1,0 +1,461 @@
+"""N CPU physics systems behind the interface of one GPU system.
+
+ManiSkill's GPU code never touches CUDA itself. It talks to one object, ``scene.px``, through
+tensors (``cuda_rigid_body_data``, ``cuda_articulation_qpos`` ...) that it reads after
+``gpu_fetch_*`` and writes before ``gpu_apply_*``. `BatchedCpuSystem` has that interface over N
+separate ``PhysxCpuSystem``s with CPU tensors, so every task runs batched on the CPU through the code
+path that the GPU uses: partial resets, reset masks and all. Each env has its own PhysX scene, so env
+i is exactly what ManiSkill's single CPU env would be, whatever its neighbours do.
+
+What makes it quick:
+
+* A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us)
+  and one gather by index over all envs; a Python getter costs 2 us *a body*. The layout of those
+  bytes is not documented, so it is checked against the getters when the scene is built.
+* An apply writes only what differs from the last fetch: a partial reset touches the bodies of the
+  envs that are reset and wakes nobody else.
+* What few tasks read (link velocities, joint accelerations, joint forces) is fetched when asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.physx as physx
+import torch
+from numpy.typing import NDArray
+
+from workbench.core.simulation.contact_queries import ContactReader, CpuArray, ImpulseQuery
+from workbench.core.simulation.drawn_poses import Places, bodies_elsewhere
+from workbench.core.simulation.mirrors import Group, Mirror, Mirrors, refuse_nan
+from workbench.core.simulation.state_layout import Layout, check_layout, lay_out
+from workbench.core.simulation.stepping import Stepper
+
+_TOO_EARLY = (
+    "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
+    "may be set. Read and write state (poses, qpos, velocities) in _initialize_episode."
+)
+
+
+def _uncommon_member(name: str) -> Any:
+    """What a `BatchedCpuSystem` answers for a member that it does not define.
+
+    Raises:
+        NotImplementedError: SAPIEN has such a member.
+        AttributeError: there is no such member, in SAPIEN neither.
+    """
+    if hasattr(physx.PhysxGpuSystem, name):
+        raise NotImplementedError(
+            f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation has not: here every env has its "
+            "own physics, at its own origin. What all of them share is asked of one: self.scene.px.systems[0]."
+        )
+    raise AttributeError(f"the batched CPU system has no '{name}'")
+
+
+def _applies(mirror: str, keep_awake: bool = False) -> Callable[..., None]:
+    """A ``gpu_apply_*``, of the one of `Mirrors` with this name.
+
+    Refuses SAPIEN's optional buffer of indices in words: not needed here, where what differs from the last fetch is
+    applied, and nothing else is touched anyway.
+    """
+
+    def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
+        if index_buffer is not None:
+            raise NotImplementedError(
+                "gpu_apply_... takes no index buffer in the batched CPU simulation: call it without, it applies the "
+                "rows that were changed."
+            )
+        self._apply(getattr(self._mirrors, mirror), keep_awake)
+
+    return apply
+
+
+class BatchedCpuSystem:
+    """What ManiSkill calls ``scene.px``, over N CPU systems.
+
+    Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
+    D the largest number of degrees of freedom. Poses are world poses of each env's own frame.
+    """
+
+    def __init__(self, scenes: Sequence[sapien.Scene], threads: int | None = None) -> None:
+        self.scenes = list(scenes)
+        self.systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]  # pyright: ignore
+        self.stepper = Stepper(self.systems, self.scenes, threads)
+        self.contacts = ContactReader(self.systems)
+        self._layout: Layout | None = None
+        self._found: Mirrors | None = None
+        self._packed: NDArray[np.float32] | None = None
+        self._posed: NDArray[np.float32] | None = None
+        self._pose_lengths: list[int] = []
+        self._link_pose_at = np.zeros((0, 7), dtype=np.int64)
+        self._version = 0
+        """Grows whenever the simulation may hold other values than were fetched."""
+        self._read_at: dict[str, int] = {}
+        """Which `_version` was read last of what is only read when it is asked for."""
+
+    # `Actor.create_from_entities` and `Link.create` ask isinstance(scene.px, PhysxGpuSystem) to decide
+    # whether a body has a row in the tensors. It has one here; a real subclass would want CUDA.
+    __class__ = property(lambda self: physx.PhysxGpuSystem)  # type: ignore[assignment]
+
+    # --- what sapien's systems have --------------------------------------------------------------
+
+    @property
+    def timestep(self) -> float:
+        return self.systems[0].timestep
+
+    @timestep.setter
+    def timestep(self, value: float) -> None:
+        for system in self.systems:
+            system.timestep = value
+
+    @property
+    def rigid_dynamic_components(self) -> list[physx.PhysxRigidDynamicComponent]:
+        return [c for system in self.systems for c in system.rigid_dynamic_components]
+
+    @property
+    def rigid_static_components(self) -> list[physx.PhysxRigidStaticComponent]:
+        return [c for system in self.systems for c in system.rigid_static_components]
+
+    @property
+    def articulation_link_components(self) -> list[physx.PhysxArticulationLinkComponent]:
+        return [c for system in self.systems for c in system.articulation_link_components]
+
+    def get_scene_offset(self, scene: sapien.Scene) -> NDArray[np.float32]:
+        """(3,) always zero: every env stands at its own origin."""
+        return np.zeros(3, dtype=np.float32)
+
+    def get_contacts(self) -> list[physx.PhysxContact]:
+        raise NotImplementedError(
+            "scene.get_contacts() does not exist in batched simulation (nor on the GPU). Use "
+            "scene.get_pairwise_contact_impulses(a, b) or actor.get_net_contact_impulses()."
+        )
+
+    def step(self) -> None:
+        """One substep of every env."""
+        if self.stepper.step():
+            self._stepped()
+
+    def hold_still(self, envs: Collection[int]) -> None:
+        """From now on PhysX does not step these envs; the others and the task's hooks go on."""
+        self._catch_up()
+        self.stepper.forget()
+        self.stepper.still = frozenset(envs)
+
+    def keep_drives(self, envs: Sequence[int], flags: Sequence[NDArray[np.bool_]]) -> None:
+        """Forget drive targets that were written for these envs while they stood still.
+
+        Args:
+            flags: `drive_flags` as they were before.
+        """
+        rows = np.isin(self._mirrors.targets.envs, envs)
+        for now, was in zip(self.drive_flags, flags, strict=True):
+            now[rows] = was[rows]
+        for targets in (self._mirrors.targets, self._mirrors.velocity_targets):
+            targets.drop()
+        self._fetch("targets")
+
+    @contextmanager
+    def merging(self, substeps: int) -> Iterator[None]:
+        """The next `substeps` calls of `step` may be done together; asking for state does them at once."""
+        with self.stepper.merging(substeps):
+            yield
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        if self.stepper.owes:
+            self.stepper.catch_up()
+            self._stepped()
+
+    def step_start(self) -> None:
+        """A substep at once: without a GPU there is nothing to wait for in `step_finish`."""
+        self.step()
+
+    def step_finish(self) -> None:
+        """Nothing to do: `step_start` stepped."""
+
+    def sync_poses_gpu_to_cpu(self) -> None:
+        """Nothing to do: SAPIEN's entities are the simulation here."""
+
+    # --- building ----------------------------------------------------------------------------------
+
+    def gpu_init(self) -> None:
+        """Lay out the tensors over the bodies that were built; called once a scene is complete."""
+        layout = self._layout = lay_out(self.systems, self.scenes)
+        found = self._found = Mirrors(
+            layout, self._pack, self._link_poses, self._setter, self.stepper.write_before_step
+        )
+        self._qacc = np.zeros_like(found.qpos.now)
+        most_links = max((len(a.links) for a in layout.articulations), default=0)
+        self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
+        self._force, self._torque = np.zeros((2, len(layout.entities), 3), dtype=np.float32)
+        self.cuda_rigid_body_data = _array(found.bodies.now)
+        self.cuda_rigid_dynamic_data = self.cuda_rigid_body_data
+        self.cuda_articulation_link_data = self.cuda_rigid_body_data
+        self.cuda_articulation_qpos = _array(found.qpos.now)
+        self.cuda_articulation_qvel = _array(found.qvel.now)
+        self.cuda_articulation_qf = _array(found.qf.now)
+        self.cuda_articulation_target_qpos = _array(found.targets.now)
+        self.cuda_articulation_target_qvel = _array(found.velocity_targets.now)
+        self.cuda_rigid_body_force = _array(self._force)
+        self.cuda_rigid_body_torque = _array(self._torque)
+        self.cuda_rigid_dynamic_force = self.cuda_rigid_body_force
+        self.cuda_rigid_dynamic_torque = self.cuda_rigid_body_torque
+        check_layout(layout, self._pack(), self._link_poses)
+        for mirror in found.all:
+            mirror.fetch()
+
+    def row_of(self, body: physx.PhysxRigidBodyComponent) -> int:
+        """Row of a dynamic or kinematic body, or of a link, in the (R, 13) tensor."""
+        return self._laid_out.row_of[id(body)]
+
+    def index_of(self, articulation: physx.PhysxArticulation) -> int:
+        """Row of an articulation in the (A, D) tensors."""
+        return self._laid_out.index_of[id(articulation)]
+
+    @property
+    def laid_out(self) -> bool:
+        """Whether the scene is complete; before that nothing has a row."""
+        return self._layout is not None
+
+    @property
+    def _laid_out(self) -> Layout:
+        self._catch_up()
+        if self._layout is None:
+            raise RuntimeError(_TOO_EARLY)
+        return self._layout
+
+    @property
+    def _mirrors(self) -> Mirrors:
+        if self._found is None:
+            raise RuntimeError(_TOO_EARLY)
+        return self._found
+
+    def __getattr__(self, name: str) -> Any:
+        # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
+        if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
+            raise RuntimeError(_TOO_EARLY)
+        return _uncommon_member(name)
+
+    def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
+        """What sets one kind of drive target of a joint."""
+        return getattr(joint, method)
+
+    # --- reading: gpu_fetch_* ----------------------------------------------------------------------
+
+    def _fetch(self, group: Group) -> None:
+        """Read what `group` has from the simulation, over what tasks wrote and did not apply."""
+        for mirror in self._mirrors.of[group]:
+            mirror.fetch()
+
+    def gpu_fetch_rigid_dynamic_data(self) -> None:
+        self._fetch("bodies")
+
+    def gpu_fetch_articulation_link_pose(self) -> None:
+        self._fetch("links")
+
+    def gpu_fetch_articulation_link_velocity(self) -> None:
+        """The root's comes with `gpu_fetch_articulation_link_pose`; see `fetch_link_velocities`."""
+
+    def gpu_fetch_articulation_qpos(self) -> None:
+        self._fetch("joints")
+
+    def gpu_fetch_articulation_qvel(self) -> None:
+        """Comes with `gpu_fetch_articulation_qpos`."""
+
+    def gpu_fetch_articulation_qacc(self) -> None:
+        """Fetched when `cuda_articulation_qacc` is read."""
+
+    def gpu_fetch_articulation_target_qpos(self) -> None:
+        self._fetch("targets")
+
+    def gpu_fetch_articulation_target_qvel(self) -> None:
+        """Comes with `gpu_fetch_articulation_target_qpos`."""
+
+    def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
+        """Fetched when `cuda_articulation_link_incoming_joint_forces` is read."""
+
+    def gpu_update_articulation_kinematics(self) -> None:
+        """Nothing to do: on the CPU, links follow when qpos or the root pose is set."""
+
+    def _unread(self, what: str, things: Iterable[Any]) -> Iterable[Any]:
+        """`things`; none where `what` was read of them since anything moved."""
+        if self._read_at.get(what) == self._version:
+            return ()
+        self._read_at[what] = self._version
+        return things
+
+    @property
+    def cuda_articulation_qacc(self) -> CpuArray:
+        for i, articulation in self._unread("qacc", enumerate(self._laid_out.articulations)):
+            self._qacc[i, : articulation.dof] = articulation.qacc
+        return _array(self._qacc)
+
+    @property
+    def cuda_articulation_link_incoming_joint_forces(self) -> CpuArray:
+        for i, articulation in self._unread("forces", enumerate(self._laid_out.articulations)):
+            forces = articulation.get_link_incoming_joint_forces()
+            self._joint_forces[i, : len(forces)] = forces
+        return _array(self._joint_forces)
+
+    def fetch_link_velocities(self) -> None:
+        """Velocities of all links into columns 7 to 12; two getters a link, so only when asked for."""
+        layout = self._laid_out
+        # Those of roots came with the poses, and may have been written since, as any pose may.
+        now, seen = self._mirrors.links.now, self._mirrors.links.seen
+        for row, link in self._unread("links", zip(layout.link_rows, layout.links, strict=True)):
+            if not link.is_root:
+                now[row, 7:10] = seen[row, 7:10] = link.linear_velocity
+                now[row, 10:13] = seen[row, 10:13] = link.angular_velocity
+
+    def _pack(self) -> NDArray[np.float32]:
+        self._catch_up()
+        if self._packed is None:
+            joined = b"".join(self.stepper.packs())
+            self._packed = np.empty(len(joined) // 4 + 1, dtype=np.float32)
+            self._packed[:-1] = np.frombuffer(joined, dtype=np.float32)
+            self._packed[-1] = 0.0
+        return self._packed
+
+    def _link_poses(self) -> NDArray[np.float32]:
+        """(L, 7) poses of all links: position, quaternion wxyz."""
+        layout = self._laid_out
+        if self._posed is None:
+            packs = self.stepper.pose_packs()
+            lengths = [len(pack) // 4 for pack in packs]
+            if lengths != self._pose_lengths:
+                # Cameras are added after the scene is laid out: each makes its env's pack longer.
+                starts = np.cumsum([0, *lengths[:-1]])
+                rows = layout.link_rows
+                self._link_pose_at = layout.pose_at[rows] + starts[layout.env_of_row[rows]][:, None]
+                self._pose_lengths = lengths
+            self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
+        return self._posed[self._link_pose_at]
+
+    def note_change(self) -> None:
+        """The simulation was written to, here or by a call on one of `systems`: what was packed is old."""
+        self._catch_up()
+        self.stepper.forget()
+        self._moved()
+
+    def _stepped(self) -> None:
+        self.contacts.stepped(self.stepper.still)
+        self._moved()
+
+    def _moved(self) -> None:
+        self._packed = self._posed = None
+        self._version += 1
+        self.contacts.invalidate()
+
+    def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
+        """By env: bodies that the tensor has elsewhere than SAPIEN, and where it has them; see `drawn_poses`."""
+        self._catch_up()
+        if self._layout is None:
+            return {}
+        return bodies_elsewhere(self.scenes, self._layout, self._mirrors.bodies.now, envs)
+
+    def replace(self, env: int, scene: sapien.Scene) -> None:
+        """Another scene, over another system, has all entities of this env now, in the same order."""
+        self.scenes[env] = scene
+        self.systems[env] = scene.physx_system  # pyright: ignore
+        self.stepper.renew(env)
+
+    def articulation(self, index: int) -> Any:
+        """The PhysxArticulation in this row of the (A, D) tensors."""
+        return self._laid_out.articulations[index]
+
+    def packs(self) -> list[bytes]:
+        """``PhysxCpuSystem.pack()`` of every env, as it is now."""
+        self._catch_up()
+        return self.stepper.packs()
+
+    @property
+    def drive_flags(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(A,), (A,) whether position, velocity targets were ever set; see `mirrors.DriveTargets`."""
+        return self._mirrors.targets.driven, self._mirrors.velocity_targets.driven
+
+    # --- writing: gpu_apply_* ----------------------------------------------------------------------
+
+    def _apply(self, mirror: Mirror, keep_awake: bool = False) -> None:
+        """Set in the simulation what tasks wrote and what differs from the last fetch."""
+        changed = mirror.differs().any()
+        if changed:
+            self.note_change()
+        if changed or keep_awake:
+            mirror.apply(keep_awake)
+
+    def apply_changes(self) -> None:
+        """Everything that ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
+        own = self._mirrors
+        for mirror in (
+            own.bodies,
+            own.qpos,
+            own.qvel,
+            own.qf,
+            own.roots,
+            own.root_velocities,
+            *own.of["targets"],
+        ):
+            self._apply(mirror)
+
+    gpu_apply_rigid_dynamic_data = _applies("bodies")
+    gpu_apply_articulation_root_pose = _applies("roots")
+    gpu_apply_articulation_root_velocity = _applies("root_velocities")
+    gpu_apply_articulation_qpos = _applies("qpos")
+    gpu_apply_articulation_qvel = _applies("qvel")
+    gpu_apply_articulation_qf = _applies("qf")
+    gpu_apply_articulation_target_position = _applies("targets", keep_awake=True)
+    gpu_apply_articulation_target_velocity = _applies("velocity_targets", keep_awake=True)
+
+    def gpu_apply_rigid_dynamic_force(self) -> None:
+        self._apply_forces(self._force, "force")
+
+    def gpu_apply_rigid_dynamic_torque(self) -> None:
+        self._apply_forces(self._torque, "torque")
+
+    def drop_writes(self) -> None:
+        """Forget what was written to the tensors and not applied."""
+        for mirror in () if self._found is None else self._found.all:
+            mirror.drop()
+
+    def _apply_forces(self, values: NDArray[np.float32], kind: str) -> None:
+        layout, zero = self._laid_out, np.zeros(3, dtype=np.float32)
+        rows = np.concatenate([layout.body_rows, layout.link_rows]).tolist()
+        for row, body in zip(rows, [*layout.bodies, *layout.links], strict=True):
+            if values[row].any():
+                refuse_nan(values[row], layout.names[row], int(layout.env_of_row[row]))
+                if kind == "force":
+                    body.add_force_torque(values[row], zero)
+                else:
+                    body.add_force_torque(zero, values[row])
+        # PhysX takes a force for one substep; a row left standing would push again at the next apply.
+        values[:] = 0.0
+
+    # --- contacts ----------------------------------------------------------------------------------
+
+    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> ImpulseQuery:
+        return self.contacts.create_body_query(bodies)
+
+    def gpu_create_contact_pair_impulse_query(self, body_pairs: Sequence[Any]) -> ImpulseQuery:
+        return self.contacts.create_pair_query(body_pairs)
+
+    def gpu_query_contact_body_impulses(self, query: ImpulseQuery) -> None:
+        self._catch_up()
+        self.contacts.answer(query)
+
+    gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
+
+
+def _array(values: NDArray[np.float32]) -> CpuArray:
+    return CpuArray(torch.from_numpy(values))
+
+
+def batched_system(scene: Any) -> BatchedCpuSystem | None:
+    """The batched CPU system of a ManiSkillScene, or None for any other scene.
+
+    Not isinstance: `BatchedCpuSystem` answers that question as a ``PhysxGpuSystem`` would.
+    """
+    return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None

@@ -1,0 +1,96 @@
+"""Drawing bodies elsewhere than they stand: where ManiSkill's tensors have them, or where they stood in the past.
+
+ManiSkill's GPU cameras draw the very tensor that poses are written to (``RenderSystemGroup.set_cuda_poses``): every
+dynamic and kinematic actor and every link at its own row, applied or not, and cameras on them likewise. A pose that
+was set in ``evaluate`` is seen and never felt; a body that moved in a step is drawn where it was until the fetch.
+SAPIEN's CPU renderer draws its entities, which know nothing of the tensor. So what the tensor has elsewhere is found
+before each picture, and only what is drawn is moved there: physics does not notice. Static bodies have no row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.render
+from numpy.typing import NDArray
+
+from workbench.core.simulation.state_layout import Layout
+
+Places = Mapping[int, tuple[Any, NDArray[np.float32]]]
+"""Entities and where to draw them (7,), by the ``id`` of the entity, which the value holds."""
+NOWHERE_ELSE: Places = {}
+
+
+def bodies_elsewhere(
+    scenes: Sequence[sapien.Scene], layout: Layout, data: NDArray[np.float32], envs: Sequence[int]
+) -> dict[int, Places]:
+    """The bodies whose row of the tensor is not where SAPIEN draws them: of each of these envs that has such, where the
+    tensor has them.
+
+    Args:
+        data: (R, 13) what ManiSkill calls ``cuda_rigid_body_data``.
+    """
+    # Packed anew, though a fetch may have done it: an entity that was moved by itself is drawn by the tensor too.
+    packs = [scenes[env].pack_poses() for env in envs]
+    starts = np.full(len(scenes), -1, dtype=np.int64)
+    starts[envs] = np.cumsum([0, *(len(pack) // 4 for pack in packs[:-1])])
+    rows = np.flatnonzero(starts[layout.env_of_row] >= 0) if len(envs) < len(scenes) else slice(None)
+    at = layout.pose_at[rows] + starts[layout.env_of_row[rows], None]
+    differs = np.frombuffer(b"".join(packs), dtype=np.float32)[at] != data[rows, :7]
+    if not differs.any():
+        return {}
+    found: dict[int, dict[int, tuple[Any, NDArray[np.float32]]]] = {}
+    for row in np.arange(len(data))[rows][differs.any(axis=1)]:
+        entity = layout.entities[row]
+        found.setdefault(int(layout.env_of_row[row]), {})[id(entity)] = entity, data[row, :7].copy()
+    return dict(found)
+
+
+@contextmanager
+def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callable[[], None]]:
+    """Draw entities at `places`, with the cameras on them, and leave the entities where they are.
+
+    Gives the function that moves what is drawn, to be called after ``update_render``, which draws every entity
+    where it is. Cameras are drawn by ``update_render``, so those on an entity are moved before it.
+
+    Args:
+        components: cameras that may be on one of them.
+    """
+    on_them = [c for c in components if id(c.entity) in places] if places else []
+    cameras = [(c, "local_pose", c.entity.pose.inv() * camera_pose(c, places)) for c in on_them]
+
+    def move_bodies() -> None:
+        for entity, pose in places.values():
+            for drawn in entity.components:
+                if isinstance(drawn, sapien.render.RenderBodyComponent):
+                    drawn._internal_node.set_position(pose[:3])
+                    drawn._internal_node.set_rotation(pose[3:])
+
+    with temporarily(cameras):
+        yield move_bodies
+
+
+@contextmanager
+def temporarily(changes: Iterable[tuple[Any, str, Any]]) -> Iterator[None]:
+    """Within this, attributes (owner, name, value) have other values."""
+    was: list[tuple[Any, str, Any]] = []
+    try:
+        for owner, name, value in changes:
+            was.append((owner, name, getattr(owner, name)))
+            setattr(owner, name, value)
+        yield
+    finally:
+        for owner, name, value in reversed(was):
+            setattr(owner, name, value)
+
+
+def camera_pose(component: Any, places: Places) -> sapien.Pose:
+    """Where a camera is in its env's frame, if the entity that it is on is drawn at `places`."""
+    if id(component.entity) not in places:
+        return component.get_global_pose()
+    pose = places[id(component.entity)][1]
+    return sapien.Pose(pose[:3], pose[3:]) * component.local_pose  # type: ignore[arg-type]

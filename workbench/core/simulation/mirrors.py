@@ -1,0 +1,248 @@
+"""The tensors that tasks write to, each beside what the simulation is known to hold of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+
+from workbench.core.simulation.state_layout import BODY, Layout
+
+Group = Literal["bodies", "links", "joints", "targets", "forces"]
+"""What one ``gpu_fetch_*`` and its ``gpu_apply_*`` carry together."""
+GROUPS: tuple[Group, ...] = get_args(Group)
+Floats = NDArray[np.float32]
+Source = tuple[Any, Callable[[], Floats]]
+"""Where in a tensor numbers of the simulation belong, and what reads them."""
+_MOVED = 1e-4
+"""Metres, radians, per second. PhysX rounds the root pose of an articulation when it is set, by about 1e-7."""
+
+
+class Mirror:
+    """K rows of a tensor (R, W), or some of their columns."""
+
+    def __init__(
+        self,
+        group: Group,
+        what: str,
+        whole: tuple[Floats, Floats],
+        names: list[str],
+        envs: NDArray[np.int64],
+        rows: NDArray[np.int64] | None = None,
+        columns: slice = slice(None),
+        sources: Sequence[Source] = (),
+        owners: Sequence[Any] = (),
+        put: Callable[[Any, Floats, NDArray[np.bool_]], None] = lambda owner, row, differs: None,
+    ) -> None:
+        """
+        Args:
+            what: for a person.
+            whole: (R, W) the tensor, and what the simulation holds of it as far as is known; of all its rows.
+            names, envs: (R,) whose each row is, and of which env.
+            rows: (K,) which are meant; None for all.
+            sources: what a fetch reads; the first says where the rows are now.
+            owners: (K,) SAPIEN's objects, for `put`.
+            put: called with an owner, its row (W,) and which numbers of it are to be set.
+        """
+        self.group: Group = group
+        self.what, self.envs = what, envs
+        self.names = names
+        self.now, self.seen = whole
+        self.rows = np.arange(len(self.now)) if rows is None else rows
+        self.at: Any = columns if rows is None else (rows, columns)
+        self.sources, self._owners, self._put = sources, owners, put
+
+    def differs(self) -> NDArray[np.bool_]:
+        """(K, W) what was written and neither applied nor fetched over; a NaN always is."""
+        return self.now[self.at] != self.seen[self.at]
+
+    def changed(self) -> NDArray[np.int64]:
+        """Which of the K rows hold such a number."""
+        return np.flatnonzero(self.differs().any(axis=1))
+
+    def written(self) -> NDArray[np.bool_]:
+        """As `differs`, but for a NaN of the simulation's own, which differs from itself."""
+        differs = self.differs()
+        if differs.any():
+            differs &= ~(np.isnan(self.now[self.at]) & np.isnan(self.seen[self.at]))
+        return differs
+
+    def fetch(self) -> None:
+        """Hold what the simulation holds."""
+        for at, read in self.sources:
+            self.now[at] = self.seen[at] = read()
+
+    def drop(self) -> None:
+        """Forget what was written and not applied."""
+        self.now[self.at] = self.seen[self.at]
+
+    def behind(self) -> NDArray[np.bool_]:
+        """(K, W) or fewer columns: what the simulation moved since it was fetched."""
+        at, read = self.sources[0]
+        return np.abs(self.now[at] - read()) > _MOVED
+
+    def apply(self, keep_awake: bool) -> None:
+        """Set what differs, and nothing else.
+
+        Raises:
+            ValueError: of a row that is to be set a number is NaN or infinite.
+        """
+        now, differs = self.now[self.at], self.differs()
+        for i in np.flatnonzero(differs.any(axis=1)).tolist():
+            refuse_nan(now[i], self.names[int(self.rows[i])], int(self.envs[self.rows[i]]))
+            self._put(self._owners[i], now[i], differs[i])
+        self.seen[self.at] = now
+
+
+class DriveTargets(Mirror):
+    """Position, or velocity, targets of the joints of every articulation, which are written otherwise than the rest.
+
+    A target that is set wakes a sleeping articulation even when its value stays, and ManiSkill's CPU controllers set
+    theirs on every control step. So what was ever driven is written at every apply, or a robot at rest would fall asleep
+    here and not there; and what nobody ever drove must not be, since it would never sleep. And they are many, 1200
+    calls a control step of 64 Pandas: in the envs' threads, just before the step, they cost nobody's waiting.
+    """
+
+    def __init__(
+        self,
+        *mirror: Any,
+        sources: Sequence[Source],
+        setters: Sequence[Sequence[Callable[[float], None]]],
+        later: Callable[[Callable[[int], None]], None],
+    ) -> None:
+        """
+        Args:
+            setters: of each articulation, of each of its active joints: what sets the target in PhysX.
+            later: takes what writes the targets of one env, to be called before its next step.
+        """
+        super().__init__("targets", *mirror, sources=sources)
+        self.driven = np.zeros(len(self.now), dtype=bool)
+        """(A,) whether they were ever set."""
+        self._setters, self._later = setters, later
+        self._of_env = {int(env): np.flatnonzero(self.envs == env).tolist() for env in np.unique(self.envs)}
+
+    def apply(self, keep_awake: bool) -> None:
+        """Take what was written.
+
+        Args:
+            keep_awake: write the targets of all that was ever driven, not only those that changed.
+
+        Raises:
+            ValueError: one of them is NaN or infinite.
+        """
+        changed = self.differs().any(axis=1)
+        self.driven |= changed
+        chosen = np.flatnonzero(self.driven if keep_awake else changed).tolist()
+        if not np.isfinite(self.now).all():
+            for i in chosen:
+                refuse_nan(self.now[i], self.names[i], int(self.envs[i]))
+        self.seen[:] = self.now
+        values, written = self.now.tolist(), set(chosen)
+
+        def write(env: int) -> None:
+            for i in self._of_env.get(env, ()):
+                if i in written:
+                    for set_target, value in zip(self._setters[i], values[i], strict=False):
+                        set_target(value)
+
+        self._later(write)
+
+
+class Mirrors:
+    """Those of all tensors of a scene."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        pack: Callable[[], Floats],
+        link_poses: Callable[[], Floats],
+        setter: Callable[[Any, str], Callable[[float], None]],
+        later: Callable[[Callable[[int], None]], None],
+    ) -> None:
+        """
+        Args:
+            pack: gives the packs of all envs as they are now, and the zero behind them; see `cpu_layout`.
+            link_poses: gives the poses (L, 7) of all links.
+            setter: what sets a drive target of a joint, by the name of SAPIEN's method.
+            later: as for `DriveTargets`.
+        """
+        data, joints = _twin((len(layout.entities), BODY)), layout.qpos_at.shape
+        rigid = data, layout.names, layout.env_of_row
+        jointed = layout.articulation_names, layout.env_of_row[layout.root_rows]
+        roots, robots = layout.root_rows, layout.articulations
+        poses, velocities = slice(0, 7), slice(7, None)
+        root_in_links = np.searchsorted(layout.link_rows, roots)
+
+        def packed(at: NDArray[np.int64], where: Any = slice(None)) -> tuple[Source]:
+            return ((where, lambda: pack()[at]),)
+
+        def of_joints(group: Group, what: str, sources: Sequence[Source], put: str) -> Mirror:
+            def put_row(articulation: Any, row: Floats, differs: Any) -> None:
+                getattr(articulation, put)(row[: articulation.dof])
+
+            return Mirror(group, what, _twin(joints), *jointed, sources=sources, owners=robots, put=put_row)
+
+        def of_targets(what: str, at: NDArray[np.int64], put: str) -> DriveTargets:
+            setters = [[setter(joint, put) for joint in robot.active_joints] for robot in robots]
+            return DriveTargets(
+                what, _twin(joints), *jointed, sources=packed(at), setters=setters, later=later
+            )
+
+        bodies = layout.body_rows, slice(None), packed(layout.body_at, layout.body_rows)
+        self.bodies = Mirror("bodies", "state", *rigid, *bodies, layout.bodies, _put_body)
+        of_roots = (((roots, poses), lambda: link_poses()[root_in_links]),)
+        self.roots = Mirror("links", "state", *rigid, roots, poses, of_roots, robots, _put_root_pose)
+        moving = packed(layout.root_at[:, 7:], (roots, velocities))
+        self.root_velocities = Mirror(
+            "links", "state", *rigid, roots, velocities, moving, robots, _put_root_velocity
+        )
+        links = ((layout.link_rows, poses), link_poses), *moving
+        self.links = Mirror("links", "state", *rigid, layout.link_rows, sources=links)
+        self.qpos = of_joints("joints", "qpos", packed(layout.qpos_at), "set_qpos")
+        self.qvel = of_joints("joints", "qvel", packed(layout.qvel_at), "set_qvel")
+        self.qf = of_joints("forces", "joint forces (qf)", (), "set_qf")
+        self.targets = of_targets("drive targets", layout.target_qpos_at, "set_drive_target")
+        self.velocity_targets = of_targets(
+            "drive velocity targets", layout.target_qvel_at, "set_drive_velocity_target"
+        )
+        self.all: tuple[Mirror, ...] = (
+            *(self.bodies, self.links, self.qpos, self.qvel, self.qf),
+            *(self.targets, self.velocity_targets),
+        )
+        """Each number once; `roots` and `root_velocities` are of `links`."""
+        self.of = {group: [mirror for mirror in self.all if mirror.group == group] for group in GROUPS}
+        """What is fetched together."""
+
+
+def _twin(shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+    return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+
+
+def _put_body(body: Any, row: Floats, differs: NDArray[np.bool_]) -> None:
+    if differs[:7].any():
+        body.entity.pose = _pose(row)
+    if differs[7:].any() and not body.kinematic:
+        body.linear_velocity = row[7:10]
+        body.angular_velocity = row[10:13]
+
+
+def _put_root_pose(articulation: Any, row: Floats, differs: NDArray[np.bool_]) -> None:
+    articulation.links[0].pose = _pose(row)
+
+
+def _put_root_velocity(articulation: Any, row: Floats, differs: NDArray[np.bool_]) -> None:
+    articulation.set_root_linear_velocity(row[:3])
+    articulation.set_root_angular_velocity(row[3:])
+
+
+def _pose(row: Floats) -> sapien.Pose:
+    return sapien.Pose(row[:3], row[3:7])  # type: ignore[arg-type]  # the stubs want a literal shape
+
+
+def refuse_nan(values: Floats, name: str, env: int) -> None:
+    # PhysX does not check: a NaN pose spreads to everything it touches and may crash the process.
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} of env {env}: the state to be set holds NaN or infinity: {values}")

@@ -1,0 +1,501 @@
+"""The simulation state of chosen envs of a `BatchedCpuSystem`: read, and written into the same or other envs.
+
+``PhysxCpuSystem.pack()`` has the pose and velocity of every body, qpos, qvel and the drive targets of an
+env, and ``unpack()`` writes them; after a control step the bytes are there already. What is added here:
+
+* *Names.* The bytes of two envs mean the same only if the envs are built alike. `Contents` says what
+  they mean, by the names that the rest of the workbench uses; where they differ (another task, an object more,
+  an arm with another joint), the bytes for the target are put together from its own and the source's.
+* *Sleep.* Writing a pose wakes a body, and a body at rest that wakes moves by some micrometres before it
+  sleeps again. What slept is put to sleep again. Every body is asked, 2 us each: a velocity in the pack does
+  not mean that one is awake (cubes of StackCube fall asleep with some left, and keep it).
+* *Forces* that ``set_qf`` left on the joints, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
+* *Contacts.* PhysX lists contacts of the last substep only, so after a restore its list is that of another
+  moment, and ``is_grasping`` would answer for it. The impulses that the task's queries count go along, and are
+  what the queries see until the next substep.
+* *Hidden objects* are drawn 99999 m away; it is their true pose that is kept.
+
+``unpack`` does not quite give back the bits that ``pack`` gave (`_settle_roots`). What PhysX keeps to itself
+is described in `snapshot`, and below.
+
+A new PhysX scene under an env that stays: the one way to make PhysX forget what it did before.
+
+PhysX solves contacts one after the other, and their order follows the numbers that it gave to pairs of
+shapes. Numbers of pairs that came apart are given out again, last returned first, so the order, and with it
+the last bits of every result, depends on all that was ever touched in that scene. No call takes it back, not
+``unpack``, not moving everything apart and together again (tried: the order turns round each time). In a grasp
+that is visible at once: the same state, written twice into the same env, went on differently in five of
+eight envs.
+
+A scene that was just made has no such history, and making one is cheap: what is expensive in an env are its
+meshes, materials, bodies and pictures, and they belong to the entities. So the entities of the env are taken
+out of their ``sapien.Scene`` and put, in the same order, into a new one with a new ``PhysxCpuSystem`` and the
+same ``RenderSystem``: 0.2 ms for a Panda, a table and a cube. SAPIEN's components stay the same Python
+objects, so nothing that ManiSkill or the task holds is out of date.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.physx as physx
+from numpy.typing import NDArray
+
+from workbench.core.scene.scene_index import hidden_poses, once_a_scene, scene_index
+from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
+from workbench.core.simulation.state_layout import BODY
+
+_ATTEMPTS = 4
+"""How often a root pose is asked for; in all tasks that were tried, two were enough."""
+_TRIES = 40
+"""How often a state is looked for that reads back as it was written; all but some humanoids need one."""
+_LAST_BIT = np.float32(2**-24)
+"""Of the numbers of a quaternion, and of a metre."""
+_FAR = np.float32(99999)
+"""By how much ``Actor.hide_visual`` moves an actor along each axis, metres."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A body or an articulation in the packed state of an env."""
+
+    name: str
+    joints: tuple[str, ...] | None
+    """Names of the active joints of an articulation; None for a body."""
+
+    @property
+    def size(self) -> int:
+        """How many float32 it takes."""
+        return BODY + (0 if self.joints is None else 4 * len(self.joints))
+
+    def __str__(self) -> str:
+        return f"{'actor' if self.joints is None else 'articulation'} {self.name}"
+
+
+Contents = tuple[Part, ...]
+"""What the packed state of one env holds, in its order: bodies, then articulations."""
+
+
+@dataclass(frozen=True)
+class CpuState:
+    """The simulation state of n envs, as columns."""
+
+    contents: tuple[Contents, ...]
+    """(n,)"""
+    packed: tuple[bytes, ...]
+    """(n,) as ``PhysxCpuSystem.pack()`` gives it; hidden actors where they really are."""
+    asleep: tuple[tuple[bool, ...], ...]
+    """(n,) one for each of its `contents`."""
+    qf: NDArray[np.float32]
+    """(A, D) joint forces of their articulations, env after env, padded with zeros."""
+    driven: NDArray[np.bool_]
+    """(2, A) whether position and velocity targets were ever set."""
+    touching: tuple[tuple[int, str, str], ...]
+    """(T,) contacts that a query counts: which of the n envs, and the names of two bodies."""
+    impulses: NDArray[np.float32]
+    """(T, 3) N s on the first body of each."""
+
+    def articulations(self, k: int) -> slice:
+        """Which of `qf` are env k's."""
+        first = sum(_articulations(contents) for contents in self.contents[:k])
+        return slice(first, first + _articulations(self.contents[k]))
+
+    def essence(self, k: int) -> tuple[Any, ...]:
+        """What is equal where PhysX would say the same of env k."""
+        rows = self.articulations(k)
+        numbers = self.qf[rows].tobytes(), self.driven[:, rows].tobytes()
+        return self.contents[k], self.packed[k], self.asleep[k], *numbers
+
+
+def _articulations(contents: Contents) -> int:
+    return sum(part.joints is not None for part in contents)
+
+
+@dataclass
+class CpuStatePlan:
+    """What of a built scene belongs to which env."""
+
+    contents: list[Contents]
+    """Of each env; envs that are alike share one object."""
+    sleepers: list[list[tuple[int, Callable[[], bool], Any]]]
+    """Of each env: index into its contents, whether it sleeps, the component that can be put to sleep."""
+    articulations: list[range]
+    """Of each env: its rows in the (A, D) tensors."""
+    names: dict[int, tuple[int, str]]
+    """Env and name of a body, by the ``id`` of its component."""
+    bodies: list[dict[str, int]]
+    """Of each env: the ``id`` of the component, by name."""
+    held: list[Any]
+    """Objects whose ids are used: pybind11 gives an id anew once its object is gone."""
+    offsets: dict[int, tuple[int, int]]
+    """Env and offset in its packed floats of an actor, by the slot of its entity (`SceneIndex`)."""
+    settled: list[dict[int, tuple[bytes, bytes]]]
+    """Of each env, by offset in its packed bytes: a root pose that was wanted, and which was asked for to get it."""
+
+
+@once_a_scene
+def plan_cpu_state(env: Any) -> CpuStatePlan:
+    """What `read_cpu_state` and `write_cpu_state` need to know of the scene that an env has now."""
+    px = batched_system(env.scene)
+    assert px is not None, "only for the batched CPU simulation"
+    scene = scene_index(env)
+
+    def name_of(component: Any) -> str:
+        return scene.name_of(component) or component.entity.name
+
+    alike: dict[Contents, Contents] = {}
+    plan = CpuStatePlan([], [], [], {}, [], [], {}, [{} for _ in px.systems])
+    first_articulation = 0
+    for index, system in enumerate(px.systems):
+        bodies, links = system.rigid_dynamic_components, system.articulation_link_components
+        statics = system.rigid_static_components
+        plan.held += [*bodies, *links, *statics]
+        by_name = {name_of(c): id(c) for c in [*statics, *links, *bodies]}
+        plan.bodies.append(by_name)
+        plan.names.update({component: (index, name) for name, component in by_name.items()})
+        parts, sleepers = [], []
+        for body in bodies:
+            if id(body.entity) in scene.slot_of:
+                plan.offsets[scene.slot_of[id(body.entity)]] = index, sum(part.size for part in parts)
+            if not body.kinematic:
+                sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
+            parts.append(Part(name_of(body), None))
+        roots = [link for link in links if link.is_root]
+        for root in roots:
+            articulation: Any = root.articulation
+            name = name_of(root).rpartition("/")[0] or articulation.name
+            sleepers.append((len(parts), _getter(root, "sleeping"), root))
+            # SAPIEN's "scene-0_panda" has joints that are called "scene-0-panda_panda_joint1".
+            prefix = articulation.name.replace("_", "-", 1) + "_"
+            joints = tuple(joint.name.removeprefix(prefix) for joint in articulation.active_joints)
+            parts.append(Part(name, joints))
+        contents = tuple(parts)
+        plan.contents.append(alike.setdefault(contents, contents))
+        plan.sleepers.append(sleepers)
+        plan.articulations.append(range(first_articulation, first_articulation + len(roots)))
+        first_articulation += len(roots)
+    return plan
+
+
+def _getter(component: Any, name: str) -> Callable[[], bool]:
+    # Asked for every body at every snapshot: past the look-up of the property.
+    return partial(getattr(type(component), name).fget, component)
+
+
+def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
+    """The simulation state of the envs in `env_idx`."""
+    px: BatchedCpuSystem = env.scene.px
+    plan = plan_cpu_state(env)
+    packs = [*px.packs()]
+    for i, hidden in _hidden(env, plan).items():
+        numbers = np.frombuffer(packs[i], dtype=np.float32).copy()
+        for offset, pose in hidden:
+            numbers[offset : offset + 7] = pose[[3, 4, 5, 6, 0, 1, 2]]
+        packs[i] = numbers.tobytes()
+    awake = {len(contents): (False,) * len(contents) for contents in plan.contents}
+    asleep = []
+    for i in env_idx:
+        sleeping = {part for part, is_asleep, _ in plan.sleepers[i] if is_asleep()}
+        parts = len(plan.contents[i])
+        asleep.append(tuple([part in sleeping for part in range(parts)]) if sleeping else awake[parts])
+    rows = [row for i in env_idx for row in plan.articulations[i]]
+    touches = _touching(px, plan, env_idx)
+    return CpuState(
+        contents=tuple([plan.contents[i] for i in env_idx]),
+        packed=tuple([packs[i] for i in env_idx]),
+        asleep=tuple(asleep),
+        qf=px.cuda_articulation_qf.torch().numpy()[rows],
+        driven=np.stack(px.drive_flags)[:, rows],
+        touching=tuple([touch for touch, _ in touches]),
+        impulses=np.array([impulse for _, impulse in touches], np.float32).reshape(-1, 3),
+    )
+
+
+def write_cpu_state(
+    env: Any, env_idx: list[int], state: CpuState, positions: list[int], fresh_physics: bool
+) -> tuple[dict[str, None], dict[str, str]]:
+    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``; the other envs are not touched. The tensors are fetched.
+
+    Returns:
+        What was carried, and what was not with the reason, each by the words that name it.
+    """
+    carried: dict[str, None] = {}
+    missed: dict[str, str] = {}
+    px: BatchedCpuSystem = env.scene.px
+    plan = plan_cpu_state(env)
+    own = px.packs()
+    for i in env_idx:
+        for _, _, component in plan.sleepers[i]:
+            # Or the time until it falls asleep would depend on what it touched before: a cube that was in
+            # a hand fell asleep one substep later than one that was not.
+            component.put_to_sleep()
+    if fresh_physics:
+        for i in renew_physics(env.scene, env_idx):
+            missed[f"fresh physics of env {i}"] = "entities were removed from its scene since it was built"
+    hidden = _hidden(env, plan)
+    packed: dict[int, bytes] = {}
+    matches: dict[int, Sequence[int | None]] = {}
+    alike: dict[int, Contents] = {}
+    for i, k in zip(env_idx, positions, strict=True):
+        contents, packed[i] = plan.contents[i], state.packed[k]
+        if state.contents[k] == contents:
+            alike[id(contents)], matches[i] = contents, range(len(contents))
+        else:
+            packed[i], matches[i] = _joined(contents, own[i], state, k, carried, missed)
+        if i in hidden:
+            packed[i] = _hide(packed[i], hidden[i])
+    _unpack(px, plan, packed)
+    _write_joint_forces(px, plan, dict(zip(env_idx, positions, strict=True)), state, matches, fresh_physics)
+    touches: dict[int, list[tuple[str, str, Any]]] = {}
+    for (k, first, second), impulse in zip(state.touching, state.impulses, strict=True):
+        touches.setdefault(k, []).append((first, second, impulse))
+    for i, k in zip(env_idx, positions, strict=True):
+        slept = {part.name for part, asleep in zip(state.contents[k], state.asleep[k], strict=True) if asleep}
+        for part, _, component in plan.sleepers[i] if slept else ():
+            if plan.contents[i][part].name in slept:
+                component.put_to_sleep()
+        ids = plan.bodies[i]
+        known = [touch for touch in touches.get(k, ()) if touch[0] in ids and touch[1] in ids]
+        px.contacts.carry(i, [((ids[a], ids[b]), impulse) for a, b, impulse in known])
+    env.scene._gpu_fetch_all()
+    carried.update({str(part): None for contents in alike.values() for part in contents})
+    return carried, missed
+
+
+def begin_cpu_state_anew(env: Any, env_idx: list[int]) -> None:
+    """Give these envs a PhysX scene without a past, and the state that they have.
+
+    What follows can then be had again to the last bit, from a snapshot of now and the same actions. A root of an
+    articulation that PhysX does not give back as it is set is moved by some last bits, to where it does.
+    """
+    left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
+    positions = list(range(len(env_idx)))
+    for attempt in range(_TRIES):
+        write_cpu_state(env, left, state, positions, fresh_physics=True)
+        found = read_cpu_state(env, left)
+        other = [j for j, k in enumerate(positions) if found.packed[j] != state.packed[k]]
+        if not other:
+            return
+        left, state, positions = [left[j] for j in other], found, other
+        if attempt > 0:
+            moved = {k: _nudged(found.contents[k], found.packed[k], dice) for k in other}
+            state = replace(found, packed=tuple(moved.get(k, was) for k, was in enumerate(found.packed)))
+
+
+def _nudged(contents: Contents, packed: bytes, dice: np.random.Generator) -> bytes:
+    numbers = np.frombuffer(packed, dtype=np.float32).copy()
+    at = 0
+    for part in contents:
+        if part.joints is not None:
+            numbers[at : at + 7] += _LAST_BIT * dice.integers(-2, 3, 7).astype(np.float32)
+        at += part.size
+    return numbers.tobytes()
+
+
+def _unpack(px: BatchedCpuSystem, plan: CpuStatePlan, packed: dict[int, bytes]) -> None:
+    """Put packed states into envs, so that each reads back as it was packed."""
+    for i, wanted in packed.items():
+        px.systems[i].unpack(_asked_for(plan, i, wanted))
+    px.note_change()
+    got = px.packs()
+    unsettled = [i for i, wanted in packed.items() if got[i] != wanted]
+    for i in unsettled:
+        _settle_roots(px, plan, i, packed[i])
+    if unsettled:
+        px.note_change()
+
+
+def _write_joint_forces(
+    px: BatchedCpuSystem,
+    plan: CpuStatePlan,
+    sources: dict[int, int],
+    state: CpuState,
+    matches: dict[int, Sequence[int | None]],
+    fresh_physics: bool,
+) -> None:
+    """Put ``set_qf``'s forces and the drives' flags back into each env; `matches` as of `_joined`."""
+    rows, theirs = [], []
+    firsts = list(accumulate(map(_articulations, state.contents), initial=0))
+    for i, k in sources.items():
+        bodies, their_bodies = (len(c) - _articulations(c) for c in (plan.contents[i], state.contents[k]))
+        first = firsts[k] - their_bodies
+        for row, match in zip(plan.articulations[i], matches[i][bodies:], strict=True):
+            if match is not None:
+                rows.append(row)
+                theirs.append(first + match)
+    qf = px.cuda_articulation_qf.torch().numpy()
+    width = min(qf.shape[1], state.qf.shape[1])
+    qf[rows, :width] = state.qf[theirs, :width]
+    for flags, was in zip(px.drive_flags, state.driven, strict=True):
+        flags[rows] = was[theirs]
+    px.gpu_apply_articulation_qf()
+    if fresh_physics and qf.any():
+        for row in (row for i in sources for row in plan.articulations[i]):
+            if qf[row].any():  # a new scene has none, though the tensor may not have changed
+                px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
+
+
+def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
+    """The bytes to unpack for `packed` to be read: with the roots that `_settle_roots` found, where it did."""
+    for at, (wanted, asked) in plan.settled[env].items():
+        if packed[at : at + len(wanted)] == wanted:
+            packed = packed[:at] + asked + packed[at + len(wanted) :]
+    return packed
+
+
+def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: bytes) -> None:
+    """Make articulations' root poses read back as they were packed.
+
+    PhysX keeps a root by its centre of mass, and what it gives back differs in the last bit from what it was
+    given; over many snapshots of snapshots that adds up. What differs is asked for that much further off. The
+    last answer is kept: most roots stand still.
+    """
+    numbers = np.frombuffer(packed, dtype=np.float32)
+    at = sum(part.size for part in plan.contents[env] if part.joints is None)
+    roots = [part for part in plan.contents[env] if part.joints is not None]
+    for row, part in enumerate(roots, plan.articulations[env].start):
+        articulation = px.articulation(row)
+        wanted = numbers[at : at + 7]
+        asked = wanted
+        for _ in range(_ATTEMPTS):
+            got = _packed_pose(articulation.root_pose)
+            if np.array_equal(got, wanted):
+                break
+            asked = asked + (wanted - got)
+            articulation.root_pose = sapien.Pose(asked[4:], asked[:4])  # type: ignore[arg-type]
+        else:
+            asked = wanted
+        if asked is not wanted:
+            plan.settled[env][at * wanted.itemsize] = wanted.tobytes(), asked.tobytes()
+        at += part.size
+
+
+def _packed_pose(pose: sapien.Pose) -> NDArray[np.float32]:
+    return np.concatenate([pose.q, pose.p])
+
+
+def _joined(
+    contents: Contents,
+    own: bytes,
+    state: CpuState,
+    k: int,
+    carried: dict[str, None],
+    missed: dict[str, str],
+) -> tuple[bytes, list[int | None]]:
+    """The bytes for an env that is built otherwise than env k of `state`, and for each of its parts the source's index."""
+    numbers = np.frombuffer(own, dtype=np.float32).copy()
+    parts, theirs = state.contents[k], np.frombuffer(state.packed[k], dtype=np.float32)
+    starts = np.cumsum([0, *(part.size for part in parts)])
+    index_of = {(part.name, part.joints is None): k for k, part in enumerate(parts)}
+    matches: list[int | None] = []
+    at = 0
+    for part in contents:
+        source = index_of.pop((part.name, part.joints is None), None)
+        if source is None:
+            missed[str(part)] = "the snapshot has none of this name: left as it is"
+        elif parts[source].joints != part.joints:
+            missed[str(part)] = "its joints are others than in the snapshot: left as it is"
+            source = None
+        else:
+            numbers[at : at + part.size] = theirs[starts[source] : starts[source] + part.size]
+            carried[str(part)] = None
+        matches.append(source)
+        at += part.size
+    for source in index_of.values():
+        missed[str(parts[source])] = "this env has none of this name"
+    return numbers.tobytes(), matches
+
+
+def _touching(
+    px: BatchedCpuSystem, plan: CpuStatePlan, env_idx: list[int]
+) -> list[tuple[tuple[int, str, str], NDArray[np.float32]]]:
+    position = {i: k for k, i in enumerate(env_idx)}
+    found = []
+    for (first, second), impulse in px.contacts.counted():
+        # Only bodies of this scene have names; ManiSkill's queries know no others.
+        if first in plan.names and second in plan.names and plan.names[first][0] in position:
+            index, name = plan.names[first]
+            found.append(((position[index], name, plan.names[second][1]), impulse))
+    return found
+
+
+def _hidden(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:
+    """Of each env with hidden actors: their offsets in its packed floats, and the poses [p, q] that are kept of them."""
+    found: dict[int, list[tuple[int, NDArray[np.float32]]]] = {}
+    for slots, poses in hidden_poses(env):
+        for slot, pose in zip(slots.tolist(), poses, strict=True):
+            if slot in plan.offsets:
+                index, offset = plan.offsets[slot]
+                found.setdefault(index, []).append((offset, pose))
+    return found
+
+
+def _hide(packed: bytes, hidden: list[tuple[int, NDArray[np.float32]]]) -> bytes:
+    numbers = np.frombuffer(packed, dtype=np.float32).copy()
+    for offset, kept in hidden:
+        pose = numbers[offset : offset + 7]
+        kept[:] = pose[[4, 5, 6, 0, 1, 2, 3]]
+        pose[4:] += _FAR
+    return numbers.tobytes()
+
+
+# --- physics without a past --------------------------------------------------------------------------
+
+
+def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
+    """Give these envs of a batched CPU scene a PhysX scene without a past.
+
+    Poses, velocities and drive targets stay; joint forces (``set_qf``) and contacts are gone.
+
+    Args:
+        scene: the env's ``ManiSkillScene``, over a `BatchedCpuSystem`.
+
+    Returns:
+        Envs that were left as they are: entities were removed from them since they were built, so that SAPIEN
+        would give the others new numbers, by which ManiSkill's segmentation pictures name them.
+    """
+    px: BatchedCpuSystem = scene.px
+    px.packs()  # substeps that are still owed are made by the old systems
+    default = physx.get_scene_config()
+    left = [i for i in env_idx if not _is_numbered_anew_alike(px.scenes[i])]
+    try:
+        for i in sorted(set(env_idx) - set(left)):
+            old = px.systems[i]
+            # A system takes its gravity and solver from the process's default, which is another env's by now.
+            physx.set_scene_config(old.config)
+            system = physx.PhysxCpuSystem()
+            system.timestep = old.timestep
+            scene.sub_scenes[i] = _moved(px.scenes[i], system)
+            px.replace(i, scene.sub_scenes[i])
+    finally:
+        physx.set_scene_config(default)
+    px.note_change()
+    return left
+
+
+def _is_numbered_anew_alike(scene: sapien.Scene) -> bool:
+    return [entity.per_scene_id for entity in scene.entities] == [*range(1, len(scene.entities) + 1)]
+
+
+def _moved(old: sapien.Scene, system: physx.PhysxCpuSystem) -> sapien.Scene:
+    """A scene over `system` that has all entities of `old`, in their order, and its render system."""
+    entities = old.entities
+    new = sapien.Scene([system, *_render_systems(old)])
+    for entity in entities:
+        entity.remove_from_scene()
+    for entity in entities:
+        new.add_entity(entity)
+    return new
+
+
+def _render_systems(scene: sapien.Scene) -> list[Any]:
+    try:
+        return [scene.render_system]
+    except RuntimeError:
+        return []  # made without rendering; SAPIEN offers no way to ask

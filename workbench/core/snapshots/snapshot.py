@@ -1,0 +1,312 @@
+"""Snapshots of chosen envs: everything that decides how an episode goes on, kept and put back.
+
+A simulation state alone does not decide it. What does is gathered from five places: PhysX's bodies, joints
+and drive targets (`cpu_state`), controllers and whatever tensors the task keeps on itself (`task_buffers`), steps
+elapsed, and the random generators (`episode_rng`). All of it is copied a row an env, so the state of one env
+can be put back where it was, into another env, into all, or by name into an env that was built anew.
+
+How exact that is. *Two restores of a snapshot go on alike*, to the last bit, whatever the env did in between,
+because a restored env gets a PhysX scene without a past (`cpu_state`); so who wants a run that can be gone back
+to exactly restores each snapshot right after it was taken. *A restore goes on as the uninterrupted run did* except
+for what PhysX keeps to itself: contact caches, the order in which it solves contacts, and the last bit of an
+articulation's root, which it holds by its centre of mass and rounds when it is set. Nothing else is missing: an
+uninterrupted run whose bodies are moved into a new scene, with no number written, goes on as the restored one does
+(tested). How far that goes hangs on what touches, five steps later: nothing for a cart-pole, 1e-3 rad of a joint where a
+hand holds or pushes, 2e-2 rad for a humanoid that lies, and no bound where a fall or a slip hangs on it (``tests/benchmarks/restore_distance.py`` measures it by kind of task,
+``web_assets/docs/task_ids.md`` has every task's figures). Writing the state some steps earlier and making those
+steps again before it is written does not help: what is written takes the contacts with it. What helps is to write only
+at an *exact point* (`begin_anew`, or right after a restore), and to make every step since then again: that gives
+the moment to the last bit. The session goes back so (`session.worker.go_back`).
+
+Control steps of some envs of a batch, while the others stand still and notice nothing.
+
+The task's code is batched: its hooks run for all envs or for none. But PhysX has a scene an env on the CPU, and those
+of the envs that are to stand still are simply not stepped. What the hooks did to them meanwhile (a step more
+counted, targets of a robot, a buffer) is put back from a snapshot that was taken before. Their physics is only put
+back where somebody wrote to it: a state that is written, even the one that is there, wakes what slept and goes on
+otherwise in the last bits.
+
+In GPU simulation all envs are in one scene and all step; there the others are put back from the snapshot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.core import maniskill_private
+from workbench.core.env_numbers import env_numbers, envs_of_batch
+from workbench.core.simulation.cpu_system import batched_system
+from workbench.core.snapshots.cpu_state import CpuState, begin_cpu_state_anew, read_cpu_state, write_cpu_state
+from workbench.core.snapshots.gpu_state import GpuState, read_gpu_state, write_gpu_state
+from workbench.core.snapshots.rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
+from workbench.core.snapshots.task_state import TaskState, read_task_state, write_task_state
+
+
+class Memory(NamedTuple):
+    """What is not in the simulation: n envs of a batch of N."""
+
+    elapsed_steps: NDArray[np.int32]
+    """(n,) control steps since each env's reset."""
+    episode_seeds: NDArray[np.int64]
+    """(n,) as `seams.episode_seeds`."""
+    rng: dict[str, list[RngState]]
+    """(n,) each: ManiSkill's generators of each env, by purpose."""
+    task: TaskState
+    shared_rng: SharedRng
+
+
+class Snapshot(NamedTuple):
+    """Chosen envs at one moment. Holds copies only: it can be pickled, and outlives its env."""
+
+    num_envs: int
+    """N, of the env that it was taken of."""
+    env_idx: tuple[int, ...]
+    """(n,) which of them."""
+    simulation: CpuState | GpuState
+    memory: Memory
+
+    @property
+    def omitted(self) -> dict[str, str]:
+        """What the task remembers and could not be kept: path and reason."""
+        return self.memory.task.omitted
+
+
+@dataclass(frozen=True)
+class RestoreReport:
+    """What a restore carried: actors, articulations, and attributes of the task by path."""
+
+    carried: tuple[str, ...]
+    not_carried: dict[str, str]
+    """Name and reason; empty when a snapshot is put back where it was taken."""
+
+
+def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snapshot:
+    """Copy the state of the envs in `env_idx`, or of all.
+
+    Args:
+        env: a ManiSkill env, batched on the CPU or on the GPU, reset at least once; wrappers are looked through.
+
+    Raises:
+        IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
+        NotImplementedError: a stock CPU env.
+    """
+    env = maniskill_private.open_env(env)
+    chosen = envs_of_batch(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
+    px = batched_system(env.scene)
+    if px is not None:
+        simulation: Any = read_cpu_state(env, chosen)
+    else:
+        _require_gpu(env)
+        simulation = read_gpu_state(env, chosen)
+    return Snapshot(env.num_envs, tuple(chosen), simulation, take_memory(env, chosen))
+
+
+def restore_snapshot(
+    env: Any,
+    snapshot: Snapshot,
+    env_idx: Sequence[int] | int | None = None,
+    source: int | Sequence[int] | None = None,
+    fresh_physics: bool = True,
+) -> RestoreReport:
+    """Put the state of envs of a snapshot into envs of `env`; its other envs are not touched.
+
+    ``restore_snapshot(env, s)`` puts every env back where it was; ``restore_snapshot(env, s, [7], source=3)`` env
+    3's state into env 7; ``restore_snapshot(env, s, range(env.num_envs), source=3)`` into all.
+
+    The env may be another: made anew, or of an edited task. Then actors and articulations are matched by
+    name, articulations also by the names of their joints, and attributes of the task by name and shape.
+    What the task keeps for a whole batch (counters, a controller's step) belongs to the moment, and is put back
+    when all envs of the env are. The process's random generators are put back when all go back where they were,
+    in a snapshot of as many.
+
+    Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not:
+    ask ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
+
+    Args:
+        env_idx: the envs to be set; None for those that the snapshot was taken of.
+        source: whose state they get, as numbered in the env of the snapshot: one for all, or one each. None:
+            each its own; or if the snapshot has a single env, that one.
+        fresh_physics: whether the envs get a PhysX scene without a past, and so go on in the same way to the
+            last bit, whatever they did before. Without, a restore is several times as fast, and contacts that
+            an env has or gets later may be solved in another order (see `cpu_state`).
+
+    Raises:
+        IndexError, ValueError: `env_idx` or `source` names envs that are not there, or the numbers differ.
+        TypeError: a GPU env's snapshot for a CPU env, or the other way round.
+    """
+    env = maniskill_private.open_env(env)
+    if not isinstance(snapshot, Snapshot):
+        raise TypeError(f"a Snapshot is wanted, as take_snapshot gives it, not {type(snapshot).__name__}")
+    targets, positions = _pairs(env, snapshot, env_idx, source)
+    px = batched_system(env.scene)
+    state: Any = snapshot.simulation
+    if isinstance(state, CpuState) != (px is not None):
+        raise TypeError(
+            "a snapshot of CPU simulation cannot be put into GPU simulation, nor the other way round"
+        )
+    if px is not None:
+        carried, missed = write_cpu_state(env, targets, state, positions, fresh_physics)
+    else:
+        _require_gpu(env)
+        carried, missed = write_gpu_state(env, targets, state, positions)
+    # In whichever order they were taken and are named.
+    whole = snapshot.num_envs == env.num_envs == len(targets) and all(
+        snapshot.env_idx[k] == i for i, k in zip(targets, positions, strict=True)
+    )
+    more, less = restore_memory(env, snapshot.memory, targets, positions, whole)
+    return RestoreReport((*carried, *more), {**missed, **less})
+
+
+def begin_anew(env: Any, env_idx: list[int]) -> None:
+    """Make now an exact point of these envs: PhysX forgets what was before, and their state is one that it gives back.
+
+    From an exact point a snapshot and the same actions give the same bits as the run that was not interrupted.
+
+    Args:
+        env: batched on the CPU and reset at least once; wrappers are looked through.
+    """
+    begin_cpu_state_anew(maniskill_private.open_env(env), env_idx)
+
+
+def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
+    """Whether an env is where env `source` of the snapshot was, to the last byte of what PhysX gives out."""
+    wanted: Any = snapshot.simulation
+    k = snapshot.env_idx.index(source)
+    return read_cpu_state(env, [env_idx]).essence(0) == wanted.essence(k)
+
+
+def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
+    """Copy what is not in the simulation; see `Memory`."""
+    seeds = maniskill_private.episode_seeds(env)
+    reader = _rng_readers.setdefault(env, RngReader())
+    generators = maniskill_private.episode_generators(env)
+    return Memory(
+        elapsed_steps=env.elapsed_steps.cpu().numpy()[env_idx].astype(np.int32),
+        episode_seeds=np.zeros(len(env_idx), np.int64)
+        if seeds is None
+        else np.array(seeds, np.int64)[env_idx],
+        rng={name: _chosen(reader.read(name, every), env_idx) for name, every in generators.items()},
+        task=read_task_state(env, env_idx),
+        shared_rng=read_shared_rng(env.device),
+    )
+
+
+@contextmanager
+def remembering(env: BaseEnv) -> Iterator[None]:
+    """Afterwards the task remembers what it did: its hooks may count and draw, and must not do so twice in a step."""
+    every = list(range(env.num_envs))
+    memory = take_memory(env, every)
+    try:
+        yield
+    finally:
+        restore_memory(env, memory, every, every, whole=True)
+
+
+def restore_memory(
+    env: BaseEnv, memory: Memory, env_idx: list[int], positions: list[int], whole: bool
+) -> tuple[dict[str, None], dict[str, str]]:
+    """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried, and not.
+
+    Args:
+        whole: all envs go back where they were, so the process's random generators do too.
+    """
+    steps = env.elapsed_steps
+    steps[env_idx] = steps.new_tensor(memory.elapsed_steps[positions])
+    maniskill_private.keep_episode_seeds(env, env_idx, memory.episode_seeds[positions])
+    reader = _rng_readers.setdefault(env, RngReader())
+    generators = maniskill_private.episode_generators(env)
+    for name, states in memory.rng.items():
+        reader.write(name, generators[name], env_idx, _chosen(states, positions))
+    if whole:
+        write_shared_rng(memory.shared_rng, env.device)
+    return write_task_state(env, memory.task, env_idx, positions)
+
+
+_rng_readers: WeakKeyDictionary[Any, RngReader] = WeakKeyDictionary()
+
+
+def _chosen(items: list[RngState], positions: list[int]) -> list[RngState]:
+    return [items[k] for k in positions]
+
+
+def _require_gpu(env: BaseEnv) -> None:
+    if not env.scene.gpu_sim_enabled:
+        raise NotImplementedError(
+            "snapshots are of envs that are batched: make this one with workbench.make, with num_envs=1 if need be"
+        )
+
+
+def _pairs(
+    env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | int | None, source: int | Sequence[int] | None
+) -> tuple[list[int], list[int]]:
+    """The envs to be set, and for each the position of its source in the snapshot."""
+    if env_idx is None and source is not None:
+        raise ValueError("source says whose state to put; env_idx must say into which envs")
+    if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
+        raise IndexError(
+            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: say with env_idx which "
+            "are to be set, and with source whose state they get"
+        )
+    targets = envs_of_batch(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
+    if source is None:
+        sources = [snapshot.env_idx[0]] * len(targets) if len(snapshot.env_idx) == 1 else targets
+    else:
+        sources = env_numbers(source)
+        if np.ndim(source) == 0:
+            sources *= len(targets)
+    if len(sources) != len(targets):
+        raise ValueError(f"{len(sources)} sources for {len(targets)} envs")
+    position = {i: k for k, i in enumerate(snapshot.env_idx)}
+    missing = sorted(set(sources) - set(position))
+    if missing:
+        raise IndexError(
+            f"the snapshot was taken of envs {list(snapshot.env_idx)}: it has no state of {missing}"
+        )
+    return targets, [position[i] for i in sources]
+
+
+# --- some envs alone ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def only_these_move(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
+    """Within this, control steps are of these envs.
+
+    Args:
+        others: all other envs as they are now, which they are at the end again; None for a batch in which nobody
+            asks for what the others were.
+    """
+    px = batched_system(env.scene)
+    if px is None:
+        try:
+            yield
+        finally:
+            if others is not None:
+                restore_snapshot(env, others)
+        return
+    before = px.packs()
+    flags = [flag.copy() for flag in px.drive_flags]
+    px.hold_still(set(range(env.num_envs)) - {int(i) for i in env_idx})
+    try:
+        yield
+    finally:
+        now = px.packs()
+        px.hold_still(())
+        if others is not None:
+            still = [i for i in others.env_idx if now[i] == before[i]]
+            moved = [i for i in others.env_idx if now[i] != before[i]]
+            if moved:
+                restore_snapshot(env, others, moved, moved, fresh_physics=False)
+            if still:
+                positions = [others.env_idx.index(i) for i in still]
+                restore_memory(env, others.memory, still, positions, whole=False)
+            px.keep_drives(still, flags)
+            env.scene._gpu_fetch_all()

@@ -1,0 +1,196 @@
+"""Where a task keeps what it remembers: every attribute that may hold some, with its path and a way to put another.
+
+Nobody declares state, so it is looked for: on the env, its agents and their controllers, through dicts, lists,
+tuples, dataclasses, ManiSkill's Poses and objects of classes that the author wrote beside the task. What
+belongs to ManiSkill, SAPIEN, gymnasium or torch (scenes, actors, sensors, spaces) is not entered, and neither are
+BaseEnv's own members. `task_buffers` says what of it is state, and keeps that.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.base_controller import BaseController
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.structs.pose import Pose
+
+from workbench.core.maniskill_private import task_class
+from workbench.core.simulation.strict_system import TENSORS
+
+PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
+"""Values that cannot change, so that keeping them is a copy."""
+_ENTERED = (
+    *PLAIN,
+    *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
+    *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
+)
+"""What may hold state, whoever made it; those of the last row cannot be kept, and are named instead."""
+_NOT_ENTERED = (
+    *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
+    *("_thread", "weakref", "functools", "pathlib", "workbench"),
+)
+"""Packages whose objects belong to the simulation or hold no state of an episode."""
+_DEEPEST = 8
+
+
+@dataclass
+class Found:
+    """A value at the end of a path, and how to put another in its place."""
+
+    path: str
+    value: Any
+    put: Callable[[Any], None]
+
+
+@dataclass
+class Walk:
+    """One look over everything that a task remembers."""
+
+    env: BaseEnv
+    author: str
+    """Module of the task's class: what is defined beside it is entered."""
+    leaves: list[Found] = field(default_factory=list)
+    omitted: dict[str, str] = field(default_factory=dict)
+    entered: dict[int, Any] = field(default_factory=dict)
+    """Objects that were met, by ``id``: held, and not entered a second time."""
+    owners: dict[str, Any] = field(default_factory=dict)
+    """Objects whose attributes were looked at, by path."""
+    simulation: frozenset[int] = frozenset()
+    """Where the simulation's own tensors lie: an attribute that is a view of one is no memory."""
+
+
+def look_over(env: BaseEnv) -> Walk:
+    """Everything that a task may remember."""
+    walk = Walk(env, task_class(env).__module__)
+    walk.entered[id(env)] = env
+    walk.simulation = frozenset(
+        array.torch().untyped_storage().data_ptr()
+        for array in (getattr(env.scene.px, name, None) for name in TENSORS)
+        if array is not None
+    )
+    _enter_members(walk, env, "", base_env_members(), 0)
+    return walk
+
+
+def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth: int) -> None:
+    if isinstance(value, PLAIN):
+        walk.leaves.append(Found(path, value, put))
+        return
+    if isinstance(value, (torch.Tensor, np.ndarray)):
+        if isinstance(value, torch.Tensor) and value.untyped_storage().data_ptr() in walk.simulation:
+            return
+        if isinstance(value, np.ndarray) and value.dtype == object:
+            walk.omitted[path] = "a numpy array of objects"
+        else:
+            walk.leaves.append(Found(path, value, put))
+        return
+    if isinstance(value, tuple) and all(isinstance(item, PLAIN) for item in value):
+        # As plain as its items. A list of them is one leaf too, but can be an env's each.
+        walk.leaves.append(Found(path, value, put))
+        return
+    if id(value) in walk.entered:
+        return
+    walk.entered[id(value)] = value
+    if depth > _DEEPEST:
+        walk.omitted[path] = f"more than {_DEEPEST} containers deep"
+    elif isinstance(value, Pose):
+        # A Pose is frozen, so another takes its place; torch may hold on to the old one.
+        _enter(walk, value.raw_pose, f"{path}.raw_pose", lambda raw: put(Pose(raw)), depth + 1)
+    elif isinstance(value, dict):
+        for key, item in list(value.items()):
+            if not _is_ignored(type(item), walk.author):
+                _enter(walk, item, f"{path}[{key!r}]", _putter(value, key), depth + 1)
+    elif isinstance(value, list):
+        if all(isinstance(item, PLAIN) for item in value):
+            walk.leaves.append(Found(path, value, put))
+        else:
+            for i, item in enumerate(value):
+                if not _is_ignored(type(item), walk.author):
+                    _enter(walk, item, f"{path}[{i}]", _putter(value, i), depth + 1)
+    elif isinstance(value, tuple):
+        _enter_tuple(walk, value, path, put, depth)
+    elif _has_members(type(value), walk.author):
+        _enter_members(walk, value, path, frozenset(), depth)
+    else:
+        walk.omitted[path] = f"a {type(value).__module__}.{type(value).__qualname__}"
+
+
+def _enter_members(walk: Walk, owner: Any, path: str, skipped: frozenset[str], depth: int) -> None:
+    walk.owners[path] = owner
+    for name, value in list(vars(owner).items()):
+        if name in skipped or _is_ignored(type(value), walk.author):
+            continue
+        where = f"{path}.{name}" if path else name
+        _enter(walk, value, where, lambda new, n=name: object.__setattr__(owner, n, new), depth + 1)
+
+
+def _enter_tuple(walk: Walk, value: tuple, path: str, put: Callable[[Any], None], depth: int) -> None:
+    # A tuple cannot be written to: with every item that is put back, a new tuple takes the old one's place.
+    items = list(value)
+
+    def put_item(new: Any, i: int) -> None:
+        items[i] = new
+        put(type(value)(*items) if hasattr(value, "_fields") else type(value)(items))
+
+    for i, item in enumerate(value):
+        if not _is_ignored(type(item), walk.author):
+            _enter(walk, item, f"{path}[{i}]", lambda new, i=i: put_item(new, i), depth + 1)
+
+
+def _putter(container: Any, key: Any) -> Callable[[Any], None]:
+    return lambda new: container.__setitem__(key, new)
+
+
+@lru_cache(maxsize=4096)
+def _has_members(cls: type, author: str) -> bool:
+    """Whether an object's attributes are looked at: robots, controllers, what the author wrote, dataclasses."""
+    if issubclass(cls, (BaseAgent, BaseController)):
+        return True
+    if issubclass(cls, (type, torch.nn.Module)) or not cls.__dictoffset__:
+        return False
+    return cls.__module__ == author or (
+        dataclasses.is_dataclass(cls) and cls.__module__.split(".")[0] not in _NOT_ENTERED
+    )
+
+
+@lru_cache(maxsize=4096)
+def _is_ignored(cls: type, author: str) -> bool:
+    """Whether an object is neither entered nor worth a word: upstream's, or code."""
+    if issubclass(cls, _ENTERED) or _has_members(cls, author):
+        return False
+    return cls.__module__.split(".")[0] in _NOT_ENTERED or any("__call__" in vars(c) for c in cls.__mro__)
+
+
+@lru_cache(maxsize=1)
+def base_env_members() -> frozenset[str]:
+    """The attributes that ManiSkill's BaseEnv sets on itself: read off its source, ``self.NAME = ...``.
+
+    They are the env's options, spaces, sensors, last observation and generators, which are either not
+    state or are put back by name (elapsed steps, generators). ``agent`` is entered.
+    """
+    tree = ast.parse(textwrap.dedent(inspect.getsource(BaseEnv)))
+    targets = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
+    names = {
+        node.attr
+        for node in targets
+        if isinstance(node.ctx, ast.Store) and isinstance(node.value, ast.Name) and node.value.id == "self"
+    }
+    ours = {
+        "_kept_controllers",
+        "_to_begin",
+        "begins_anew",
+        "observation_space",
+        "single_observation_space",
+        "segmentation_id_map",
+    }
+    return frozenset(names | ours) - {"agent"}

@@ -1,0 +1,272 @@
+"""What a task remembers between steps, on itself, its robots and their controllers; found, read, put back.
+
+A simulator's state is not a task's. The best distance so far, the stage of each env, a target pose that
+a controller goes after: tasks keep these as attributes, and ManiSkill's ``get_state_dict`` knows nothing of them.
+Nobody declares them either, so they are looked for (`task_members`).
+
+*Rows.* A tensor, an array or a list of plain values whose first dimension is the number of envs has one row
+an env, and the rows of chosen envs are copied. Anything else (a counter, a threshold) holds for the whole
+batch, so it is put back only when all envs are.
+
+*State or scene?* ``self.peg_half_sizes`` has a row an env too, but it describes pegs that were built, and
+copying env 3's row to env 7 would not change env 7's peg. The difference is when it was written: what has not
+changed since the scene was built (`note_scene`, called by the batched env) belongs to the scene. It is not
+copied, and if it has changed by the time of the restore, it gets back the value that it was built with.
+Where nobody noted that (GPU simulation), everything counts as state.
+
+*New tensors.* A value is put back as a new tensor, never written into the old one, which may be somebody
+else's: a controller's target is often the caller's action array itself. Two attributes that were one tensor
+stay one. What cannot be carried is named, with the reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.core.scene.scene_index import once_a_scene
+from workbench.core.snapshots.task_attributes import PLAIN, Found, look_over
+
+_LARGEST_OF_BATCH = 1 << 16
+"""Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
+
+
+class Buffer(NamedTuple):
+    """One value that was found, as it was."""
+
+    values: Any
+    """Rows of the chosen envs (numpy array, or list of plain values), or the value for the whole batch."""
+    per_env: bool
+    dtype: torch.dtype | None
+    """Of a tensor; None for what is none."""
+
+    def is_as(self, other: Buffer) -> bool:
+        """Whether both are equal to the last bit."""
+        kind = self.per_env, self.dtype
+        return kind == (other.per_env, other.dtype) and _equal(self.values, other.values)
+
+
+class TaskState(NamedTuple):
+    """What a task, its robots and their controllers remembered."""
+
+    buffers: dict[str, Buffer]
+    """What was written since the scene was built, by path: ``best_distance``, ``agent.controllers['pd_ee_delta_pos'].controllers['arm']._target_qpos``, ``stages['reach']``."""
+    built: frozenset[str]
+    """Paths of what was there when the scene was built."""
+    omitted: dict[str, str]
+    """Path and reason of what could not be kept."""
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """A value as it was when the scene was built."""
+
+    value: Any
+    """Itself."""
+    version: int
+    """How often a tensor had been written, as torch counts."""
+    kept: Buffer
+    """What was in it."""
+
+
+@dataclass
+class _Scene:
+    """What was there when a scene was built."""
+
+    marks: dict[str, _Mark] = field(default_factory=dict)
+    paths: frozenset[str] = frozenset()
+
+    def add(self, env: BaseEnv, leaves: list[Found]) -> None:
+        for leaf in leaves:
+            version = version_of(leaf.value) if isinstance(leaf.value, torch.Tensor) else 0
+            self.marks[leaf.path] = _Mark(leaf.value, version, _kept(leaf.value, env.num_envs))
+        self.paths = frozenset(self.marks)
+
+
+@once_a_scene
+def _scene_of(env: BaseEnv) -> _Scene:
+    return _Scene()
+
+
+def note_scene(env: BaseEnv) -> None:
+    """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
+    _scene_of(env).add(env, look_over(env).leaves)
+
+
+def note_constructed(env: BaseEnv) -> None:
+    """Remember the plain values that the task's ``__init__`` set after BaseEnv's, as belonging to the scene.
+
+    An env made of the edited file would otherwise be given the old file's ``self.threshold = 0.02``.
+    """
+    plain = [leaf for leaf in look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))]
+    _scene_of(env).add(env, plain)
+
+
+def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
+    """Copies of what the task remembers about the envs in `env_idx`, and of what holds for the batch."""
+    walk = look_over(env)
+    scene = _scene_of(env)
+    buffers: dict[str, Buffer] = {}
+    omitted = dict(walk.omitted)
+    chosen = None if env_idx == list(range(env.num_envs)) else np.array(env_idx, np.int64)
+    for leaf in walk.leaves:
+        value = leaf.value
+        if not _changed(value, scene.marks.get(leaf.path)):
+            continue
+        whole = isinstance(value, torch.Tensor) and not is_per_env(value, env.num_envs)
+        if whole and value.numel() > _LARGEST_OF_BATCH:
+            omitted[leaf.path] = f"a tensor {tuple(value.shape)} that has no row for each env"
+        else:
+            buffers[leaf.path] = _kept(value, env.num_envs, chosen)
+    return TaskState(buffers, scene.paths, omitted)
+
+
+def _kept(value: Any, num_envs: int, env_idx: NDArray[np.int64] | None = None) -> Buffer:
+    """A copy of a value; of what has a row for each env, the rows of these, or of all."""
+    per_env, dtype = is_per_env(value, num_envs), None
+    if per_env and env_idx is not None:
+        value = [value[i] for i in env_idx] if isinstance(value, list) else value[env_idx]
+    if isinstance(value, torch.Tensor):
+        value, dtype = value.detach(), value.dtype
+        value = (value.float() if dtype == torch.bfloat16 else value).cpu().numpy()
+    return Buffer(value.copy() if isinstance(value, (np.ndarray, list)) else value, per_env, dtype)
+
+
+def write_task_state(
+    env: BaseEnv, state: TaskState, env_idx: list[int], positions: list[int]
+) -> tuple[dict[str, None], dict[str, str]]:
+    """Put row ``positions[k]`` of every buffer into env ``env_idx[k]``.
+
+    What holds for the whole batch is put back too if all envs are, each to its own or all to one of them: they
+    then stand at the one moment that it belongs to.
+
+    Returns:
+        Paths that were carried, and paths that were not with the reason.
+    """
+    walk = look_over(env)
+    scene = _scene_of(env)
+    carried: dict[str, None] = {}
+    missed = dict(state.omitted)
+    all_envs = sorted(env_idx) == list(range(env.num_envs))
+    replaced: dict[int, Any] = {}
+    here = set()
+    for leaf in walk.leaves:
+        here.add(leaf.path)
+        kept, value, chosen = state.buffers.get(leaf.path), leaf.value, positions
+        if kept is None:
+            mark = scene.marks.get(leaf.path)
+            if not _changed(value, mark):
+                continue
+            if mark is None or leaf.path not in state.built:
+                # A controller's start and step exist from its first action on, and mean nothing before it.
+                if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
+                    missed[leaf.path] = "the snapshot has none of this name: left as it is"
+                continue
+            kept, chosen = mark.kept, env_idx
+        if id(value) in replaced and isinstance(value, (torch.Tensor, np.ndarray)):
+            leaf.put(replaced[id(value)][1])
+            carried[leaf.path] = None
+            continue
+        if not kept.per_env:
+            if all_envs:
+                leaf.put(_as_found(kept, env))
+                carried[leaf.path] = None
+            elif not _equal(kept.values, value):
+                missed[leaf.path] = "it holds for the whole batch, and not all envs were put back"
+            continue
+        new = _with_rows(value, kept, env, env_idx, chosen, all_envs)
+        if isinstance(new, str):
+            missed[leaf.path] = new
+            continue
+        # The old value is held, or its id could be the id of a new tensor.
+        replaced[id(value)] = value, new
+        leaf.put(new)
+        carried[leaf.path] = None
+    for path, kept in state.buffers.items():
+        if path in here:
+            continue
+        owner, _, name = path.rpartition(".")
+        # A class's default (controllers have None) shows that the attribute is only not set yet.
+        if owner in walk.owners and hasattr(type(walk.owners[owner]), name) and all_envs:
+            value = (
+                _with_rows(None, kept, env, env_idx, positions, True)
+                if kept.per_env
+                else _as_found(kept, env)
+            )
+            object.__setattr__(walk.owners[owner], name, value)
+            carried[path] = None
+        else:
+            missed[path] = "the task has none of this name now"
+    return carried, missed
+
+
+def _with_rows(
+    value: Any, kept: Buffer, env: BaseEnv, env_idx: list[int], positions: list[int], all_envs: bool
+) -> Any:
+    """A copy of `value` with the rows put in, or a sentence that says why there is none."""
+    listed = isinstance(kept.values, list)
+    rows: Any = [kept.values[k] for k in positions] if listed else kept.values[positions]
+    kind: Any = list if listed else np.ndarray if kept.dtype is None else torch.Tensor
+    shape = (env.num_envs, *np.shape(kept.values)[1:])
+    fits = isinstance(value, kind) and is_per_env(value, env.num_envs) and (listed or value.shape == shape)
+    # Of all envs another thing may be put in its place, but for a tensor of another shape.
+    if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
+        if listed:
+            return "it is no list with an entry for each env now"
+        return f"it had shape ({', '.join(['N', *map(str, shape[1:])])}) and is another thing now"
+    if listed:
+        new: Any = list(value) if fits else [None] * env.num_envs
+        for i, row in zip(env_idx, rows, strict=True):
+            new[i] = row
+    elif kept.dtype is None:
+        new = value.copy() if fits else np.empty(shape, dtype=rows.dtype)
+        new[env_idx] = rows
+    else:
+        new = value.detach().clone(memory_format=torch.contiguous_format) if fits else None
+        new = torch.empty(shape, dtype=kept.dtype, device=env.device) if new is None else new
+        new[torch.tensor(env_idx, device=new.device)] = torch.from_numpy(rows).to(new)
+    return new
+
+
+def _as_found(kept: Buffer, env: BaseEnv) -> Any:
+    if kept.dtype is not None:
+        return torch.from_numpy(kept.values.copy()).to(device=env.device, dtype=kept.dtype)
+    return kept.values.copy() if isinstance(kept.values, (np.ndarray, list)) else kept.values
+
+
+# --- comparing -------------------------------------------------------------------------------------
+
+
+def is_per_env(value: Any, num_envs: int) -> bool:
+    if isinstance(value, (torch.Tensor, np.ndarray)):
+        return value.ndim > 0 and value.shape[0] == num_envs
+    return isinstance(value, list) and len(value) == num_envs
+
+
+def _changed(value: Any, mark: _Mark | None) -> bool:
+    """Whether a value was written since its mark; what was not there then has been."""
+    if mark is None:
+        return True
+    if value is mark.value and isinstance(value, PLAIN):
+        return False
+    if isinstance(value, torch.Tensor):
+        return value is not mark.value or version_of(value) != mark.version
+    return type(value) is not type(mark.value) or not _equal(value, mark.kept.values)
+
+
+def version_of(tensor: torch.Tensor) -> int:
+    """How often it was written, as torch counts; below 0 where torch does not."""
+    return -1 if tensor.is_inference() else tensor._version
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, np.ndarray):
+        return (a.shape, a.dtype) == (b.shape, b.dtype) and a.tobytes() == b.tobytes()
+    return a is b or a == b

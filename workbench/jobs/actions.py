@@ -1,0 +1,274 @@
+"""What the envs do next: the source of the actions, and the random numbers, of a page and of a recording.
+
+The page draws its random actions and the seeds of new episodes from one generator, for the whole batch at once, so that
+a reset with the session's seed repeats everything that follows it; what env 3 does hangs on how many envs there are. A
+recording is to hold the same episodes on any number of envs and processes. So there each episode draws from a generator
+of its own, begun with its seed; and where actions are given by a file, each has its place in its own.
+
+A file of actions is a program for the robot, so it is done to its end: an episode of it does not stop at success or at
+the time limit, as ManiSkill's ``replay_trajectory`` does not. A demonstration also says how its episode began (its
+seed) and how it went (its env states), which is how a replay is put right where the same actions lead elsewhere:
+another machine, another version, a batch that was seeded as one on a GPU.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.authoring.problem import TaskError, is_ctrl_c
+from workbench.core.capture.recorded_run import RecordedRun
+from workbench.core.env import actions
+from workbench.core.env.task_env import TaskEnv
+from workbench.jobs.from_recording import run_of
+from workbench.jobs.policy import Policy, load_policy, problem_of
+from workbench.jobs.task import ActionSource
+from workbench.machine.files import open_regular_file
+from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.recording.reader.reading import find_trajectories, read_recording
+
+
+class Acting:
+    """Chooses the action of every control step."""
+
+    def __init__(self, folder: CurrentFolder) -> None:
+        """
+        Args:
+            folder: from which a relative policy is meant.
+        """
+        self._folder = folder
+        self._source: ActionSource = "random"
+        self._policy: Policy | None = None
+        self._policy_name = ""
+        self._beside: Path | None = None
+        self._rng = np.random.default_rng(0)
+        self.sliders: tuple[float, ...] = ()
+        """(A,) what every env is given while the source is ``sliders``; another length is no action."""
+
+    @property
+    def name(self) -> str:
+        """What chooses, as a recording says it."""
+        return {"hold": "hold still", "policy": f"policy {self._policy_name}"}.get(self._source, self._source)
+
+    def seed(self, seed: int) -> None:
+        """Begin the random numbers anew."""
+        self._rng = np.random.default_rng(seed)
+
+    def fresh_seeds(self, count: int) -> list[int]:
+        # Each episode has a seed of its own, or a recording of it could not say how to start it again.
+        return [int(seed) for seed in self._rng.integers(2**31, size=count)]
+
+    def use(self, source: ActionSource, policy: str | None, beside: Path | None = None) -> None:
+        """Take the actions from there.
+
+        Args:
+            policy: as for `load_policy`; with none named yet, nothing is wrong until an action is asked for.
+            beside: as for `load_policy`.
+
+        Raises:
+            TaskError: the policy cannot be imported; so will `next_action`, which tries again.
+        """
+        self._source, self._policy_name, self._beside = source, policy or "", beside
+        self._policy = None
+        if source != "policy" or not self._policy_name:
+            return
+        with self._imported():
+            pass
+
+    def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
+        """(N, A), within the bounds but for a policy's.
+
+        Raises:
+            TaskError: the policy raised, gave no action, or cannot be imported. Its file is read anew the next
+                time: it may be mended by then.
+        """
+        if self._source == "random":
+            return actions.random_action(task.parts, task.num_envs, self._rng)
+        if self._source == "policy":
+            # Never another action in its place: the page says that the policy acts.
+            with self._imported() as policy:
+                whose = f"what {self._policy_name} returned"
+                return actions.to_flat_action(task.env, task.parts, policy(task.obs), whose)
+        low, high = actions.bounds(task.parts)
+        if self._source == "zero":
+            return _same_for_all(np.clip(0.0, low, high), task)
+        if self._source == "sliders" and len(self.sliders) == len(low):
+            return _same_for_all(np.clip(np.asarray(self.sliders, np.float32), low, high), task)
+        return actions.hold_action(task.parts, task.num_envs)
+
+    @contextmanager
+    def _imported(self) -> Iterator[Policy]:
+        """The policy; what is raised within is its fault, and it is imported anew the next time."""
+        try:
+            if self._policy is None:
+                with self._folder.again():
+                    self._policy = load_policy(self._policy_name, self._beside)
+            yield self._policy
+        except BaseException as error:
+            if is_ctrl_c(error):
+                raise
+            policy, self._policy = self._policy, None
+            raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error
+
+
+def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
+    return np.broadcast_to(action, (task.num_envs, len(action))).astype(np.float32)
+
+
+class RecordActing:
+    """Chooses the actions of every control step of a recording; an env without an episode holds still."""
+
+    def __init__(self, acting: Acting | None) -> None:
+        """
+        Args:
+            acting: asked for whatever is neither random nor given; None for those.
+        """
+        self._acting = acting
+        self._rng: dict[int, np.random.Generator] = {}
+        self._given: dict[int, RecordedRun] = {}
+
+    def begin(self, env: int, seed: int, given: RecordedRun | None) -> str:
+        """An episode begins in this env; returns what will choose its actions, as its recording says it."""
+        self._rng[env] = np.random.default_rng(seed)
+        self._given.pop(env, None)
+        if given is not None:
+            self._given[env] = given
+            return given.name
+        return "random" if self._acting is None else self._acting.name
+
+    def end(self, env: int) -> None:
+        """Nothing is to be done in this env any more."""
+        self._rng.pop(env, None)
+
+    def next_action(self, task: TaskEnv, steps: Mapping[int, int]) -> NDArray[np.float32]:
+        """(N, A); `steps` says how many were made, of each env with an episode.
+
+        Raises:
+            TaskError: the policy raised, or gave no action.
+            ValueError: actions of another size were given.
+        """
+        action = actions.hold_action(task.parts, task.num_envs)
+        if self._acting is not None:
+            # Asked for the whole batch, as a policy is written for.
+            chosen = self._acting.next_action(task)
+            for env in steps:
+                action[env] = chosen[env]
+            return action
+        for env, step in steps.items():
+            given = self._given.get(env)
+            if given is None:
+                action[env] = actions.random_action(task.parts, 1, self._rng[env])[0]
+                continue
+            if given.action.shape[1] != action.shape[1]:
+                raise ValueError(
+                    f"the file's actions have {given.action.shape[1]} dimensions, and this task's {action.shape[1]} "
+                    f"({', '.join(name for part in task.parts for name in part.names)}): another control mode or robot?"
+                )
+            action[env] = given.action[step]
+        return action
+
+
+# --- Actions that are known before: from a NumPy file, or demonstrations in ManiSkill's own ``.h5`` ---
+
+
+MOST_BYTES = 2**30
+"""Of a NumPy file, also unpacked: 20 million steps of a Panda."""
+SUFFIXES = (".npy", ".npz", ".h5")
+
+
+def read_given(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    """Read a file of actions: what each episode is to do, begun as its run did where that is known; and what of the env's
+    keywords the file asks for, such as the control mode that its actions are of.
+
+    ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
+    trajectories of ManiSkill, or a recording of the workbench.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ValueError: it does not hold such; the message says what it holds.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    if path.suffix == ".h5":
+        return _demonstrations(path)
+    try:
+        arrays = _arrays(path)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read as a NumPy file of numbers: {error}") from error
+    if path.suffix == ".npy" and arrays[0].ndim == 3:
+        arrays = list(arrays[0])
+    for array in arrays:
+        if array.ndim != 2 or array.shape[0] == 0 or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path} holds {array.dtype} of shape {array.shape}; actions are numbers of shape (steps, dimensions), in a "
+                ".npy also (episodes, steps, dimensions)"
+            )
+    if not arrays:
+        raise ValueError(f"{path} holds no array")
+    names = [
+        f"file {path.name}" + (f", its array {i}" if len(arrays) > 1 else "") for i in range(len(arrays))
+    ]
+    return [RecordedRun(name, -1, {}, _finite(path, array), {}) for name, array in zip(names, arrays)], {}
+
+
+def _arrays(path: Path) -> list[NDArray]:
+    """What a NumPy file holds. `np.load` would allocate what a header claims, before it looks whether it is there."""
+    with open_regular_file(path, MOST_BYTES) as file:
+        if path.suffix == ".npy":
+            return [_array(file, path.stat().st_size)]
+        with zipfile.ZipFile(file) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
+                raise ValueError("unpacked it is larger than any file of actions")
+            found = []
+            for member in archive.infolist():
+                with archive.open(member) as opened:
+                    found.append(_array(opened, member.file_size))
+            return found
+
+
+def _array(file: IO[bytes], size: int) -> NDArray:
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"it is of NumPy's format {version}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    length = math.prod(shape) * dtype.itemsize
+    if length > size:
+        raise ValueError(f"it says that it holds {length} bytes of {dtype}, and has {size}")
+    content = file.read(length)
+    return np.frombuffer(content, dtype, math.prod(shape)).reshape(shape, order="F" if fortran else "C")
+
+
+def _demonstrations(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    runs, kwargs = list[RecordedRun](), dict[str, Any]()
+    for name in find_trajectories(path):
+        episode = read_recording("maniskill", path, name)
+        if episode.length == 0:
+            continue
+        run = run_of(episode)
+        runs.append(replace(run, name=f"file {path.name}, {name}", action=_finite(path, run.action)))
+        given: Mapping[str, Any] = episode.info.env_kwargs
+        kwargs = {key: given[key] for key in ("robot_uids", "control_mode") if given.get(key) is not None}
+        if episode.info.control_mode is not None:
+            kwargs["control_mode"] = episode.info.control_mode
+    if not runs:
+        raise ValueError(f"{path} holds no trajectory with actions")
+    return runs, kwargs
+
+
+def _finite(path: Path, actions: NDArray) -> NDArray[np.float32]:
+    actions = np.asarray(actions, np.float32)
+    if not np.isfinite(actions).all():
+        raise ValueError(f"{path} holds actions that are NaN or infinite")
+    return actions

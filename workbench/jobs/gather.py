@@ -1,0 +1,382 @@
+"""From the stream of steps of a batch to episodes, one env at a time.
+
+The page's Record button, ``workbench record`` and `workbench.Recorder` gather the same way: an env's episode begins
+with a reset and ends when it terminates, is truncated, or is reset. What comes is a step of all envs; what is written
+is a file an env. So each env has a writer of its own, which gets that env's row of every step; whoever gathers gets
+the writer when the episode is over, and says whether it becomes files (`EpisodeWriter.finish` takes a fraction of a
+second, and may be done on another thread) or is forgotten.
+
+It is also the place where a broken stream is noticed. `elapsed_steps` of a real episode counts 0, 1, 2 ...; a step that
+was lost, or a reset that went by unseen, would otherwise become a file that looks right and is not.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import Picture
+from workbench.core.capture.recorded_run import STATE, states_of
+from workbench.core.env.step_result import OtherEntry, StepResult
+from workbench.jobs.task import Stepped, TaskDescription
+from workbench.machine.processes.watched_thread import say_failure
+from workbench.recording.episode.columns import BatchPacker
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.side_files import side_files
+from workbench.recording.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
+from workbench.recording.writing.publish import RecordingError
+
+_PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk")
+
+
+@dataclass
+class GatheredEpisode:
+    """An episode that is over, and not on the disk yet but for its journal."""
+
+    writer: EpisodeWriter
+    env: int
+    seed: int
+    """Below 0 where it is not known."""
+    steps: int = 0
+    total_reward: float = 0.0
+    success: bool | None = None
+    """At its last state; None for a task that says nothing of it."""
+    state_names: frozenset[str] = frozenset()
+    """Of the env states that its first row has."""
+    acted_by: str = ""
+    """What chose its last action."""
+    begun: bool = False
+    """Whether it has its first state."""
+
+    @classmethod
+    def of(
+        cls,
+        folder: Path,
+        task: TaskDescription,
+        env: int,
+        seed: int,
+        reset_options: Mapping[str, Any] | None = None,
+        acted_by: str = "",
+    ) -> GatheredEpisode:
+        """One that begins, with a writer of its own into `folder`. Raises RecordingError."""
+        writer = EpisodeWriter(
+            folder,
+            episode_info(task, env, seed, reset_options, acted_by),
+            task.geometry,
+            task.segmentation,
+            [dimension.name for dimension in task.actions],
+            task.cameras,
+        )
+        return cls(writer, env, seed, acted_by=acted_by)
+
+    def acts(self, what: str) -> None:
+        """What chooses the next action; empty for no news. Raises RecordingError."""
+        if what and what != self.acted_by:
+            self.writer.acted_by(what)
+            self.acted_by = what
+
+    def take(
+        self,
+        packer: BatchPacker,
+        step: StepResult,
+        row: int,
+        columns: Mapping[str, NDArray],
+        pictures: Sequence[Picture],
+    ) -> None:
+        """Its next state, row `row` of a batch; the first is that after a reset. Raises as `EpisodeWriter.append`."""
+        if not self.begun:
+            self.state_names = frozenset(states_of(columns, row))
+            count = len(step.reward)
+            no, nothing = np.zeros(count, np.bool_), np.zeros((count, self.writer.actions), np.float32)
+            step = replace(
+                step, action=nothing, reward=np.zeros(count, np.float32), terminated=no, truncated=no
+            )
+        batch = batch_columns(step, columns, self.state_names)
+        layout, (packed,) = packer.pack([(name, values[row : row + 1]) for name, values in batch])
+        self.writer.append(layout, packed, _of_env(pictures, row), others_of(step.others, row))
+        self.steps += self.begun
+        self.begun = True
+
+
+class EpisodeGatherer:
+    """Gathers the episodes of some envs of one task."""
+
+    def __init__(
+        self,
+        task: TaskDescription,
+        env_idx: Sequence[int],
+        folder: Path,
+        on_episode: Callable[[GatheredEpisode], object],
+        *,
+        ends: Literal["over", "reset"] = "over",
+        one_each: bool = False,
+        reset_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """
+        Args:
+            on_episode: gets each episode when it is over, and its writer with it.
+            ends: ``over`` ends an episode also where it terminates or is truncated, ``reset`` only where its env is
+                reset: for who goes on after that.
+            one_each: only the next episode of each env.
+        """
+        self._task, self._folder, self._on_episode = task, folder, on_episode
+        self._ends, self._one_each = ends, one_each
+        self.reset_options: Mapping[str, Any] = reset_options or {}
+        """Of the resets that come next."""
+        self.acted_by = ""
+        """What chooses the actions of the episodes that begin next, where the steps do not say it."""
+        self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
+        self._packer = BatchPacker()
+
+    @property
+    def env_idx(self) -> tuple[int, ...]:
+        """The envs that are still gathered."""
+        return tuple(self._episodes)
+
+    @property
+    def under_way(self) -> tuple[GatheredEpisode, ...]:
+        """The episodes that have begun."""
+        return tuple(episode for episode in list(self._episodes.values()) if episode is not None)
+
+    def take(self, stepped: Stepped) -> None:
+        """The next reset or step of the batch.
+
+        Raises:
+            ValueError: it does not follow from the one before, or holds what no file can; what came before can still
+                be finished.
+            RecordingError: the disk does not take it.
+        """
+        step = stepped.step
+        reset = stepped.reset_mask.tolist()
+        if step.action is not None:
+            going_on = [e for e in self._episodes.values() if e is not None and not reset[e.env]]
+            for names in {episode.state_names for episode in going_on}:
+                self._append([e for e in going_on if e.state_names == names], names, stepped)
+        for env in [env for env in self._episodes if reset[env]]:
+            self.end(env)
+            # Somebody may have gone back into an episode: no seed starts one there.
+            if env in self._episodes and step.elapsed_steps[env] == 0:
+                self._begin(env, stepped)
+
+    def finish(self) -> None:
+        """End the episodes under way where they are."""
+        for env in list(self._episodes):
+            self.end(env)
+
+    def end(self, env: int) -> None:
+        """End the episode of `env` where it is; it must have a step to be kept."""
+        episode = self._episodes.get(env)
+        if episode is None:
+            return
+        self._episodes[env] = None
+        if episode.steps == 0:
+            episode.writer.discard()
+            return
+        if self._one_each:
+            del self._episodes[env]
+        self._on_episode(episode)
+
+    def drop(self, env: int) -> None:
+        """Forget the episode of `env`, if it has one."""
+        episode = self._episodes.get(env)
+        if episode is not None:
+            self._episodes[env] = None
+            episode.writer.discard()
+
+    def _begin(self, env: int, stepped: Stepped) -> None:
+        seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
+        begun = GatheredEpisode.of(self._folder, self._task, env, seed, self.reset_options, self.acted_by)
+        try:
+            begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
+        except BaseException:
+            begun.writer.discard()
+            raise
+        self._episodes[env] = begun
+
+    def _append(self, episodes: list[GatheredEpisode], state_names: frozenset[str], stepped: Stepped) -> None:
+        """The rows of envs that have the same states."""
+        step = stepped.step
+        elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
+        over = (step.terminated | step.truncated).tolist()
+        successes = step.evaluate.get("success")
+        success: list[bool] | None = None
+        if successes is not None:
+            # One value an env, or several.
+            success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
+        captured, others, acted_by = stepped.captured, step.others, stepped.acted_by
+        layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
+        for episode in episodes:
+            env = episode.env
+            if elapsed[env] != episode.steps + 1:
+                raise _lost(env, episode.steps + 1, elapsed[env])
+            if acted_by != episode.acted_by:
+                episode.acts(acted_by)
+            episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
+            episode.steps += 1
+            episode.total_reward += reward[env]
+            episode.success = None if success is None else success[env]
+            if over[env] and self._ends == "over":
+                self.end(env)
+
+
+def _lost(env: int, expected: int, came: int) -> ValueError:
+    return ValueError(
+        f"env {env}: step {expected} was expected and step {came} came; a step was lost or the env was reset unseen"
+    )
+
+
+def batch_columns(
+    step: StepResult, columns: Mapping[str, NDArray], state_names: frozenset[str]
+) -> list[tuple[str, NDArray]]:
+    """A control step of the batch, as `BatchPacker` takes it."""
+    assert step.action is not None
+    count = len(step.reward)
+    rows = [
+        ("poses", step.poses),
+        ("action", step.action.reshape(count, -1)),
+        ("reward", step.reward),
+        ("terminated", step.terminated),
+        ("truncated", step.truncated),
+    ]
+    rows += [("evaluate/" + name, values) for name, values in step.evaluate.items()]
+    rows += [
+        ("batch/" + name, np.broadcast_to(entry.numbers, (count, *entry.numbers.shape)))
+        for name, entry in step.others.items()
+        if entry.numbers is not None
+    ]
+    rows += [
+        (name, values)
+        for name, values in columns.items()
+        if name[: len(STATE)] != STATE or name[len(STATE) :] in state_names
+    ]
+    return rows
+
+
+def _of_env(pictures: Sequence[Picture], env: int) -> Sequence[Picture]:
+    return [picture for picture in pictures if picture.env == env] if pictures else ()
+
+
+def others_of(others: Mapping[str, OtherEntry], env: int) -> Mapping[str, OtherEntry]:
+    """`StepResult.others` of one env."""
+    return {name: entry.of_env(env) for name, entry in others.items()} if others else NO_OTHERS
+
+
+def episode_info(
+    task: TaskDescription,
+    env: int,
+    seed: int,
+    reset_options: Mapping[str, Any] | None = None,
+    acted_by: str = "",
+) -> EpisodeInfo:
+    """What is needed to make an episode of this task again."""
+    return EpisodeInfo(
+        task=task.env_id,
+        env_index=env,
+        seed=seed,
+        source_file=task.file,
+        source_hash=task.source_hash,
+        source=task.source,
+        control_dt=task.control_dt,
+        control_mode=task.control_mode,
+        backend=task.backend,
+        versions=dict(package_versions()),
+        env_kwargs=dict(task.env_kwargs),
+        reset_options=dict(reset_options or {}),
+        max_episode_steps=task.max_episode_steps,
+        side_files=side_files(task.file, task.source),
+        acted_by=((0, acted_by),) if acted_by else (),
+    )
+
+
+@cache
+def package_versions() -> Mapping[str, str]:
+    """Versions of what an episode depends on, for its properties: of what this process has, for as long as it lives."""
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # a source checkout that was never installed
+            continue
+    return found
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What came of them so far."""
+
+    count: int = 0
+    bytes_written: int = 0
+    last: EpisodeFiles | None = None
+    problem: str | None = None
+    """Why the last one that failed did."""
+
+
+class EpisodeFinisher:
+    """Makes the files of episodes that are over, one after the other on a thread of its own. Thread-safe."""
+
+    def __init__(
+        self, on_change: Callable[[], None] = lambda: None, first: Callable[[], None] | None = None
+    ) -> None:
+        """
+        Args:
+            on_change: called on the thread when an episode has its files, or cannot have them.
+            first: called on the thread before all else.
+        """
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._finished = Finished()
+        self._waiting = 0
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="episode-files")
+        if first is not None:
+            self._pool.submit(first)
+
+    @property
+    def finished(self) -> Finished:
+        with self._lock:
+            return self._finished
+
+    @property
+    def waiting(self) -> int:
+        """Episodes whose files are not there yet."""
+        with self._lock:
+            return self._waiting
+
+    def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
+        """Make its files; the result says why where that failed. `finished` does too, until another one succeeds."""
+        with self._lock:
+            self._waiting += 1
+        return self._pool.submit(self._finish, episode)
+
+    def close(self) -> None:
+        """Wait for what is under way."""
+        self._pool.shutdown(wait=True)
+
+    def _finish(self, episode: GatheredEpisode) -> EpisodeFiles | str:
+        size = 0
+        made: EpisodeFiles | str
+        try:
+            made = episode.writer.finish()
+            size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
+        except Exception as error:
+            # Its journal stays, and the next start tries again.
+            if not isinstance(error, (RecordingError, OSError, ValueError)):
+                say_failure(f"An episode of env {episode.env} could not be written", error)
+            made = f"an episode of env {episode.env} could not be written: {error}"
+        with self._lock:
+            self._waiting -= 1
+            now = self._finished
+            if isinstance(made, str):
+                self._finished = replace(now, problem=made)
+            else:
+                self._finished = Finished(now.count + 1, now.bytes_written + size, made, None)
+        self._on_change()
+        return made

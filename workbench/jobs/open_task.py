@@ -1,0 +1,424 @@
+"""From a file or an env id to a running, tried-out task with everything a page must know of it.
+
+A task that imports and builds can still fail at its first step, in its reward or in a partial reset.
+Whoever opens a task wants to hear that before the version that works is thrown away; so opening
+includes a rehearsal: one reset, one step, one partial reset, each with the returns checked. Only what
+passes is handed over. The page, ``workbench record`` and the benchmarks open tasks through here.
+"""
+
+from __future__ import annotations
+
+import linecache
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from workbench.authoring.loading.load import (
+    LoadedTask,
+    import_modules,
+    load_task,
+    take_back,
+    with_late_imports,
+)
+from workbench.authoring.loading.reference import TaskName
+from workbench.authoring.problem import (
+    MESSAGE_LIMIT,
+    Interrupted,
+    Problem,
+    TaskError,
+    is_ctrl_c,
+    problem_from_exception,
+    shorten,
+)
+from workbench.authoring.return_problems import check_step_returns, problem_from_return
+from workbench.core.backends import BackendUnavailable, find_renderer, gpu_left_alone
+from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
+from workbench.core.cameras.render import list_cameras, recorded_pictures, segmentation_names, take_pictures
+from workbench.core.cameras.visibility import objects_to_see
+from workbench.core.capture.recorded_run import env_kwargs
+from workbench.core.env import actions
+from workbench.core.env.assets import MissingAssets
+from workbench.core.env.cpu_scene import BatchedCpuMixin, ForgottenInit
+from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.rules import Degree, Finding
+from workbench.core.scene.read_scene import read_geometry
+from workbench.core.snapshots.snapshot import RestoreReport, Snapshot
+from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
+
+
+@dataclass(frozen=True)
+class OpenedTask:
+    loaded: LoadedTask
+    env: TaskEnv
+    description: TaskDescription
+    first: StepResult
+    """The state after the reset with the seed that was asked for."""
+    milliseconds: dict[str, float]
+    """Wall time of each part: import, build, reset, rehearse, geometry."""
+
+
+class Clock:
+    """Wall time of the parts of a load, in milliseconds."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.laps: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = self.laps.get(name, 0.0) + 1000 * (now - self._last)
+        self._last = now
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a task is opened."""
+
+    on_activity: Callable[[str], None] = lambda activity: None
+    """Called with what is done next."""
+    on_finding: Callable[[Finding], None] = warn_of
+    """Called with each place where it breaks a rule that does not stop it, the first time."""
+    begins_anew: bool = False
+    """Whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that goes back."""
+    clock: Clock = field(default_factory=Clock)
+
+
+def with_advice(
+    error: TaskError,
+    loaded: LoadedTask,
+    options: TaskOptions,
+    again: Callable[[], LoadedTask],
+    knows_others: bool = False,
+) -> TaskError:
+    """Of a task that could not be opened: also what would open in its place.
+
+    Args:
+        again: imports it once more; the failed one was taken back.
+        knows_others: the other tasks of the file need not be told of.
+    """
+    advice: list[str] = []
+    if (
+        options.num_envs > 1
+        and not isinstance(error.__cause__, _NOT_OF_THE_BATCH)
+        and _runs_alone(again, options)
+    ):
+        advice.append(f"it fails with {options.num_envs} envs and runs with one: --num-envs 1")
+    if loaded.others and loaded.file is not None and not knows_others:
+        file = loaded.file.name
+        advice.append(
+            f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in "
+            f"{file}:{loaded.others[-1]}, or choose it as Task on the page"
+        )
+    if not advice:
+        return error
+    more = shorten("; ".join(advice), MESSAGE_LIMIT // 2)
+    message = f"{shorten(error.problem.message, MESSAGE_LIMIT - len(more) - 3)} ({more})"
+    classes = (loaded.chosen, *loaded.others) if loaded.others else ()
+    return TaskError(replace(error.problem, message=message), classes)
+
+
+_NOT_OF_THE_BATCH = (Interrupted, BrokenRule, MissingAssets, BackendUnavailable)
+"""Causes that say already what to do, or that one env has as well."""
+
+
+def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
+    """Whether one env of the task passes what a batch failed in: it may be written for one."""
+    try:
+        loaded = again()
+    except TaskError:
+        return False
+    try:
+        build_task(loaded, replace(options, num_envs=1), Opening(on_finding=lambda finding: None)).env.close()
+    except TaskError as error:
+        if isinstance(error.__cause__, Interrupted):
+            raise
+        return False
+    finally:
+        take_back(loaded)
+    return True
+
+
+def open_task(
+    reference: TaskName,
+    options: TaskOptions,
+    *,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = warn_of,
+) -> OpenedTask:
+    """Import, build, rehearse and reset a task, to be run without a page.
+
+    Raises:
+        TaskError: with the author's file and line; nothing of the task stays behind.
+    """
+    opening = Opening(on_activity, on_finding)
+    loaded = import_task(reference, options, None, opening)
+    try:
+        return build_task(loaded, options, opening)
+    except TaskError as error:
+        take_back(loaded)
+        raise with_advice(error, loaded, options, lambda: load_task(reference)) from error.__cause__
+    except BaseException:
+        take_back(loaded)
+        raise
+
+
+def import_task(
+    reference: TaskName, options: TaskOptions, source: dict[str, str] | None, opening: Opening
+) -> LoadedTask:
+    """The class of a task, with `source` in place of what is on disk if it is given. Raises TaskError."""
+    opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
+    import_modules(options.imports)
+    loaded = load_task(reference, source=source)
+    opening.clock.lap("import")
+    return loaded
+
+
+def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
+    """Build, rehearse and reset what was imported; taking back `loaded` where that raises TaskError is the caller's."""
+    on_activity, clock = opening.on_activity, opening.clock
+    on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
+    with blamed("build", loaded):
+        env = make_env(
+            loaded.cls,
+            EnvOptions(
+                num_envs=options.num_envs,
+                backend=options.backend,
+                rules=_rules(loaded, options),
+                on_finding=opening.on_finding,
+                kwargs=options.env_kwargs,
+            ),
+            asset_ids=loaded.asset_ids,
+            default_kwargs=loaded.default_kwargs,
+        )
+    clock.lap("build")
+    if opening.begins_anew and isinstance(env, BatchedCpuMixin):
+        env.begins_anew = True
+    try:
+        with blamed("build", loaded):
+            task = TaskEnv(env, loaded.max_episode_steps, check=returns_check(loaded, options.num_envs))
+        on_activity("trying a reset and a step")
+        rehearse(task, loaded, options.seed)
+        clock.lap("rehearse")
+        if task.broken_rules is not None:
+            task.broken_rules.begin()
+        first = reset_checked(task, loaded, options.seed)
+        clock.lap("reset")
+        on_activity("reading the shapes")
+        loaded = with_late_imports(loaded)
+        description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
+        description = replace(description, notices=notices_of(loaded, options))
+        clock.lap("geometry")
+    except BaseException:
+        env.close()
+        raise
+    return OpenedTask(loaded, task, description, first, clock.laps)
+
+
+def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
+    """One reset, one step and one partial reset; raises TaskError where the task fails in one."""
+    reset_checked(task, loaded, seed)
+    step_checked(task, loaded, actions.hold_action(task.parts, task.num_envs))
+    if task.num_envs > 1:
+        reset_checked(task, loaded, env_idx=[0])
+
+
+def step_checked(task: TaskEnv, loaded: LoadedTask, action: Any) -> StepResult:
+    """`TaskEnv.step`; what goes wrong is raised as a TaskError with the author's line."""
+    with blamed("step", loaded, task):
+        return task.step(action if task.parts else None)
+
+
+def reset_checked(
+    task: TaskEnv,
+    loaded: LoadedTask,
+    seed: int | Sequence[int] | None = None,
+    env_idx: Sequence[int] | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> StepResult:
+    """`TaskEnv.reset`; what goes wrong is raised as a TaskError with the author's line."""
+    with blamed("reset", loaded, task):
+        return task.reset(seed=seed, env_idx=env_idx, options=options)
+
+
+def restore_checked(
+    task: TaskEnv, loaded: LoadedTask, snapshot: Snapshot, env_idx: Sequence[int], source: Sequence[int]
+) -> tuple[StepResult, RestoreReport]:
+    """`TaskEnv.restore`; what goes wrong is raised as a TaskError with the author's line."""
+    with blamed("restore", loaded, task):
+        return task.restore(snapshot, env_idx, source)
+
+
+def describe(
+    loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any], max_episode_steps: int | None
+) -> TaskDescription:
+    """What the page must know of the task, as plain data; `given` are the keywords that it was made with."""
+    env = task.env
+    dimensions = [
+        ActionDimension(name, float(low), float(high))
+        for part in task.parts
+        for name, low, high in zip(part.names, part.low, part.high, strict=True)
+    ]
+    simulation = "gpu" if env.device.type == "cuda" else "cpu (batched)"
+    can_render = bool(env.scene.can_render())
+    renderer = find_renderer() if can_render else None
+    control_mode = None if env.agent is None else str(env.control_mode)
+    return TaskDescription(
+        env_id=loaded.env_id,
+        class_name=loaded.class_name,
+        file=None if loaded.file is None else str(loaded.file),
+        source_files=tuple(str(path) for path in loaded.source_files) if loaded.followed else (),
+        source_hash=loaded.source_hash,
+        source=dict(loaded.source),
+        backend=simulation,
+        device=f"{env.device}" + (f", pictures on {renderer.name}" if renderer else ", no pictures"),
+        num_envs=task.num_envs,
+        max_episode_steps=max_episode_steps,
+        obs_mode=env.obs_mode,
+        reward_mode=env.reward_mode,
+        control_mode=control_mode,
+        control_dt=task.control_dt,
+        actions=tuple(dimensions),
+        geometry=read_geometry(env),
+        cameras=list_cameras(env),
+        segmentation=segmentation_names(env),
+        can_render=can_render,
+        chosen=loaded.chosen,
+        others=loaded.others if loaded.followed else (),
+        in_place_of=None if loaded.in_place_of is None else loaded.in_place_of.name,
+        env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
+        objects=objects_to_see(env),
+    )
+
+
+def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
+    """What whoever opens it should know although it works, in sentences."""
+    gpu = gpu_left_alone(options.backend)
+    return (*(loaded.notices if loaded.followed else ()), *(() if gpu is None else (gpu,)))
+
+
+def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
+    """What `TaskEnv` calls with what ``evaluate`` and the reward returned: raises TaskError for wrong shapes."""
+
+    def check(evaluate: Mapping[str, Any], reward: Any) -> None:
+        problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
+        if problem is not None:
+            raise TaskError(problem)
+
+    return check
+
+
+def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:
+    """An installed task is not its reader's to mend: unless it is asked for, it is told of and never stopped."""
+    if options.rules is None and not loaded.followed and class_is_installed(loaded.cls):
+        return "warn"
+    return options.rules
+
+
+class blamed:
+    """Turns what the author's code raises into a TaskError that names their line."""
+
+    def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
+        self._stage, self._loaded, self._task = stage, loaded, task
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, Interrupted):
+            # Nothing more of the author's is called to find out what is wrong: it may be what does not end.
+            files, cls = self._loaded.source_files, self._loaded.cls
+            raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
+        # SystemExit as well, and what an author derives from BaseException: neither must take the worker along.
+        # Here and not further up: there the version before may have been put back, with its texts.
+        if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
+            return
+        raise TaskError(self._problem(error)) from error
+
+    def _is_closed(self, error: BaseException) -> bool:
+        """Whether a generator of ours is closed in the middle; not where the author's code raised that."""
+        if not isinstance(error, GeneratorExit):
+            return False
+        files = {str(file) for file in self._loaded.source_files}
+        return not any(frame.filename in files for frame in traceback.extract_tb(error.__traceback__))
+
+    def _problem(self, error: BaseException) -> Problem:
+        loaded = self._loaded
+        if isinstance(error, WrongReturn):
+            return problem_from_return(loaded.cls, error.hook, error.said, loaded.source_files)
+        env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
+        if isinstance(error, (BrokenRule, ForgottenInit)):
+            return _problem_at_its_place(error, self._stage, loaded)
+        known = _raised_in(error, loaded.source_files)
+        if env is not None and not known:
+            # Raised in ManiSkill's own code, most often over what evaluate() returned; the last line of
+            # the author's on the traceback is then only their call of super().__init__().
+            try:
+                returned = env.evaluate()
+            except Exception:
+                # It cannot be asked, as where an unknown keyword ended the constructor and no scene is there:
+                # telling that would hide what happened.
+                return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+            blamed = check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
+            if blamed is not None:
+                return blamed
+        return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+
+
+def _problem_at_its_place(error: BrokenRule | ForgottenInit, stage: str, loaded: LoadedTask) -> Problem:
+    """At the line that is at fault, also where that was over before it showed, and is on no traceback."""
+    problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
+    if error.place is None or Path(error.place[0]) not in loaded.source_files:
+        return problem
+    file, line, _ = error.place
+    return replace(problem, file=file, line=line, code=linecache.getline(file, line).strip() or None)
+
+
+def _raised_in(error: BaseException, files: Sequence[Path]) -> bool:
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and Path(frames[-1].filename) in files
+
+
+def _env_on_traceback(error: BaseException, cls: type) -> Any:
+    """The env whose constructor raised: ``BaseEnv.__init__`` resets, so hooks run before it returns."""
+    trace = error.__traceback__
+    while trace is not None:
+        owner = trace.tb_frame.f_locals.get("self")
+        if isinstance(owner, cls):
+            return owner
+        trace = trace.tb_next
+    return None
+
+
+# --- before any ----------------------------------------------------------------------------------------
+
+_SMALL_TASK = "PickCube-v1"
+"""Needs no download, has a sensor and a human camera, and the robot that most tasks have."""
+
+
+def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
+    """What a process does once and takes long over, done before somebody waits for it: make a small env, draw it, and
+    throw it away; ends early when `goes_on` says no.
+
+    To make the first env of a process and read its shapes takes 1.2 s with N = 4 on two cores, the second 0.12, and the
+    first picture of each kind of camera has its shaders compiled: the robot's files, the render system and the shaders
+    are the same, whatever the author's task is.
+
+    It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
+    """
+    # Of the author's own arguments the one that says whether there is anything to draw with.
+    renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
+    try:
+        opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))
+    except TaskError:
+        return
+    try:
+        for camera in recorded_pictures(opened.description.cameras):
+            if not goes_on():
+                return
+            take_pictures(opened.env.env, 0, [camera])
+    finally:
+        opened.env.close()

@@ -1,0 +1,403 @@
+"""Record episodes without a page: as many envs at once as asked for, in one process or several.
+
+Each episode is started by a reset of its env alone with a seed of its own, so that episode k of a recording is the one
+that ``gym.make(...).reset(seed=seed + k)`` starts, whatever the number of envs and processes; and its actions are its
+own too (`acting.RecordActing`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from workbench.authoring.loading.reference import named_file
+from workbench.core.broken_rule import warn_of
+from workbench.core.cameras.render import recorded_pictures, step_pictures
+from workbench.core.capture.recorded_run import RecordedRun, states_of
+from workbench.core.capture.recorded_state import apart
+from workbench.core.capture.state_columns import read_state_columns
+from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
+from workbench.jobs.actions import SUFFIXES, Acting, RecordActing, read_given
+from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
+from workbench.jobs.open_task import OpenedTask, blamed, open_task, reset_checked, step_checked
+from workbench.jobs.policy import find_policy
+from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
+from workbench.jobs.record_options import RecordArguments
+from workbench.jobs.replay import put_there
+from workbench.jobs.task import Stepped, TaskOptions
+from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.recording.writing.episode_writer import EpisodeFiles
+from workbench.recording.writing.publish import RecordingError
+
+_STEPS_WITHOUT_LIMIT = 200
+_TRIES = 100
+"""For each success that is wanted."""
+_KINDS = ("random", "zero", "hold")
+_ELSEWHERE = 1e-4
+"""Metres, or radians: a start that is further from the demonstration's is another start."""
+
+
+@dataclass(frozen=True)
+class RecordOptions(RecordArguments):
+    """What to record, and how its task is made."""
+
+    options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
+
+
+@dataclass(frozen=True)
+class Written:
+    """An episode that is on the disk."""
+
+    index: int
+    """Which of the recording it is."""
+    path: Path
+    """Its .rrd; the .h5 and .json lie beside it."""
+    seed: int
+    steps: int
+    total_reward: float
+    success: bool | None
+    put_right: bool = False
+    """Its seed gives another start than the demonstration's, and it was put to its first state."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    kept: int
+    """Episodes that are kept so far."""
+    steps: int
+    """Control steps made so far, over all envs with an episode."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What came of it."""
+
+    written: tuple[Written, ...]
+    """In the order of their numbers."""
+    tried: int
+    """Episodes that it took."""
+    stopped: bool
+    """Somebody ended it before."""
+    put_right: int = 0
+    """Episodes that were."""
+
+
+def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[RecordedRun]]:
+    """What is asked for, with what the file of actions says of it: how many episodes, the control mode. And its runs, one
+    for each episode or one for all; none where the actions are not in a file.
+
+    Raises:
+        FileNotFoundError, ValueError: as `read_given`; or the numbers asked for make no sense.
+    """
+    given: Sequence[RecordedRun] = ()
+    if Path(what.actions).suffix in SUFFIXES:
+        given, env_kwargs = read_given(Path(what.actions))
+        options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
+        what = replace(what, options=options)
+    elif what.actions not in _KINDS:
+        find_policy(what.actions, _beside(what))
+    if what.use_env_states and not (given and all(run.env_states for run in given)):
+        raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")
+    if what.episodes is not None and what.successes is not None:
+        raise ValueError("--episodes and --successes: name one of them")
+    for name, number in (
+        ("episodes", what.episodes),
+        ("successes", what.successes),
+        ("tries", what.tries),
+        ("workers", what.workers),
+        ("max-steps", what.max_steps),
+    ):
+        if number is not None and number < 1:
+            raise ValueError(f"--{name} must be at least 1, not {number}")
+    several = len(given) if len(given) > 1 else 0
+    if what.successes is None:
+        episodes = what.episodes or len(given) or 4
+        if several and episodes > several:
+            raise ValueError(f"{what.actions} has {several} episodes, and --episodes asks for {episodes}")
+        return replace(what, episodes=episodes), given
+    most = what.tries or _TRIES * what.successes
+    return replace(what, tries=min(most, several) if several else most), given
+
+
+def record(
+    what: RecordOptions,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    stop: Callable[[], bool] = lambda: False,
+    on_finding: Callable[[Finding], None] = warn_of,
+    executor: Executor | None = None,
+) -> Recorded:
+    """Record into ``what.out``.
+
+    Args:
+        on_finding: called with each place where the task breaks a rule that does not stop it, once.
+        stop: asked between steps; when it says yes, what is over is kept, the rest is not, and that is it.
+        executor: None for this process, or, with several workers, for processes of their own.
+
+    Raises:
+        TaskError: the task cannot be opened, or fails while it runs.
+        RecordingError: a file cannot be written.
+        PoolError: a process that records failed or died.
+        FileNotFoundError, ValueError: what is asked for makes no sense.
+    """
+    what, given = with_given_actions(what)
+    envs = shares(what.options.num_envs, what.workers)
+    setups = [replace(what, options=replace(what.options, num_envs=count)) for count in envs]
+    recording = _Recording(what, on_activity, on_progress, stop, on_finding)
+    run = _record_share
+    if executor is None and len(setups) == 1:
+        executor, run = Here(), partial(_record_share, given=given)
+    work = Work(run, setups, result=Written | None, news=str | int | Finding, name="that records")
+    (executor or Processes()).run(work, recording.deal)
+    return recording.so_far(stop())
+
+
+class _Recording:
+    """What is heard of the episodes, whoever makes them.
+
+    Who wants K successes gets those with the lowest numbers, and that is where order matters: with many envs, or several
+    processes, a later episode may succeed before an earlier one has ended. Its files go again when K others are before it.
+    """
+
+    def __init__(
+        self,
+        what: RecordOptions,
+        on_activity: Callable[[str], None],
+        on_progress: Callable[[Progress], None],
+        stop: Callable[[], bool],
+        on_finding: Callable[[Finding], None],
+    ) -> None:
+        self._folder, self._wanted = what.out.absolute(), what.successes
+        self._on_activity, self._on_progress, self._on_finding = on_activity, on_progress, on_finding
+        self._kept: dict[int, Written] = {}
+        self._ended = self._steps = 0
+        self._found: set[object] = set()
+        """Each process finds the same, and it is told once."""
+        most = what.episodes if what.successes is None else what.tries
+        assert most is not None
+        self.deal: Deal[Written | None, str | int | Finding] = Deal(range(most), self._over, self._news, stop)
+
+    def so_far(self, stopped: bool) -> Recorded:
+        enough = self._wanted is not None and len(self._kept) == self._wanted
+        written = tuple(self._kept[number] for number in sorted(self._kept))
+        put_right = sum(episode.put_right for episode in written)
+        return Recorded(written, written[-1].index + 1 if enough else self._ended, stopped, put_right)
+
+    def _over(self, number: int, written: Written | None) -> None:
+        self._ended += 1
+        if written is not None:
+            self._kept[number] = written
+        if self._wanted is not None and len(self._kept) >= self._wanted:
+            last = sorted(self._kept)[self._wanted - 1]
+            self.deal.lower(last + 1)
+            for surplus in [number for number in self._kept if number > last]:
+                self._remove(self._kept.pop(surplus))
+        self._on_progress(Progress(len(self._kept), self._steps))
+
+    def _news(self, news: str | int | Finding) -> None:
+        if isinstance(news, str):
+            self._on_activity(news)
+        elif isinstance(news, int):
+            self._steps += news
+            self._on_progress(Progress(len(self._kept), self._steps))
+        elif news.key not in self._found:
+            self._found.add(news.key)
+            self._on_finding(news)
+
+    def _remove(self, episode: Written) -> None:
+        for suffix in (".json", ".h5", ".rrd"):  # what has no .json is not there
+            (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)
+
+
+def _record_share(what: RecordOptions, share: Share, given: Sequence[RecordedRun] | None = None) -> None:
+    """What one process does. Raises as `record`.
+
+    Args:
+        given: as `with_given_actions`, if that was read already.
+    """
+    torch.set_num_threads(1)  # see workbench.session.worker.loop.work
+    if given is None:
+        what, given = with_given_actions(what)
+    here = CurrentFolder()  # the task may go to another
+    with here.again():
+        folder = what.out.absolute()
+        opened = open_task(what.task, what.options, on_activity=share.say, on_finding=share.say)
+        try:
+            _Episodes(opened, what, here, folder, given, share).run()
+        finally:
+            opened.env.close()
+
+
+class _Episodes:
+    """The episodes that one process makes: envs that are free take the next one, and all make a step."""
+
+    def __init__(
+        self,
+        opened: OpenedTask,
+        what: RecordOptions,
+        here: CurrentFolder,
+        folder: Path,
+        given: Sequence[RecordedRun],
+        share: Share,
+    ) -> None:
+        self._opened, self._what, self._given, self._share = opened, what, given, share
+        self._finisher = EpisodeFinisher()
+        self._envs = list(range(opened.env.num_envs))
+        self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
+        plain = not given and what.actions != "random"
+        self._acting = RecordActing(_acting(what, here) if plain else None)
+        self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
+        self._running: dict[int, int] = {}
+        """Number of the episode in each env that has one."""
+        self._steps: dict[int, int] = {}
+        self._put_right: set[int] = set()
+        """Episodes whose seed gives another start than the demonstration's."""
+        self._made: dict[int, tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = {}
+
+    def run(self) -> None:
+        """Until there is nothing more to make; what is under way after a failure is not kept."""
+        try:
+            while self._begin_free():
+                self._step()
+                self._collect()
+        finally:
+            self._drop_from(0)
+            self._finisher.close()
+            self._collect()
+
+    def _begin_free(self) -> bool:
+        """Whether any env has an episode."""
+        self._drop_from(self._share.limit())
+        for env in self._envs:
+            if env not in self._running and (index := self._share.next()) is not None:
+                self._begin(env, index)
+        return bool(self._running)
+
+    def _drop_from(self, limit: int) -> None:
+        for env in [env for env, index in self._running.items() if index >= limit]:
+            self._gatherer.drop(env)
+            self._free(env)
+
+    def _free(self, env: int) -> None:
+        del self._running[env]
+        self._acting.end(env)
+
+    def _collect(self) -> None:
+        """Tell of the episodes whose files are there.
+
+        Raises:
+            RecordingError: those of one cannot be written.
+        """
+        for index in [index for index, (_, future) in self._made.items() if future.done()]:
+            episode, future = self._made.pop(index)
+            files = future.result()
+            if isinstance(files, str):
+                raise RecordingError(files)
+            shown = self._what.out / files.rrd.name  # as the person named the folder
+            put_right = index in self._put_right
+            self._share.tell(
+                index,
+                Written(
+                    index,
+                    shown,
+                    episode.seed,
+                    episode.steps,
+                    episode.total_reward,
+                    episode.success,
+                    put_right,
+                ),
+            )
+
+    # --- one episode -----------------------------------------------------------------------------------
+
+    def _given_of(self, index: int) -> RecordedRun | None:
+        return self._given[index % len(self._given)] if self._given else None
+
+    def _begin(self, env: int, index: int) -> None:
+        task, given = self._opened.env, self._given_of(index)
+        seed = self._what.options.seed + index
+        if given is not None and given.seed >= 0:
+            seed = given.seed
+        step = reset_checked(task, self._opened.loaded, seed, [env])
+        self._running[env], self._steps[env] = index, 0
+        if given is not None and given.env_states:
+            step = self._put_right_start(env, given, step)
+        self._gatherer.acted_by = self._acting.begin(env, seed, given)
+        mask = np.zeros(task.num_envs, bool)
+        mask[env] = True
+        self._gatherer.take(self._stepped(step, mask, [env]))
+
+    def _put_right_start(self, env: int, given: RecordedRun, step: StepResult) -> StepResult:
+        first, task = given.state(0), self._opened.env
+        if max(apart(states_of(read_state_columns(task), env), first)) <= _ELSEWHERE:
+            return step
+        self._put_right.add(self._running[env])
+        return put_there(self._opened, {env: first})
+
+    def _step(self) -> None:
+        """A control step of all envs, and the end of the episodes that are over with it."""
+        task, loaded = self._opened.env, self._opened.loaded
+        action = self._acting.next_action(task, {env: self._steps[env] for env in self._running})
+        step = step_checked(task, loaded, action)
+        if self._what.use_env_states:
+            states = {
+                env: given.state(self._steps[env] + 1)
+                for env, index in self._running.items()
+                if (given := self._given_of(index)) is not None
+            }
+            step = put_there(self._opened, states, action)
+        none = np.zeros(task.num_envs, bool)
+        self._gatherer.take(self._stepped(step, none, sorted(self._running)))
+        self._share.say(len(self._running))
+        for env in list(self._running):
+            self._steps[env] += 1
+            if self._is_over(env, step):
+                self._gatherer.end(env)
+                self._free(env)
+
+    def _is_over(self, env: int, step: StepResult) -> bool:
+        given = self._given_of(self._running[env])
+        if given is not None:
+            return self._steps[env] >= min(given.length, self._what.max_steps or 10**9)
+        limit = self._what.max_steps or self._opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
+        return bool(step.terminated[env] or step.truncated[env] or self._steps[env] >= limit)
+
+    def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
+        task = self._opened.env
+        pictures = tuple(step_pictures(task, pictured, self._wanted))
+        with blamed("step", self._opened.loaded, task):
+            columns = read_state_columns(task)
+        return Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns)
+
+    def _over(self, episode: GatheredEpisode) -> None:
+        index = self._running[episode.env]
+        if self._what.successes is not None and not episode.success:
+            episode.writer.discard()
+            self._share.tell(index, None)
+        else:
+            self._made[index] = episode, self._finisher.finish(episode)
+
+
+def _acting(what: RecordOptions, here: CurrentFolder) -> Acting:
+    acting = Acting(here)
+    acting.seed(what.options.seed)
+    if what.actions in ("hold", "zero"):
+        acting.use(what.actions, None)
+    else:
+        with here.again():
+            beside = _beside(what)
+        acting.use("policy", what.actions, beside)
+    return acting
+
+
+def _beside(what: RecordOptions) -> Path | None:
+    """Where a policy may be too."""
+    file = named_file(what.task)
+    return None if file is None else file.parent

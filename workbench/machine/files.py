@@ -1,0 +1,228 @@
+"""Files that are there whole or not at all, whoever reads, dies or fills the disk meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+MOST_BYTES = 64 << 20
+"""Of what is expected to be there."""
+_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
+
+
+@contextmanager
+def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Path]:
+    """A file in the folder of `path` that holds `content` and is on the disk; gone after the block, if it is still there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    temporary = path.with_name(f".{uuid.uuid4().hex}{path.suffix}.part")
+    try:
+        with open(temporary, "xb", opener=lambda name, how: os.open(name, how, mode)) as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        yield temporary
+    finally:
+        with contextlib.suppress(OSError):  # what is to be told is why it was not written
+            temporary.unlink(missing_ok=True)
+
+
+def give_name(temporary: Path, path: Path) -> None:
+    """Let `path`, which must be free, be the file that is whole at `temporary`; that one may be gone then.
+
+    Raises:
+        FileExistsError: it is taken.
+        OSError: it cannot be done.
+    """
+    try:
+        os.link(temporary, path)  # unlike a rename it is never over another
+    except FileExistsError:
+        raise
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # A filesystem without hard links (FAT, some network drives): claim the name, then replace it.
+        path.touch(exist_ok=False)
+        try:
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+            raise
+
+
+def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
+    """Write a file that must not be there yet; False, and nothing done, if it is. Raises OSError."""
+    with written_beside(path, content, mode) as temporary:
+        try:
+            give_name(temporary, path)
+        except FileExistsError:
+            return False
+    return True
+
+
+def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> bool:
+    """Let `path`, whether or not it is there yet, hold `content`; False, and nothing done, if it no longer holds what is `expected`.
+
+    A link stays one; mode and owner stay as they are.
+
+    Raises:
+        OSError: it cannot be written; it holds what it held before.
+    """
+    path = path.resolve()
+    with written_beside(path, content) as temporary:
+        with contextlib.suppress(FileNotFoundError):  # a new file has no mode to keep
+            status = path.stat()
+            with contextlib.suppress(PermissionError):  # a group's file that somebody else in the group owns
+                os.chown(temporary, status.st_uid, status.st_gid)
+            with contextlib.suppress(PermissionError):  # a drive that knows no modes
+                os.chmod(temporary, stat.S_IMODE(status.st_mode))
+        if expected is not None and read_regular_file(path, MOST_BYTES) != expected:
+            return False
+        os.replace(temporary, path)
+    return True
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A name beside `path` to write to; what was written has the name `path` after the block, unless it raised.
+
+    Raises:
+        FileExistsError: there is something at `path`; the message says what to do.
+        OSError: the folder cannot be written to, or the disk is full; the message names the file.
+    """
+    path = Path(path)
+    if path.exists():
+        raise _taken(path)
+    temporary = path.parent / f".{uuid.uuid4().hex}.part"
+    try:
+        _make_folder(path.parent)
+        yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        give_name(temporary, path)
+    except FileExistsError:
+        raise _taken(path) from None
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
+    finally:
+        # The other name is there by now, or it is to be told why it is not.
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:  # which would be taken for one of the file's own name
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
+
+
+def _taken(path: Path) -> FileExistsError:
+    return FileExistsError(
+        f"There is a file {path} already, and it is not written over: move it, or name another folder."
+    )
+
+
+# --- Reads files that others may have replaced: only regular files, and only so much of them ---
+
+
+MOST_SOURCE_BYTES = 16 << 20
+"""Of one Python file; the largest of the standard library has a fiftieth of this."""
+_PIECE = 1 << 20
+_KINDS = (
+    (stat.S_ISDIR, "folder"),
+    (stat.S_ISFIFO, "named pipe"),
+    (stat.S_ISCHR, "character device"),
+    (stat.S_ISBLK, "block device"),
+    (stat.S_ISSOCK, "socket"),
+)
+
+
+class NotARegularFile(OSError):
+    """A path that leads to a device, a pipe, a socket or a folder. As text, a sentence that names the path."""
+
+    def __str__(self) -> str:
+        return f"{self.filename} {self.strerror}"
+
+
+class FileTooLarge(OSError):
+    """A file with more bytes than its kind may have. As text, as of `NotARegularFile`."""
+
+    __str__ = NotARegularFile.__str__
+
+
+def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:
+    """The content of a file of at most `most_bytes`.
+
+    Raises:
+        NotARegularFile: ``path`` is, or links to, something else. It was not read from.
+        FileTooLarge: there is more, also where the file says a smaller size or grows meanwhile.
+        OSError: it cannot be opened or read.
+    """
+    with open_regular_file(path, most_bytes) as file:
+        pieces, size = [], 0
+        # In pieces: one read of `most_bytes` would allocate them all for a file of ten bytes.
+        while piece := file.read(min(_PIECE, most_bytes + 1 - size)):
+            pieces.append(piece)
+            size += len(piece)
+            if size > most_bytes:
+                raise _too_large(path, None, most_bytes)
+    return b"".join(pieces)
+
+
+def open_regular_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> BinaryIO:
+    """Open a file for reading, never waiting for it; links to regular files are followed.
+
+    Args:
+        most_bytes: its size may be no more than this; None for any size. A file that grows afterwards, and one of
+            ``/proc`` that has no size, can give more.
+
+    Raises:
+        NotARegularFile, FileTooLarge, OSError: as `read_regular_file`.
+    """
+    # Looked at before it is opened: opening some devices does something (a watchdog, a tape).
+    _must_be_regular(path, os.stat(path).st_mode)
+    # It may be another one by now, and the open of a pipe without a writer would wait for ever.
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    try:
+        found = os.fstat(fd)
+        _must_be_regular(path, found.st_mode)
+        if most_bytes is not None and found.st_size > most_bytes:
+            raise _too_large(path, found.st_size, most_bytes)
+        return os.fdopen(fd, "rb")
+    except BaseException:
+        os.close(fd)
+        raise
+
+
+def _must_be_regular(path: str | os.PathLike[str], mode: int) -> None:
+    if stat.S_ISREG(mode):
+        return
+    kind = next((name for is_kind, name in _KINDS if is_kind(mode)), "special file")
+    raise NotARegularFile(errno.EINVAL, f"is a {kind}, not a regular file", os.fspath(path))
+
+
+def _too_large(path: str | os.PathLike[str], size: int | None, most_bytes: int) -> FileTooLarge:
+    has = "has more" if size is None else f"has {_in_words(size)}, more"
+    return FileTooLarge(
+        errno.EFBIG, f"{has} than the {_in_words(most_bytes)} that such a file may have", os.fspath(path)
+    )
+
+
+def _in_words(size: int) -> str:
+    for unit, name in ((2**30, "GB"), (2**20, "MB"), (2**10, "KB")):
+        if size >= unit:
+            return f"{size / unit:.1f} {name}"
+    return f"{size} bytes"

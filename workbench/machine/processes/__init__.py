@@ -1,0 +1,1 @@
+"""How processes are started, spoken to, confined and ended."""

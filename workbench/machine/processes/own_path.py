@@ -1,0 +1,32 @@
+"""Takes the current folder out of where this command imports from. Imported first of all, for that effect.
+
+``python -m`` puts the folder where a command is started first on ``sys.path``, and so does an empty entry of
+``PYTHONPATH``: a ``numpy.py`` in a downloaded folder of recordings would run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+
+def without_current_folder(path: Sequence[str], python_path: str) -> list[str]:
+    """`path` less the current folder, unless somebody named it or this very package is imported from there.
+
+    Args:
+        python_path: the variable ``PYTHONPATH``: what is named there, ``.`` too, is meant.
+    """
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # it was removed: nothing can be imported from it
+        return list(path)
+    named = {os.path.realpath(entry) for entry in python_path.split(os.pathsep) if entry}
+    package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.realpath(__file__)))))
+    libraries = os.path.dirname(os.path.realpath(os.__file__))
+    if here in (*named, package, libraries) or os.path.basename(here) in ("site-packages", "dist-packages"):
+        return list(path)
+    return [entry for entry in path if os.path.realpath(entry) != here]
+
+
+sys.path[:] = without_current_folder(sys.path, os.environ.get("PYTHONPATH", ""))

@@ -1,0 +1,199 @@
+"""Whether SAPIEN finds something to render with, asked of SAPIEN itself.
+
+That a driver file (ICD) lies in /usr/share/vulkan proves nothing: Mesa 22.3's software driver is
+there on every Debian 12 with Chromium, and SAPIEN refuses it; an NVIDIA ICD without the kernel module
+crashes or hangs in native code. So a child process builds a `sapien.render.RenderSystem` on the same
+device that ManiSkill would ask for, and tells the name; if it crashes or hangs, that is the answer.
+
+The driver's name and version come from Vulkan (``VkPhysicalDeviceDriverProperties``, core since 1.2),
+because SAPIEN tells only the device's. Run as a module this file is that child: it prints one line of
+JSON.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import struct
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+
+from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.family import describe_exit
+
+ANSWER = "render-device-answer:"
+DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
+
+SYSTEM_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libxcb.so.1": "libxcb1",
+    "libGL.so.1": "libgl1",
+    "libgthread-2.0.so.0": "libglib2.0-0",
+}
+"""Libraries that the wheels of sapien and opencv-python load and do not carry -> Debian's package."""
+
+
+@dataclass(frozen=True)
+class RenderProbe:
+    """What one look found."""
+
+    ok: bool
+    name: str | None = None
+    """The device, as Vulkan calls it: ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
+    driver: str | None = None
+    """The driver and its version: ``llvmpipe, Mesa 25.0.7-2``."""
+    error: str | None = None
+    """Why not, in a sentence; None when `ok`."""
+    env: Mapping[str, str] = field(default_factory=dict)
+    """Variables that a process must be started with to find this device; empty for a system driver."""
+    device: str | None = None
+    """What ``sapien.Device`` takes for it: ``cuda`` or ``cpu`` (any other Vulkan device)."""
+    missing_libraries: tuple[str, ...] = ()
+    """Those of `SYSTEM_LIBRARIES` that cannot be loaded; not empty makes `ok` False."""
+
+
+def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float = 60) -> RenderProbe:
+    """Ask a child process, started with this process's environment and `env` on top.
+
+    Never raises for what the child does: a crash, a hang of `timeout_s` or a missing library is an
+    answer with ``ok=False``.
+    """
+    added = dict(env or {})
+    try:
+        child = subprocess.run(
+            python_command("-m", "workbench.machine.render_probe"),
+            env=child_environment(**added),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+        )
+    except subprocess.TimeoutExpired:
+        return RenderProbe(ok=False, error=f"SAPIEN gave no answer in {timeout_s:.0f} s", env=added)
+    for line in child.stdout.splitlines():
+        if line.startswith(ANSWER):
+            return replace(msgspec.json.decode(line[len(ANSWER) :], type=RenderProbe), env=added)
+    how, last = (
+        describe_exit(child.returncode),
+        (child.stderr.strip().splitlines() or ["it said nothing"])[-1],
+    )
+    return RenderProbe(
+        ok=False, error=f"SAPIEN {how}" + (f": {last}" if child.returncode > 0 else ""), env=added
+    )
+
+
+def driver_files() -> list[Path]:
+    """The driver manifests (ICDs) that the Vulkan loader would read, by its documented search order.
+
+    Source: "LoaderDriverInterface.md" of Khronos' Vulkan-Loader, "Driver Discovery" on Linux.
+    """
+    for variable in DRIVER_VARIABLES:
+        if os.environ.get(variable):
+            return [Path(part) for part in os.environ[variable].split(os.pathsep) if Path(part).is_file()]
+    home = Path.home()
+    roots = [
+        Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config"),
+        *(Path(part) for part in (os.environ.get("XDG_CONFIG_DIRS") or "/etc/xdg").split(os.pathsep)),
+        Path("/etc"),
+        Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share"),
+        *(
+            Path(p)
+            for p in (os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share").split(os.pathsep)
+        ),
+    ]
+    return sorted({file for root in roots for file in (root / "vulkan" / "icd.d").glob("*.json")})
+
+
+def _look() -> RenderProbe:
+    """In the child: build a render system and describe the device it took."""
+    missing = tuple(name for name in SYSTEM_LIBRARIES if not _loads(name))
+    if missing:
+        return RenderProbe(ok=False, error=f"missing: {', '.join(missing)}", missing_libraries=missing)
+    import sapien
+    import sapien.render
+
+    refusals: list[str] = []
+    # CUDA first, as ManiSkill's "gpu" render backend; a process can have one render device, so the first
+    # that works ends the search.
+    for device in ("cuda", "cpu"):
+        try:
+            system = sapien.render.RenderSystem(device)
+        except RuntimeError as refusal:
+            refusals.append(str(refusal))
+            continue
+        summary = sapien.render.get_device_summary()
+        names = [line.partition(":")[2].strip() for line in summary.splitlines() if line.startswith("GPU:")]
+        name = names[0] if names else str(system.device)
+        return RenderProbe(ok=True, name=name, driver=_vulkan_drivers().get(name), device=device)
+    return RenderProbe(ok=False, error=_why(refusals[-1]))
+
+
+def _why(refusal: str) -> str:
+    """SAPIEN's refusal, with what a person can do about it where the environment is the reason."""
+    for variable in DRIVER_VARIABLES:
+        if os.environ.get(variable):
+            return f"{refusal} (the environment has {variable}={os.environ[variable]}: unset it, or mend it)"
+    return refusal
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def _vulkan_drivers() -> dict[str, str]:
+    """Device name -> driver name and version, for every device that Vulkan lists.
+
+    Written against the C layout of Vulkan 1.2 on 64 bits: VkApplicationInfo is 48 bytes with apiVersion
+    at 44; VkInstanceCreateInfo is 64 bytes with the application info's address at 24;
+    VkPhysicalDeviceDriverProperties has driverName (256 characters) at 20 and driverInfo at 276;
+    VkPhysicalDeviceProperties2 has pNext at 8 and the properties at 16, their deviceName at 20.
+    """
+    try:
+        vulkan = ctypes.CDLL(os.environ.get("SAPIEN_VULKAN_LIBRARY_PATH", "libvulkan.so.1"))
+    except OSError:
+        return {}
+    version_1_2 = 1 << 22 | 2 << 12
+    application = ctypes.create_string_buffer(48)
+    struct.pack_into("=I", application, 44, version_1_2)
+    create_info = ctypes.create_string_buffer(64)
+    struct.pack_into("=I", create_info, 0, 1)
+    struct.pack_into("=Q", create_info, 24, ctypes.addressof(application))
+    instance = ctypes.c_void_p()
+    if vulkan.vkCreateInstance(create_info, None, ctypes.byref(instance)) != 0:
+        return {}
+    count = ctypes.c_uint32(16)
+    devices = (ctypes.c_void_p * 16)()
+    vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), devices)
+    drivers: dict[str, str] = {}
+    for device in devices[: count.value]:
+        driver = ctypes.create_string_buffer(1024)
+        struct.pack_into("=I", driver, 0, 1000196000)
+        properties = ctypes.create_string_buffer(4096)
+        struct.pack_into("=I", properties, 0, 1000059001)
+        struct.pack_into("=Q", properties, 8, ctypes.addressof(driver))
+        vulkan.vkGetPhysicalDeviceProperties2(ctypes.c_void_p(device), properties)
+        drivers[_text(properties, 16 + 20)] = ", ".join(
+            filter(None, (_text(driver, 16 + 4), _text(driver, 276)))
+        )
+    return drivers
+
+
+def _text(buffer: ctypes.Array[ctypes.c_char], offset: int) -> str:
+    return bytes(buffer)[offset : offset + 256].split(b"\0", 1)[0].decode(errors="replace")
+
+
+def _answer() -> None:
+    print("\n" + ANSWER + msgspec.json.encode(_look()).decode(), flush=True)
+
+
+if __name__ == "__main__":
+    _answer()

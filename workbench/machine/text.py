@@ -1,0 +1,171 @@
+"""Numbers and lengths as text, NaN and infinite ones too: one way for the page, the terminal and the files.
+
+Short, since it is one decision that everything that shows a number must share.
+
+What a terminal gets can clear it, rename its window, write to the clipboard or move the cursor over what stood there;
+characters that turn the direction of writing make a name look like another. So all of these are shown as Python would
+write them (``\x1b``, ``\u202e``). Of an author's prints the colours are kept: only ``ESC [ numbers m``, and of the numbers
+only those that a reader can still see through. `guard_terminal` stands between a process and its terminal.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+_UNITS = (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4), ("µm", 1e-6, 1e-6), ("nm", 1e-9, 0.0))
+"""Name, size, and from where on it is used."""
+
+
+def number_text(value: float, form: str = ".4g") -> str:
+    """``0.25``, ``NaN``, ``infinite``, ``-infinite``."""
+    if math.isnan(value):
+        return "NaN"
+    if math.isinf(value):
+        return "infinite" if value > 0 else "-infinite"
+    return format(value, form)
+
+
+def lost_text(values: ArrayLike) -> str:
+    """How many of these are no finite numbers: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
+    flat = np.asarray(values).reshape(-1)
+    counts = {"NaN": int(np.isnan(flat).sum()), "infinite": int(np.isinf(flat).sum())}
+    told = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
+    return f"{told} of {len(flat)}" if told else ""
+
+
+def mean_text(values: ArrayLike, say: Callable[[float], str] = number_text) -> str:
+    """The mean of those that are finite, and how many are not: ``0.25, NaN in 3 of 16``."""
+    flat = np.asarray(values, np.float64).reshape(-1)
+    finite = flat[np.isfinite(flat)]
+    return ", ".join(
+        part for part in (say(float(finite.mean())) if len(finite) else "", lost_text(flat)) if part
+    )
+
+
+def length(metres: float) -> str:
+    """As a person says it: ``3.2 cm``, ``0.4 mm``, ``70 nm``, ``0``."""
+    if metres == 0:
+        return "0"
+    if not math.isfinite(metres):
+        return "more than can be told"
+    unit, size = next((unit, size) for unit, size, least in _UNITS if metres >= least)
+    return f"{metres / size:.2g} {unit}"
+
+
+# --- Text that comes from elsewhere, made harmless for a terminal and a page: controls are shown, colours are kept ---
+
+
+_SHOWN = re.compile(
+    "[\x00-\x1f\x7f-\x9f"  # C0, DEL and C1, which some terminals take for ESC and a letter
+    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # the direction of writing
+    "\u2028\u2029"  # line ends, to some programs
+    "\u200b\u2060\ufeff\U000e0000-\U000e007f"  # seen by nobody
+    "\ud800-\udfff]"  # bytes of a file's name that are not UTF-8: they cannot be printed
+)
+COLOURS = re.compile("\x1b\\[([0-9;:]{0,64})m")
+"""What changes them, and with which numbers."""
+HARMLESS = frozenset((0, 1, 2, 3, 4, 7, 9, 22, 23, 24, 27, 29, *range(30, 50), *range(90, 108)))
+"""Codes of colours and styles that hide nothing and do not blink."""
+
+
+def plain_text(text: str, keep: str = "") -> str:
+    """`text` with every control, unseen and direction character shown escaped, but for those in `keep`."""
+    if not _SHOWN.search(text):
+        return text
+    return _SHOWN.sub(
+        lambda found: found[0] if found[0] in keep else found[0].encode("unicode_escape").decode(), text
+    )
+
+
+def short_line(text: str, longest: int) -> str:
+    """`text` on one line of about `longest` characters, as in `plain_text`; what is too long lacks its middle."""
+    if len(text) > longest:
+        text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
+    return plain_text(text)
+
+
+def only_colours(text: str, keep: str = "\n\t") -> str:
+    """`text` with its colours as they are and all else as in `plain_text`."""
+    if not _SHOWN.search(text):
+        return text
+    parts: list[str] = []
+    end = 0
+    for found in COLOURS.finditer(text):
+        parts.append(plain_text(text[end : found.start()], keep))
+        harmless = all(code[0] in HARMLESS for code in colour_codes(found[1]))
+        parts.append(found[0] if harmless else plain_text(found[0]))
+        end = found.end()
+    parts.append(plain_text(text[end:], keep))
+    return "".join(parts)
+
+
+def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
+    """The codes, each with what belongs to it: (31,), (38, 5, 208), (48, 2, 0, 0, 0)."""
+    parts = iter(numbers.split(";"))
+    for part in parts:
+        if ":" in part:
+            values = [int(value) if value else 0 for value in part.split(":")]
+            # 38:2:SPACE:r:g:b and the 38:2:r:g:b that many write.
+            if values[0] in (38, 48) and len(values) > 5 and values[1] == 2:
+                del values[2]
+            yield tuple(values)
+            continue
+        code = int(part) if part else 0
+        if code not in (38, 48):
+            yield (code,)
+            continue
+        kind = next(parts, "")
+        wanted = {"5": 1, "2": 3}.get(kind, 0)
+        following = [next(parts, "") for _ in range(wanted)]
+        yield (code, *(int(value) if value.isdigit() else 0 for value in (kind, *following)))
+
+
+class SafeStream:
+    """A text stream that lets nothing through but text and its colours."""
+
+    def __init__(self, raw: Any) -> None:
+        self.raw = raw
+
+    def write(self, text: str) -> int:
+        self.raw.write(only_colours(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.raw, name)
+
+
+def guard_terminal() -> None:
+    """From now on nothing that this process prints does more to a terminal than show text in colours.
+
+    For good, since the traceback of what ends the process is printed last of all. What a program of its own writes to
+    the terminal, and native code, does not come by here.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, SafeStream):
+            setattr(sys, name, SafeStream(stream))
+    # Where nobody sets up logging, as here, all records go through this one.
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_OneLine())
+
+
+class _OneLine(logging.Formatter):
+    """A record of a logger is one line, whatever names are in it, and its traceback behind it."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return plain_text(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:
+        return plain_text(super().formatException(ei), "\n\t")

@@ -1,0 +1,1 @@
+"""One episode as columns, and what its files say of it."""

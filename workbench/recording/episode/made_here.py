@@ -1,0 +1,133 @@
+"""The seal of a recording: by it this installation knows what it recorded itself, also after others had it in hand.
+
+A keyed hash (HMAC-SHA256) with a key that is made once, at random, and that only this user can read. It covers what
+decides which code runs when the recording is judged or gone into (task, text, keywords), and what its files hash to
+(`document.checksum`). Tags and notes may change; a moved recording keeps it. Where the task's file lay has a hash of its own: a
+recording that comes back from elsewhere with another file beside it must not pass for the one that was open here.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from hashlib import sha256
+from typing import Any
+
+from workbench.machine.user_folder import create_private, read_private, set_aside
+from workbench.recording.episode.document import SHARED, Description, SealWords, as_json
+from workbench.recording.episode.episode import EpisodeInfo
+
+log = logging.getLogger(__name__)
+
+KEY_FILE = "recordings.key"
+_KEY_BYTES = 32
+_COVERED = {*SHARED, "seed", "source"} - {"acted_by"}
+_told: set[str] = set()
+
+
+class MadeHere(Enum):
+    NO = "no"
+    """It came from elsewhere, or was changed, or the key is gone."""
+    CONTENT = "content"
+    """This installation recorded it; but its task's file lay elsewhere, or is gone."""
+    CONTENT_AND_PLACE = "content and place"
+    """And the file that it names now is the one that was open then (with another text, perhaps)."""
+
+
+def seal(said: Description, source_file: str | None) -> SealWords | None:
+    """For the description `said` of a recording that is being made; None as `seal_text`.
+
+    Args:
+        source_file: the absolute path of the task's file.
+    """
+    values = {name: getattr(said, name) for name in _COVERED}
+    content = seal_text(_content(values, said.source_file, said.files, said.acted_by), "content")
+    place = seal_text(source_file or "", "place")
+    return None if content is None or place is None else SealWords(content, place)
+
+
+def made_here(info: EpisodeInfo) -> MadeHere:
+    """Whether this installation made the recording that `info` was read from."""
+    found = info.seal
+    if found is None:
+        return MadeHere.NO
+    values = {name: getattr(info, name) for name in _COVERED}
+    values["seed"] = info.seed if info.seed >= 0 else None
+    try:
+        content = _content(values, found.main, found.files, info.acted_by)
+    except (TypeError, ValueError, RecursionError):
+        return MadeHere.NO
+    if not is_sealed(content, found.content, "content"):
+        return MadeHere.NO
+    place = info.source_file
+    there = place is not None and os.path.isabs(place) and is_sealed(place, found.place, "place")
+    return MadeHere.CONTENT_AND_PLACE if there else MadeHere.CONTENT
+
+
+def seal_text(text: str, what: str = "text") -> str | None:
+    """A seal of a text that this installation writes and reads back, such as the head of a journal; None, which is told once,
+    where there can be no key.
+
+    Args:
+        what: it is; a seal of something else does not fit.
+    """
+    try:
+        return _mac(_key() or _new_key(), what, text)
+    except OSError as error:
+        _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
+        return None
+
+
+def is_sealed(text: str, found: object, what: str = "text") -> bool:
+    """Whether `found` is what `seal_text` gave for this here."""
+    try:
+        key = _key()
+    except OSError as error:
+        _tell_once(f"Recordings that were made here cannot be told from others: {error}")
+        return False
+    if key is None or not isinstance(found, str):
+        return False
+    return hmac.compare_digest(found.encode("utf-8", "surrogatepass"), _mac(key, what, text).encode())
+
+
+def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequence[Sequence[Any]]) -> str:
+    """One text for what JSON reads back as the same."""
+    return json.dumps(as_json([values, main, files, acted_by]), sort_keys=True)
+
+
+def _mac(key: bytes, what: str, text: str) -> str:
+    return hmac.new(key, f"{what}\0{text}".encode("utf-8", "surrogatepass"), sha256).hexdigest()
+
+
+def _key() -> bytes | None:
+    """None where there is none, or what is there is none."""
+    written = read_private(KEY_FILE)
+    try:
+        key = None if written is None else bytes.fromhex(written.decode("ascii"))
+    except ValueError:
+        return None
+    return key if key is not None and len(key) == _KEY_BYTES else None
+
+
+def _new_key() -> bytes:
+    if read_private(KEY_FILE) is not None:
+        broken = set_aside(KEY_FILE)
+        _tell_once(
+            f"The key of this installation's recordings was broken, and is {broken} now: there is a new one."
+        )
+    create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # or another process did, a moment ago
+    key = _key()
+    if key is None:
+        raise OSError("the key that was written cannot be read back")
+    return key
+
+
+def _tell_once(what: str) -> None:
+    if what not in _told:
+        _told.add(what)
+        log.warning("%s", what)

@@ -1,0 +1,1 @@
+"""All recordings below a folder, as a table."""

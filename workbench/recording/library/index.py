@@ -1,0 +1,180 @@
+"""What was read of a library's files, kept so that thousands of them are there at once the next time.
+
+The index is a cache and nothing else: all that it holds can be read again from the files, so whatever is wrong with it
+(cut short, a page of garbage, no place to write) is answered by throwing it away, never by an error.
+For each name it keeps its files as they were, the rows that they gave, and their thumbnails. It is SQLite, since
+that bears two processes at once and being killed; each write is one short transaction. A process that finds the file
+locked for long goes on without having written.
+
+It lies in the user's cache folder, and where that cannot be written in memory, for this time. Not in the library's folder: one that
+came from elsewhere would bring an index along, and SQLite does what a file says (it may be a link to another program's
+database, which would be given our tables, or have a journal that names files to delete).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+from workbench.machine.user_folder import cache_folder
+from workbench.recording.episode.row import Entry, Facts, clean_facts
+from workbench.recording.reader.scan import Found
+
+log = logging.getLogger(__name__)
+
+VERSION = 5
+"""Raised whenever rows are read or kept in another way; each version has a file of its own."""
+LOCKED_SECONDS = 3.0
+MOST_INDICES = 200
+"""Of folders that were looked into."""
+_ROWS = msgspec.msgpack.Decoder(tuple[dict[str, int], dict[str, int], list[Facts]])
+"""Sizes and times of the files, and what they gave."""
+_JPEGS = msgspec.msgpack.Decoder(list[bytes | None])
+_TABLES = ("read (key BLOB PRIMARY KEY, rows BLOB)", "pictures (key BLOB PRIMARY KEY, jpegs BLOB)")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What the files of one name gave when they were so."""
+
+    found: Found
+    rows: tuple[Facts, ...]
+
+
+class LibraryIndex:
+    """The index of one folder. Safe to use from several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._lock = threading.Lock()
+        self._path = index_path(folder)
+        self._database: sqlite3.Connection | None = _open(self._path)
+        _tidy(self._path)
+
+    def load(self) -> dict[str, Kept]:
+        """All that it holds, by key."""
+
+        def read(database: sqlite3.Connection) -> dict[str, Kept]:
+            kept = {}
+            for key, rows in database.execute("SELECT key, rows FROM read"):
+                sizes, times, facts = _ROWS.decode(rows)
+                found = Found(os.fsdecode(key), sizes, times)
+                kept[found.key] = Kept(found, tuple(map(clean_facts, facts)))
+            return kept
+
+        return self._do(read, {})
+
+    def store(self, read: Collection[tuple[Found, Sequence[Entry]]], gone: Collection[str] = ()) -> None:
+        """Keep what was read, and forget the keys that are gone."""
+
+        def write(database: sqlite3.Connection) -> None:
+            for found, entries in read:
+                key, facts = os.fsencode(found.key), [facts for facts, _ in entries]
+                rows = msgspec.msgpack.encode((found.sizes, found.times, facts))
+                jpegs = msgspec.msgpack.encode([jpeg for _, jpeg in entries])
+                database.execute("REPLACE INTO read VALUES (?, ?)", (key, rows))
+                database.execute("REPLACE INTO pictures VALUES (?, ?)", (key, jpegs))
+            keys = [(os.fsencode(key),) for key in gone]
+            database.executemany("DELETE FROM read WHERE key = ?", keys)
+            database.executemany("DELETE FROM pictures WHERE key = ?", keys)
+
+        self._do(write, None)
+
+    def thumbnails(self, wanted: Collection[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
+        """The jpegs of these rows (key, and number of the row in what its files gave), of those that have one."""
+
+        def read(database: sqlite3.Connection) -> dict[tuple[str, int], bytes]:
+            found = {}
+            for key in {key for key, _ in wanted}:
+                query = "SELECT jpegs FROM pictures WHERE key = ?"
+                for (jpegs,) in database.execute(query, (os.fsencode(key),)):
+                    found |= {(key, row): jpeg for row, jpeg in enumerate(_JPEGS.decode(jpegs)) if jpeg}
+            return {place: found[place] for place in wanted if place in found}
+
+        return self._do(read, {})
+
+    def close(self) -> None:
+        with self._lock:
+            if self._database is not None:
+                self._database.close()
+                self._database = None
+
+    def _do(self, work: Callable[[sqlite3.Connection], T], otherwise: T) -> T:
+        """`otherwise` where another process holds the file, and where what is there is of no use: it is thrown away. Another
+        process that has it open goes on with what it has, unharmed."""
+        with self._lock:
+            if self._database is None:
+                return otherwise
+            try:
+                with self._database:
+                    return work(self._database)
+            except (sqlite3.Error, msgspec.MsgspecError, ValueError, TypeError) as error:
+                # What Python's module raises by itself has no code. The low byte is the error, the rest tells its kinds apart.
+                code = getattr(error, "sqlite_errorcode", None) or 0
+                if code & 0xFF not in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+                    log.info("The index of the library is made anew: %s", error)
+                    self._database.close()
+                    _remove(self._path)
+                    self._database = _open(self._path)
+                return otherwise
+
+
+def index_path(folder: Path) -> Path:
+    """Where the index of a folder lies."""
+    name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
+    return cache_folder() / "libraries" / f"{name}-{VERSION}.sqlite"
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    """What is there and no index is thrown away; in memory where there is no place for it."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    for _ in range(2):
+        try:
+            return _connect(os.fspath(path))
+        except sqlite3.OperationalError:
+            break
+        except sqlite3.DatabaseError:
+            _remove(path)
+    return _connect(":memory:")
+
+
+def _connect(name: str) -> sqlite3.Connection:
+    database = sqlite3.connect(name, timeout=LOCKED_SECONDS, check_same_thread=False)
+    try:
+        with database:
+            for table in _TABLES:
+                database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
+            # A folder that may be read but not written says so only here.
+            database.execute("DELETE FROM read WHERE key = ''")
+    except sqlite3.Error:
+        database.close()
+        raise
+    return database
+
+
+def _tidy(path: Path) -> None:
+    """Throw away the indices that were used least lately, where there are very many."""
+    try:
+        os.utime(path)
+        indices = sorted(path.parent.glob("*.sqlite"), key=lambda index: index.stat().st_mtime)
+    except OSError:
+        return  # there is none, or another process is at it
+    for index in indices[:-MOST_INDICES]:
+        _remove(index)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        for name in (path, path.with_name(f"{path.name}-journal")):
+            name.unlink(missing_ok=True)

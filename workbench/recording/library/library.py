@@ -1,0 +1,352 @@
+"""The library: every recording below one folder, as a table that keeps up with the folder.
+
+A folder of recordings is the only truth: people move, copy and delete files, several processes write into it, and
+some of it comes from elsewhere. So the table is made from the files, again whenever they changed, and what can be
+done to recordings here (tags, a note, deleting) is done to the files. Reading thousands of them takes seconds, hence
+an index (`library_index`) from which the rows are there at once; then names, sizes and times are compared, and only
+what differs is read, the newest first and on a thread of its own (`watch`), with the rows so far shown meanwhile.
+
+Recordings are known by ids that this table gives. What a page sends is looked up here, and only what is found has
+paths.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from workbench.machine.processes.watched_thread import watched_thread
+from workbench.recording.episode.row import Entry, Facts, LibraryRow, clean_note, clean_tags, text
+from workbench.recording.episode.tags import write_into_description, write_notes
+from workbench.recording.library.index import Kept, LibraryIndex
+from workbench.recording.library.trash import (
+    Trash,
+    TrashError,
+    empty_trash,
+    look_into_trash,
+    put_into_trash,
+    take_out_of_trash,
+)
+from workbench.recording.reader.reading import read_rows
+from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, Scan, key_of, scan_folder
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY = 1.0
+"""Seconds between two looks at the folders' times."""
+LONGEST_PAUSE = 5.0
+LOOK_THOROUGHLY_EVERY = 30.0
+"""Seconds between two looks at every file: a file that was written to in place leaves its folder's time alone."""
+PUBLISH_EVERY = 0.3
+"""Seconds between two states of the table while it is being read."""
+
+
+class LibraryError(OSError):
+    """Something could not be done to recordings; the message says what to do about it."""
+
+
+@dataclass(frozen=True)
+class LibraryView:
+    """The table at one moment."""
+
+    serial: int = 0
+    """Grows with each change."""
+    rows: tuple[LibraryRow, ...] = ()
+    """By name."""
+    reading: tuple[int, int] | None = None
+    """Files read so far and to be read, while they are; (0, 0) before the first look has found out how many."""
+    problem: str | None = None
+    """A sentence, where the folder cannot be looked at."""
+    trash: Trash = Trash()
+
+
+class Library:
+    """The recordings in a folder and the folders below it.
+
+    Args:
+        folder: need not be there yet. Nothing is written into it but the index and what is asked for.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder).absolute()
+        self._looking = threading.Lock()
+        """Held while the folder is looked through: by one thread at a time."""
+        self._changing = threading.RLock()
+        """Held while `_kept` is changed, but not while all that changed is read."""
+        self._changed = threading.Lock()
+        self._view = LibraryView(reading=(0, 0))
+        self._by_id: dict[str, LibraryRow] = {}
+        self._scan = Scan(fresh=True)
+        self._thorough_at = -1e9
+        self._index: LibraryIndex | None = LibraryIndex(self.folder) if self.folder.is_dir() else None
+        self._kept: dict[str, Kept] = {} if self._index is None else self._index.load()
+        self._stopping = threading.Event()
+        self._asked = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    # --- looking -----------------------------------------------------------------------------------
+
+    def view(self) -> LibraryView:
+        return self._view
+
+    def rows(self) -> tuple[LibraryRow, ...]:
+        return self._view.rows
+
+    def row(self, id: str) -> LibraryRow | None:
+        """None for an id that is not in the table (any more)."""
+        return self._by_id.get(id)
+
+    def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
+        """Small jpegs of those of these recordings that have one."""
+        by_id, index = self._by_id, self._index
+        rows = [by_id[id] for id in ids if id in by_id]
+        jpegs = {} if index is None else index.thumbnails([row.place for row in rows])
+        return {row.id: jpegs[row.place] for row in rows if row.place in jpegs}
+
+    # --- keeping up with the folder ------------------------------------------------------------------
+
+    def watch(self) -> None:
+        """Keep the table up to date, on a thread of its own, until `close`."""
+        if self._thread is not None:
+            raise RuntimeError("The library is watched already.")
+        self._thread = watched_thread("library", self._watch)
+        self._thread.start()
+
+    def look_soon(self) -> None:
+        """Have the watching thread look at every file now, for whoever knows that something changed."""
+        self._asked.set()
+
+    def close(self) -> None:
+        """Stop to watch; returns when the thread has ended."""
+        self._stopping.set()
+        self._asked.set()
+        if self._thread is not None:
+            self._thread.join(timeout=10.0)
+        with self._changing:
+            if self._index is not None:
+                self._index.close()
+                self._index = None
+
+    def _watch(self) -> None:
+        while not self._stopping.is_set():
+            began = time.monotonic()
+            try:
+                self.refresh(thorough=self._asked.is_set())
+            except Exception:
+                # The table is what it was, and a thread that ended would let it be that for ever.
+                log.exception("The library in %s could not be read; trying again.", self.folder)
+                self._publish(problem="The library could not be read. The reason is in the terminal.")
+            self._asked.clear()
+            # Of a huge folder that is being written to, a tenth of the time goes into looking and not all of it.
+            self._asked.wait(min(max(LOOK_EVERY, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
+
+    def refresh(self, thorough: bool = True) -> None:
+        """Read what has changed since the last look.
+
+        Args:
+            thorough: look at every file, also if no folder says that something came or went.
+        """
+        with self._looking:
+            late = time.monotonic() - self._thorough_at > LOOK_THOROUGHLY_EVERY
+            if not (thorough or late) and self._scan.looks_the_same():
+                return
+            with self._changing:
+                if self._index is None and self.folder.is_dir() and not self._stopping.is_set():
+                    self._index = LibraryIndex(self.folder)
+                if self._view.serial == 0 and self._kept:
+                    # What the index knows, as if it were all still so, until that is known.
+                    self._show(reading=(0, 0))
+            self._thorough_at = time.monotonic()
+            scan = scan_folder(self.folder)
+            self._scan = replace(scan, found={})  # what was read is kept with what it was read of
+            self._read_changed(scan)
+
+    def _read_changed(self, scan: Scan, only: Collection[str] | None = None) -> None:
+        """Of all keys, or of those alone with which something was just done here: whoever did it sees it at once."""
+        with self._changing:
+            before = self._view.reading
+            changed = [
+                found
+                for key, found in scan.found.items()
+                if (only is None or key in only) and (key not in self._kept or self._kept[key].found != found)
+            ]
+            gone = {key for key in self._kept if key not in scan.found and (only is None or key in only)}
+            for key in gone:
+                del self._kept[key]
+            # Where not all could be looked at, what is not seen may be there: the index keeps it.
+            forgotten = [] if scan.problem else sorted(gone)
+        changed.sort(key=lambda found: found.newest, reverse=True)
+        unsaved: list[tuple[Found, list[Entry]]] = []
+        published = time.monotonic()
+        for done, (found, entries) in enumerate(read_rows(self.folder, changed)):
+            if self._stopping.is_set():
+                break
+            with self._changing:
+                if not os.path.lexists(found.paths(self.folder)[0]):
+                    continue  # deleted since, on this page perhaps
+                self._kept[found.key] = Kept(found, tuple(facts for facts, _ in entries))
+                unsaved.append((found, entries))
+                if time.monotonic() - published > PUBLISH_EVERY:
+                    self._save(unsaved, forgotten)
+                    unsaved, forgotten = [], []
+                    self._show(reading=(done + 1, len(changed)), problem=scan.problem)
+                    published = time.monotonic()
+        with self._changing:
+            self._save(unsaved, forgotten)
+            self._show(reading=None if only is None else before, problem=scan.problem)
+
+    def _save(self, read: list[tuple[Found, list[Entry]]], gone: list[str]) -> None:
+        if self._index is not None and (read or gone):
+            self._index.store(read, gone)
+
+    def _show(self, reading: tuple[int, int] | None, problem: str | None = None) -> None:
+        rows: dict[str, LibraryRow] = {}
+        for _, kept in sorted(self._kept.items()):
+            for number, facts in enumerate(kept.rows):
+                row = self._row(kept.found, number, facts, rows)
+                rows[row.id] = row
+        self._publish(rows=tuple(rows.values()), reading=reading, problem=problem)
+
+    def _row(self, found: Found, number: int, facts: Facts, taken: Collection[str]) -> LibraryRow:
+        id = facts.uid if facts.uid.isalnum() and facts.uid.isascii() else ""
+        if not id or id in taken:
+            # No id of its own, or a copy of a recording that is in the table already.
+            where = f"{found.key}#{facts.trajectory or ''}"
+            id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
+        name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
+        name += "" if facts.trajectory is None else f"#{facts.trajectory}"
+        # A file's name may hold bytes that are no text, which no page can be sent.
+        name, place = text(name, 400), (found.key, number)
+        paths, size = found.paths(self.folder), sum(found.sizes.values())
+        return LibraryRow(**vars(facts), id=id, name=name, place=place, paths=paths, size=size)
+
+    def _publish(self, **changes: object) -> None:
+        with self._changed:
+            view = replace(self._view, trash=look_into_trash(self.folder), **changes)  # type: ignore[arg-type]
+            if view.rows is not self._view.rows:
+                self._by_id = {row.id: row for row in view.rows}
+            if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
+                self._view = replace(view, serial=self._view.serial + 1)
+
+    # --- what is done to recordings --------------------------------------------------------------------
+
+    def set_tags(self, ids: Iterable[str], add: Iterable[str] = (), remove: Iterable[str] = ()) -> None:
+        """Add tags to recordings and take tags away.
+
+        Raises:
+            LibraryError: a file cannot be written; the recordings before it have their tags.
+        """
+        add, without = clean_tags(tuple(add)), set(clean_tags(tuple(remove)))
+        self._annotate(
+            ids, lambda facts: (clean_tags((*(t for t in facts.tags if t not in without), *add)), facts.note)
+        )
+
+    def set_note(self, ids: Iterable[str], note: str) -> None:
+        """Give recordings a note; an empty one takes it away. Raises as `set_tags`."""
+        note = clean_note(note)
+        self._annotate(ids, lambda facts: (facts.tags, note))
+
+    def _annotate(self, ids: Iterable[str], change: Callable[[Facts], tuple[tuple[str, ...], str]]) -> None:
+        with self._changing:
+            touched: set[str] = set()
+            try:
+                for id in ids:
+                    row, found = self._there(id)
+                    tags, note = change(row)
+                    if (tags, note) == (row.tags, row.note):
+                        continue
+                    touched.add(found.key)
+                    try:
+                        if row.kind == "workbench":
+                            write_into_description(found.path(self.folder, ".json"), tags, note)
+                        else:
+                            write_notes(found.path(self.folder, NOTES), row.trajectory, tags, note)
+                    except (OSError, ValueError) as error:
+                        why = getattr(error, "strerror", None) or error
+                        raise LibraryError(
+                            f"Tags and note of {row.name} could not be kept ({why}). "
+                            "They are written beside the recording, so its folder must be writable."
+                        ) from error
+            finally:
+                self._read_changed(scan_folder(self.folder), touched)
+
+    def delete(self, ids: Iterable[str]) -> str:
+        """Move all files of these recordings to the trash; returns the name of the deletion, for `undo_delete`.
+
+        Raises:
+            LibraryError: nothing was moved because a file holds other recordings too, or something could not be
+                moved; the recordings before it were.
+        """
+        with self._changing:
+            keys = self._keys_to_delete(ids)
+            paths = [self._kept[key].found.paths(self.folder) for key in sorted(keys)]
+            try:
+                batch = put_into_trash(self.folder, paths)
+            except TrashError as error:
+                raise LibraryError(f"Not everything was deleted. {error}") from error
+            finally:
+                self._read_changed(scan_folder(self.folder), keys)
+            if batch is None:
+                raise LibraryError("Those files were gone already.")
+            return batch
+
+    def may_delete(self, ids: Iterable[str]) -> None:
+        """Raise LibraryError where `delete` would refuse them."""
+        with self._changing:
+            self._keys_to_delete(ids)
+
+    def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
+        wanted = set(ids)
+        keys = {self._there(id)[1].key for id in wanted}
+        for key in keys:
+            if key.split("/")[-2:] == DATASET_KEY and "/" in key:
+                raise LibraryError(
+                    f"{text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
+                    "deleted from here: delete the folder."
+                )
+            of_file = {row.id for row in self.rows() if row.place[0] == key}
+            if not wanted >= of_file:
+                raise LibraryError(
+                    f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
+                    "select all of them."
+                )
+        return keys
+
+    def undo_delete(self) -> None:
+        """Bring back what the last deletion took.
+
+        Raises:
+            LibraryError: there is none, or something could not be brought back.
+        """
+        with self._changing:
+            batches = look_into_trash(self.folder).batches
+            if not batches:
+                raise LibraryError("The trash is empty.")
+            try:
+                back = take_out_of_trash(self.folder, batches[-1])
+            except TrashError as error:
+                raise LibraryError(f"Not everything could be brought back. {error}") from error
+            self._read_changed(scan_folder(self.folder), {key_of(path) for path in back})
+
+    def empty_trash(self) -> None:
+        """Delete for good what was deleted. Raises LibraryError."""
+        with self._changing:
+            try:
+                empty_trash(self.folder)
+            except TrashError as error:
+                raise LibraryError(str(error)) from error
+            finally:
+                self._publish()
+
+    def _there(self, id: str) -> tuple[LibraryRow, Found]:
+        row = self.row(id)
+        kept = None if row is None else self._kept.get(row.place[0])
+        if row is None or kept is None:
+            raise LibraryError("That recording is not in the library any more.")
+        return row, kept.found

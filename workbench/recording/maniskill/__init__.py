@@ -1,0 +1,1 @@
+"""ManiSkill's own trajectory files, written and read."""

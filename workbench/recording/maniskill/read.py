@@ -1,0 +1,247 @@
+"""Recordings that ManiSkill's own RecordEpisode made, as an `Episode`: its demonstrations, and everybody's own.
+
+Such a file has no meshes and no poses of bodies, which are the simulator's to make; but its curves, states, observations and
+cameras are columns like ours. Two things that it does not hold: what ``evaluate()`` said of state 0 (taken for no success and no
+failure), and entries of ``evaluate()`` besides those two.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from transforms3d.quaternions import mat2quat
+
+from workbench.core.camera_data import CameraInfo
+from workbench.recording.episode.document import Document, EpisodeWords, WrongDocument, read_document
+from workbench.recording.episode.encoded_pictures import (
+    MILLIMETRES_PER_METRE,
+    MODALITIES,
+    MOST_PIXELS,
+    EncodedPictures,
+    LazyPictures,
+    Modality,
+    encode,
+)
+from workbench.recording.episode.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
+
+_PICTURES = ("sensor_data", "sensor_param")
+_UNKNOWN_DT = 0.05
+"""ManiSkill's default control period (20 Hz); the file does not say it."""
+
+
+def trajectories(path: Path) -> tuple[str, ...]:
+    """Names of the episodes in a ManiSkill .h5, in the order of their numbers.
+
+    Raises:
+        UnreadableRecording: it is no such file.
+    """
+    try:
+        with open_h5(path) as file:
+            return tuple(sorted((name for name in file if name.startswith("traj_")), key=_number))
+    except (OSError, RuntimeError, RefusedH5) as error:
+        raise UnreadableRecording(f"{Path(path).name} is no .h5 that can be read: {error}") from error
+
+
+def read_maniskill(path: Path, trajectory: str) -> Episode:
+    """Episode `trajectory` (``traj_0``) of an .h5 that ManiSkill's RecordEpisode wrote; its .json lies beside it.
+
+    It has no geometry and no poses. The control period is `control_freq` of its env's keywords if that is said, else
+    ManiSkill's default of 1/20 s.
+
+    Raises:
+        UnreadableRecording: one of the two files is missing or broken, or has no such episode.
+    """
+    path = Path(path)
+    document, said = _said(path.with_suffix(".json"), trajectory)
+    try:
+        with open_h5(path) as file:
+            group = file.group(trajectory)
+            if group is None:
+                raise UnreadableRecording(f"{path.name} has no {trajectory}.")
+            return _episode(group, document, said, path, trajectory)
+    except UnreadableRecording:
+        raise
+    except RefusedH5 as error:
+        raise UnreadableRecording(f"{path.name} {error}.") from error
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise UnreadableRecording(
+            f"{trajectory} of {path.name} cannot be read ({type(error).__name__}: {error})"
+        ) from error
+
+
+def leaves(
+    node: H5Group | H5Dataset | None, prefix: str = "", skip: Sequence[str] = ()
+) -> Iterator[tuple[str, NDArray]]:
+    """Every dataset of numbers below `node` by its path, ``a/b``; ``""`` where `node` is one itself."""
+    if isinstance(node, H5Dataset):
+        if node.is_numbers:
+            yield prefix, node.read()
+    elif node is not None:
+        for name in node:
+            if name not in skip:
+                yield from leaves(node[name], f"{prefix}/{name}" if prefix else name)
+
+
+def _number(name: str) -> tuple[int, str]:
+    digits = name.removeprefix("traj_")
+    return (int(digits) if digits.isdigit() else 1 << 60, name)
+
+
+def _said(path: Path, trajectory: str) -> tuple[Document, EpisodeWords]:
+    try:
+        document = read_document(path)
+        for number, said in enumerate(document.said["episodes"]):
+            if f"traj_{said['episode_id']}" == trajectory:
+                return document, document.episode(number)
+    except OSError as error:
+        raise UnreadableRecording(f"{path.name} cannot be read: {error.strerror}") from error
+    except WrongDocument as error:
+        raise UnreadableRecording(f"{path.name} {error}.") from error
+    except (KeyError, TypeError) as error:
+        raise UnreadableRecording(f"{path.name} is not what ManiSkill writes beside an .h5.") from error
+    raise UnreadableRecording(f"{path.name} says nothing of {trajectory}.")
+
+
+def _episode(group: H5Group, document: Document, said: EpisodeWords, path: Path, trajectory: str) -> Episode:
+    env = document.env()
+    kwargs = env.env_kwargs or {}
+    actions, action_names = _actions(group["actions"])
+    length = len(actions)
+    flags = {
+        name: np.concatenate([[False], group.numbers(name)]) for name in ("success", "fail") if name in group
+    }
+    rewards = group.numbers("rewards") if "rewards" in group else np.full(length, np.nan)
+    frequency = (kwargs.get("sim_config") or {}).get("control_freq") or 0
+    info = EpisodeInfo(
+        task=env.env_id or "unknown task",
+        env_index=0,
+        seed=NO_SEED if said.seed is None else said.seed,
+        source_file=None,
+        source_hash="",
+        source={},
+        control_dt=1 / frequency if frequency else _UNKNOWN_DT,
+        control_mode=said.control_mode if isinstance(said.control_mode, str) else None,
+        backend=str(kwargs.get("sim_backend") or "physx_cpu"),
+        env_kwargs=kwargs,
+        reset_options=(said.reset_kwargs and said.reset_kwargs.options) or {},
+        max_episode_steps=env.max_episode_steps,
+        written_at=_written(path),
+        id=f"{path.stem}/{trajectory}",
+        acted_by=((0, document.source_type),) if document.source_type else (),
+    )
+    obs = group.get("obs")
+    return Episode(
+        info=info,
+        geometry=None,
+        segmentation={},
+        poses=None,
+        action=actions,
+        action_names=action_names,
+        reward=np.asarray(rewards, dtype=np.float32),
+        terminated=group.numbers("terminated").astype(np.bool_),
+        truncated=group.numbers("truncated").astype(np.bool_),
+        evaluate=flags,
+        cameras=_cameras(obs, path),
+        env_states=dict(leaves(group.get("env_states"))),
+        obs=dict(leaves(obs, skip=_PICTURES)),
+    )
+
+
+def _written(path: Path) -> str:
+    when = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.timezone.utc)
+    return when.isoformat(timespec="seconds")
+
+
+def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """(T, A), of several robots one behind the other, and a name for each of the A."""
+    parts = [(name, array.reshape(len(array), -1)) for name, array in leaves(node)]
+    names = [f"{name or 'action'}[{i}]" for name, array in parts for i in range(array.shape[1])]
+    return np.concatenate([array for _, array in parts], axis=1).astype(np.float32), tuple(names)
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+def _picture(path: Path, place: str, modality: Modality, number: int) -> bytes:
+    """Of a dataset (P, H, W, C), read and encoded when it is asked for."""
+    with open_h5(path) as file:
+        dataset = file[place]
+        if not isinstance(dataset, H5Dataset):
+            raise OSError(f"{path.name} has changed since it was opened")
+        picture = dataset.row(number)
+    if modality == "rgb":
+        return encode("rgb", np.ascontiguousarray(picture[..., :3]))
+    plain = picture.reshape(picture.shape[:2])
+    if modality == "depth":
+        # Whole millimetres if they are integers, metres otherwise (textures of the ray tracers).
+        scale = MILLIMETRES_PER_METRE if plain.dtype.kind in "iu" else 1.0
+        return encode("depth", plain.astype(np.float32) / scale)
+    return encode("segmentation", plain.astype(np.int32))
+
+
+def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
+    sensors = obs.group("sensor_data") if isinstance(obs, H5Group) else None
+    if sensors is None or not isinstance(obs, H5Group):
+        return []
+    tracks = []
+    for name in sensors:
+        held: dict[Modality, EncodedPictures] = {}
+        size = (0, 0)
+        count = 0
+        camera = sensors.group(name)
+        for key in camera or ():
+            modality: Modality | None = next((known for known in MODALITIES if known == key), None)
+            dataset = None if camera is None or modality is None else camera[key]
+            if modality is None or not isinstance(dataset, H5Dataset):
+                continue
+            if dataset.ndim != 4 or not dataset.is_numbers:
+                raise RefusedH5(
+                    f"has pictures of shape {dataset.shape} and type {dataset.dtype} (at {dataset.name})"
+                )
+            count, size = len(dataset), (dataset.shape[1], dataset.shape[2])
+            if dataset.shape[1] * dataset.shape[2] > MOST_PIXELS:
+                raise RefusedH5(
+                    f"claims pictures of {dataset.shape[2]} x {dataset.shape[1]} pixels (at {dataset.name})"
+                )
+            one = partial(_picture, path, dataset.name, modality)
+            held[modality] = EncodedPictures(modality, LazyPictures(count, one))
+        if held:
+            parameters = obs.group(f"sensor_param/{name}")
+            info = _lens(name, size, tuple(held), parameters)
+            pose = _poses(parameters, count)
+            tracks.append(CameraTrack(info, np.arange(count), pose, **held))
+    return tracks
+
+
+def _lens(
+    name: str, size: tuple[int, int], modalities: tuple[str, ...], parameters: H5Group | None
+) -> CameraInfo:
+    height, width = size
+    intrinsic = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float32)
+    if parameters is not None and "intrinsic_cv" in parameters:
+        intrinsic = parameters.numbers("intrinsic_cv")[0].astype(np.float32)
+    fovy = float(2 * np.arctan2(height / 2, intrinsic[1, 1]))
+    return CameraInfo(name, "sensor", width, height, fovy, 0.01, 100.0, intrinsic, None, modalities)
+
+
+def _poses(parameters: H5Group | None, count: int) -> NDArray[np.float32]:
+    """(P, 7) in ManiSkill's camera frame, from OpenGL's (x right, y up, z backward)."""
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype=np.float32), (count, 1))
+    if parameters is None or "cam2world_gl" not in parameters:
+        return poses
+    matrices = parameters.numbers("cam2world_gl")
+    for index, matrix in enumerate(matrices):
+        if index and np.array_equal(matrix, matrices[index - 1]):
+            poses[index] = poses[index - 1]
+            continue
+        right, up, back = matrix[:3, 0], matrix[:3, 1], matrix[:3, 2]
+        poses[index, :3] = matrix[:3, 3]
+        poses[index, 3:] = mat2quat(np.stack([-back, -right, up], axis=1))
+    return poses

@@ -1,0 +1,243 @@
+"""Reads HDF5 files that anybody may have made: numbers of this one file, and no more of them than it can hold.
+
+HDF5 by itself follows a file wherever it points. External links, external storage and virtual datasets read other files
+of the machine, filters load plugins, and a dataset of 8 kB may claim terabytes that are allocated before the first byte
+is read. So groups and datasets are reached through this module alone. It follows hard links, and soft links within the
+file; it reads plain numbers; and it compares what a dataset claims with what the file holds of it before anything is
+allocated.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+# Filters come from shared libraries that HDF5 looks for when it is loaded; "::" is how it is told not to.
+os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.machine.files import open_regular_file
+
+MOST_BYTES = 1 << 30
+"""Of numbers that are read from one file while it is open."""
+MOST_NODES = 200_000
+"""Groups and datasets that are looked up in one file while it is open."""
+DEEPEST = 32
+"""Groups in groups; hard links can lead round in a circle."""
+SMALL = 1 << 20
+"""Bytes that a dataset may claim whatever the file holds of it: one that was made and never written reads as zeros."""
+MOST_PACKED = 1100
+"""Bytes that one byte in the file may become: deflate's limit is 1032."""
+LARGEST_CHUNK = 16 << 20
+"""Bytes of a chunk that are allocated whatever the file holds of its dataset."""
+
+_FILTERS = {
+    h5py.h5z.FILTER_DEFLATE,
+    h5py.h5z.FILTER_SHUFFLE,
+    h5py.h5z.FILTER_FLETCHER32,
+    h5py.h5z.FILTER_SZIP,
+    h5py.h5z.FILTER_NBIT,
+    h5py.h5z.FILTER_SCALEOFFSET,
+    h5py.h5z.FILTER_LZF,
+}
+"""That come with h5py."""
+_NUMBERS = "biuf"
+
+
+class RefusedH5(ValueError):
+    """The file asks for something that is not done for it; the message says what, and goes on from the file's name."""
+
+
+@contextmanager
+def open_h5(path: Path) -> Iterator[H5Group]:
+    """The root group of the file at `path`, for the time of the block.
+
+    Raises:
+        OSError: it cannot be opened, or is no regular file, or no HDF5.
+    """
+    with open_regular_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    # Without a lock: a recorder that has the file open would be a reason to show nothing.
+    with h5py.File(path, "r", locking=False) as opened:
+        yield H5Group(opened, _Budget(size))
+
+
+class _Budget:
+    """What may still be taken out of an open file."""
+
+    def __init__(self, file_size: int) -> None:
+        self.file_size = file_size
+        self._bytes, self._nodes = MOST_BYTES, MOST_NODES
+
+    def take_node(self) -> None:
+        self._nodes -= 1
+        if self._nodes < 0:
+            raise RefusedH5(f"holds more than {MOST_NODES:,} groups and datasets")
+
+    def take_bytes(self, name: str, count: int) -> None:
+        self._bytes -= count
+        if self._bytes < 0:
+            raise RefusedH5(f"holds more than {MOST_BYTES >> 30} GB of numbers (at {name})")
+
+
+class H5Group:
+    """A group; what is in it is looked up by names, or by a path of names with ``/`` between them."""
+
+    def __init__(self, group: h5py.Group, budget: _Budget, depth: int = 0) -> None:
+        self._group, self._budget, self._depth = group, budget, depth
+
+    def __iter__(self) -> Iterator[str]:
+        if len(self._group) > MOST_NODES:
+            raise RefusedH5(f"holds a group of {len(self._group):,} entries")
+        return (str(name) for name in self._group)
+
+    def __contains__(self, path: str) -> bool:
+        return self.get(path) is not None
+
+    def __getitem__(self, path: str) -> H5Group | H5Dataset:
+        """Raises KeyError where there is nothing, and RefusedH5."""
+        found = self.get(path)
+        if found is None:
+            raise KeyError(f"{self._where(path)} is missing")
+        return found
+
+    def get(self, path: str) -> H5Group | H5Dataset | None:
+        """None where there is nothing. Raises RefusedH5."""
+        return self._follow(path, 0)
+
+    def group(self, path: str) -> H5Group | None:
+        """None where there is none. Raises RefusedH5."""
+        found = self.get(path)
+        return found if isinstance(found, H5Group) else None
+
+    def numbers(self, path: str) -> NDArray:
+        """All of a dataset. Raises KeyError where there is none, and RefusedH5."""
+        found = self[path]
+        if not isinstance(found, H5Dataset):
+            raise KeyError(f"{path} is a group, not numbers")
+        return found.read()
+
+    def _follow(self, path: str, links: int) -> H5Group | H5Dataset | None:
+        node: H5Group | H5Dataset | None = self
+        for name in (part for part in path.split("/") if part not in ("", ".")):
+            if not isinstance(node, H5Group):
+                return None
+            node = node._child(name, links)
+        return node
+
+    def _child(self, name: str, links: int) -> H5Group | H5Dataset | None:
+        self._budget.take_node()
+        link = self._group.get(name, getlink=True)
+        if isinstance(link, h5py.ExternalLink):
+            raise RefusedH5(
+                f"has {self._where(name)} in another file (an external link), and other files are not read for it"
+            )
+        if isinstance(link, h5py.SoftLink):
+            if links >= DEEPEST:
+                raise RefusedH5(f"has links that lead round in a circle (at {self._where(name)})")
+            begin = H5Group(self._group.file, self._budget) if link.path.startswith("/") else self
+            return begin._follow(link.path, links + 1)
+        if link is None:
+            return None
+        if self._depth >= DEEPEST:
+            raise RefusedH5(f"has groups more than {DEEPEST} deep (at {self._where(name)})")
+        found = self._group[name]
+        if isinstance(found, h5py.Group):
+            return H5Group(found, self._budget, self._depth + 1)
+        return H5Dataset(found, self._budget) if isinstance(found, h5py.Dataset) else None
+
+    def _where(self, name: str) -> str:
+        return f"{self._group.name or ''}/{name}".strip("/")
+
+
+class H5Dataset:
+    """A dataset of this file. Nothing of it is read until it is asked for."""
+
+    def __init__(self, dataset: h5py.Dataset, budget: _Budget) -> None:
+        """Raises RefusedH5."""
+        self.name = str(dataset.name)
+        creation = dataset.id.get_create_plist()
+        # Before its shape is asked for: HDF5 opens the files of a virtual dataset to say one.
+        if creation.get_layout() == h5py.h5d.VIRTUAL:
+            raise RefusedH5(
+                f"has {self._short} put together from other files (a virtual dataset), which are not read for it"
+            )
+        if creation.get_external_count():
+            raise RefusedH5(
+                f"has {self._short} stored in another file (external storage), and other files are not read for it"
+            )
+        for index in range(creation.get_nfilters()):
+            if (code := creation.get_filter(index)[0]) not in _FILTERS:
+                raise RefusedH5(
+                    f"has {self._short} packed by a filter that h5py does not bring along ({code})"
+                )
+        self._dataset, self._budget = dataset, budget
+        self.dtype: np.dtype = dataset.dtype
+        self.shape: tuple[int, ...] = tuple(dataset.shape or ())
+        self._check_size()
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    @property
+    def is_numbers(self) -> bool:
+        """Plain booleans, integers or floating point numbers."""
+        return self.dtype.kind in _NUMBERS and self._dataset.shape is not None
+
+    def __len__(self) -> int:
+        return self.shape[0] if self.shape else 0
+
+    def read(self) -> NDArray:
+        """All of it. Raises RefusedH5."""
+        self._check_numbers()
+        self._budget.take_bytes(self._short, self._size(self.shape))
+        return _native(self._dataset[()])
+
+    def row(self, number: int) -> NDArray:
+        """One of its rows. Raises RefusedH5, and IndexError where there is none."""
+        self._check_numbers()
+        if not self.shape:
+            raise RefusedH5(f"has one number where rows are looked for (at {self._short})")
+        index = range(len(self))[number]
+        self._budget.take_bytes(self._short, self._size(self.shape[1:]))
+        return _native(self._dataset[index])
+
+    def _check_numbers(self) -> None:
+        if not self.is_numbers:
+            raise RefusedH5(f"has {self._short} of type {self.dtype}, which is no plain number")
+
+    def _check_size(self) -> None:
+        """Whether the file can hold what its shape claims."""
+        storage = self._dataset.id.get_storage_size()
+        if storage > self._budget.file_size:
+            raise RefusedH5(
+                f"claims {storage:,} bytes for {self._short}, and has {self._budget.file_size:,} in all"
+            )
+        claimed = self._size(self.shape)
+        chunk = self._dataset.chunks
+        if claimed > SMALL + storage * (1 if chunk is None else MOST_PACKED):
+            raise RefusedH5(
+                f"claims {claimed:,} bytes of numbers for {self._short}, and holds {storage:,} bytes of it"
+            )
+        if chunk is not None and self._size(chunk) > LARGEST_CHUNK + storage * MOST_PACKED:
+            raise RefusedH5(f"claims chunks of {self._size(chunk):,} bytes for {self._short}")
+
+    def _size(self, shape: tuple[int, ...]) -> int:
+        return math.prod(shape) * max(self.dtype.itemsize, 1)
+
+    @property
+    def _short(self) -> str:
+        return self.name.strip("/")
+
+
+def _native(numbers: NDArray) -> NDArray:
+    """With the bytes of each number in this machine's order, which torch asks for."""
+    array = np.asarray(numbers)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)

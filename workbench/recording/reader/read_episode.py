@@ -1,0 +1,344 @@
+"""A recording as an `Episode` again.
+
+The ``.json`` says what the episode is, the ``.rrd`` holds what there is to see (meshes, poses, pictures, curves), and the ``.h5``
+what there is to compute with (env states, observations, actions). Each is read for what it holds best, and a file that is missing or broken takes
+only its own with it: a lone ``.rrd`` that somebody was sent can be looked at, though nobody can step into it.
+
+Pictures stay in the file until one is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.scene.shapes import SceneGeometry, SharedShapes
+from workbench.recording.episode.columns import MOST_LINES
+from workbench.recording.episode.document import (
+    CameraWords,
+    ColumnWords,
+    Description,
+    Document,
+    WrongDocument,
+    check,
+    description_in,
+    read_document,
+    task_file,
+)
+from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality
+from workbench.recording.episode.episode import CameraTrack, Episode, Unread
+from workbench.recording.episode.source import Source, UnreadableRecording
+from workbench.recording.lerobot.read import is_lerobot, lerobot_rows
+from workbench.recording.maniskill.read import leaves
+from workbench.recording.maniskill.read import read_maniskill as read_maniskill
+from workbench.recording.maniskill.read import trajectories as trajectories
+from workbench.recording.maniskill.safe_h5 import open_h5
+from workbench.recording.maniskill.write import TRAJECTORY
+from workbench.recording.rerun.layout import (
+    OBSERVATION,
+    batch_entity,
+    body_entities,
+    camera_entities,
+    evaluate_entity,
+    wxyz_from_optical,
+)
+from workbench.recording.rerun.read import RerunTable, rows_at
+
+MOST_STATES = 10_000_000
+MOST_COLUMN_BYTES = 1 << 29
+"""Of one column, as the recording describes it: the rows that say nothing new are not in the file, so its size says little."""
+
+
+def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
+    """The episode of our own files; `path` is its .rrd, .h5 or .json, and the others are found beside it.
+
+    With `shapes`, meshes are those of other recordings that were read with it, where they look the same.
+
+    What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
+    states. The same for one that is broken, named in `Episode.unread`. The geometry is that of this env alone, as
+    env 0 of 1.
+
+    Raises:
+        UnreadableRecording: what is there is no recording of ours, or all of it is broken; the message says which.
+    """
+    episode, source_path = read_inert(path, shapes)
+    found = task_file(source_path, episode.info.task, Path(path).parent)
+    if found is not None:
+        episode.info = replace(episode.info, source_file=found)
+    return episode
+
+
+def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
+    """As `read_episode`, from these files alone: the task's own file is not looked for, and where it may be is said beside.
+
+    Raises as `read_episode`.
+    """
+    path = Path(path)
+    files = {suffix: path.with_suffix(suffix) for suffix in (".rrd", ".h5", ".json")}
+    there = {suffix: file for suffix, file in files.items() if file.is_file()}
+    if not there:
+        raise UnreadableRecording(f"{path.name} is not there any more.")
+    unread: list[Unread] = []
+    beside, not_json = _beside(there.get(".json"))
+    files = {} if beside is None else beside.files or {}
+    table = states = None
+    if ".rrd" in there:
+        try:
+            check(there[".rrd"], files)
+            table = RerunTable(there[".rrd"], shapes)
+        except (OSError, ValueError, RuntimeError) as error:
+            lost = "its 3-D scene, its pictures and what evaluate() said are missing"
+            unread.append(_unread(there[".rrd"], error, lost))
+    if ".h5" in there:
+        try:
+            check(there[".h5"], files)
+            states = _read_states(there[".h5"])
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            unread.append(_unread(there[".h5"], error, "its env states are missing"))
+    if table is None and states is None and unread:
+        raise UnreadableRecording(" ".join(broken.sentence for broken in unread))
+    if not_json is not None and table is not None:
+        unread.append(
+            _unread(there[".json"], not_json, "its tags, its note and the place of its task are missing")
+        )
+    said = beside or _description(there.get(".json"), not_json, table, path)
+    try:
+        episode = _episode(said, table)
+        if states is not None:
+            _add_states(episode, states)
+        elif table is not None:
+            episode.obs = dict(_observations(table, said.obs, episode.length + 1))
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise UnreadableRecording(
+            f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
+        ) from error
+    episode.unread = tuple(unread)
+    return episode, said.source_path or None
+
+
+def _unread(file: Path, error: Exception, lost: str) -> Unread:
+    why = " ".join(str(error).split()).removeprefix(f"Failed to read RRD file at {file}: ")
+    why = why if len(why) <= 160 else why[:159] + "\u2026"
+    return Unread(file.name, f"was cut short or changed ({why}): {lost}.")
+
+
+def _beside(file: Path | None) -> tuple[Description | None, Exception | None]:
+    """What the .json says; nothing where it is none of ours, and why where it is no JSON."""
+    if file is None:
+        return None, None
+    try:
+        document = read_document(file)
+    except (OSError, WrongDocument) as error:
+        return None, error
+    try:
+        return document.description() if document.is_ours else None, None
+    except WrongDocument as error:
+        raise UnreadableRecording(
+            f"{file.stem} is a recording, but a broken one: {file.name} {error}."
+        ) from error
+
+
+def _description(
+    file: Path | None, not_json: Exception | None, table: RerunTable | None, path: Path
+) -> Description:
+    """What the recording says of itself where there is no .json of ours."""
+    if file is not None and table is None:
+        if not_json is not None:
+            raise UnreadableRecording(f"{file.name} {not_json}.") from not_json
+        raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
+    if table is None:
+        raise UnreadableRecording(f"{path.stem}.json is missing, which says what is in {path.name}.")
+    said = table.property("workbench", "description")
+    if not isinstance(said, str):
+        raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
+    files, texts = (_list(table.property("source", key)) for key in ("files", "texts"))
+    try:
+        return description_in(said, dict(zip(files, texts)))
+    except WrongDocument as error:
+        raise UnreadableRecording(f"{path.stem}.rrd {error}.") from error
+
+
+def _list(value: Any) -> list[Any]:
+    return [] if value is None else value if isinstance(value, list) else [value]
+
+
+def _episode(said: Description, table: RerunTable | None) -> Episode:
+    states = said.length + 1
+    if not 0 < states <= MOST_STATES:
+        raise ValueError(f"it says that it has {said.length} steps")
+    if sum(map(len, said.texts.values())) > MOST_LINES:
+        raise ValueError(f"it has more than {MOST_LINES} lines of entries that are no numbers")
+    geometry = poses = None
+    cameras: list[CameraTrack] = []
+    if table is not None:
+        scene = said.scene
+        bare = SceneGeometry(1, scene.body_names, scene.body_kinds, scene.body_hidden, ())
+        entities = body_entities(bare)
+        geometry = table.geometry(bare, entities)
+        _check_room("the poses", (states, len(entities), 7), np.dtype(np.float32))
+        poses = table.poses(entities, states)
+        cameras = list(_cameras(said.cameras, table, states))
+    actions, number, flag = ("<f4", (len(said.action_names),)), ("<f4", ()), ("|b1", ())
+    return Episode(
+        info=said.info(),
+        geometry=geometry,
+        segmentation=said.segmentation,
+        poses=poses,
+        action=_column(table, "/action", actions, 1, states),
+        action_names=said.action_names,
+        reward=_column(table, "/reward", number, 1, states),
+        terminated=_column(table, "/episode/terminated", flag, 1, states),
+        truncated=_column(table, "/episode/truncated", flag, 1, states),
+        evaluate=_columns(table, said.evaluate, evaluate_entity, states),
+        cameras=cameras,
+        batch=_columns(table, said.batch, batch_entity, states),
+        texts=said.texts,
+    )
+
+
+def _columns(
+    table: RerunTable | None, said: Mapping[str, ColumnWords], entity_of: Callable[[str], str], states: int
+) -> dict[str, NDArray]:
+    if table is None:
+        return {}
+    return {name: _column(table, entity_of(name), words, 0, states) for name, words in said.items()}
+
+
+def _column(table: RerunTable | None, entity: str, words: ColumnWords, first: int, states: int) -> NDArray:
+    """States `first` to the last of the numbers of `entity`, as `words` say they were."""
+    dtype, shape = np.dtype(words[0]), (states - first, *words[1])
+    _check_room(entity, shape, dtype)
+    out = np.full(shape, np.nan if dtype.kind == "f" else 0, dtype=dtype)
+    if table is None or out.size == 0:
+        return out
+    steps, values = table.scalars(entity)
+    if len(steps) == 0:
+        return out
+    flat = out.reshape(len(out), -1)
+    if dtype.kind == "b":
+        values = values != 0
+    at = rows_at(steps, first, states)
+    flat[at >= 0] = values[at[at >= 0]].astype(dtype)
+    return out
+
+
+def _check_room(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    """Before it is allocated: what a recording says of itself may be anything. Raises ValueError."""
+    if dtype.kind not in "biuf":
+        raise ValueError(f"{what} is said to be of type {dtype}, which is no plain number")
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize > MOST_COLUMN_BYTES:
+        raise ValueError(f"{what} is said to be {shape} numbers")
+
+
+def _cameras(said: Sequence[CameraWords], table: RerunTable, states: int) -> Iterator[CameraTrack]:
+    infos = [words.info() for words in said]
+    for info, entity in zip(infos, camera_entities(infos)):
+        held: dict[Modality, tuple[NDArray[np.int64], EncodedPictures]] = {}
+        for modality in ("rgb", "depth", "segmentation"):
+            found = table.pictures(f"{entity}/{modality}", modality, info)
+            if found is not None:
+                held[modality] = found
+        if not held:
+            continue
+        frame = next(iter(held.values()))[0]
+        pose = wxyz_from_optical(table.pose_rows(entity, frame, states))
+        pictures = {modality: track for modality, (_, track) in held.items()}
+        yield CameraTrack(
+            info, frame, pose, pictures.get("rgb"), pictures.get("depth"), pictures.get("segmentation")
+        )
+
+
+def _observations(
+    table: RerunTable, columns: Mapping[str, ColumnWords], states: int
+) -> Iterator[tuple[str, NDArray]]:
+    begin = 0
+    together = sum(math.prod(shape) for _, shape in columns.values())
+    values = _column(table, OBSERVATION, ("<f8", (together,)), 0, states)
+    for name, (dtype, shape) in columns.items():
+        end = begin + math.prod(shape)
+        yield name, values[:, begin:end].astype(dtype).reshape(states, *shape)
+        begin = end
+
+
+_FLAGS = ("success", "fail")
+
+
+def _read_states(path: Path) -> dict[str, Any]:
+    """What the .h5 holds; where the .rrd holds it too, this is what ManiSkill reads."""
+    with open_h5(path) as file:
+        group = file.group(TRAJECTORY)
+        if group is None:
+            raise KeyError(f"it has no {TRAJECTORY}")
+        held: dict[str, Any] = {name: dict(leaves(group.get(name))) for name in ("env_states", "obs")}
+        held |= {name: group.numbers(name) for name in ("actions", "rewards", "terminated", "truncated")}
+        return held | {name: group.numbers(name) for name in _FLAGS if name in group}
+
+
+def _add_states(episode: Episode, held: dict[str, Any]) -> None:
+    episode.env_states, episode.obs = held["env_states"], held["obs"]
+    episode.action, episode.reward = held["actions"], held["rewards"]
+    episode.terminated, episode.truncated = held["terminated"], held["truncated"]
+    if not episode.evaluate:
+        for name in _FLAGS:
+            if name in held:
+                episode.evaluate[name] = np.concatenate([[False], held[name]])
+
+
+# --- Which recordings a file is, or a folder holds, told by looking into them -----------------
+
+
+_OURS = (".rrd", ".h5", ".json")
+
+
+def sources_in(path: Path) -> Iterator[Source]:
+    """In a folder by name, with the folders below it. Raises OSError where a folder cannot be looked into."""
+    if not path.is_dir():
+        yield from _in_file(path) if path.suffix in _OURS else ()
+    elif is_lerobot(path):
+        yield from _in_dataset(path)
+    else:
+        # What is hidden is under way, an index, or thrown away.
+        there = sorted(inside for inside in path.iterdir() if not inside.name.startswith("."))
+        stems = {inside.with_suffix(""): inside for inside in there if inside.suffix in _OURS}
+        for inside in sorted([*stems.values(), *(inside for inside in there if inside.is_dir())]):
+            # A link may lead round in a circle.
+            if not (inside.is_dir() and os.path.islink(inside)):
+                yield from sources_in(inside)
+
+
+def _in_file(path: Path) -> Iterator[Source]:
+    json, h5, rrd = (path.with_suffix(suffix) for suffix in (".json", ".h5", ".rrd"))
+    document = _document(json)
+    if document.is_ours:
+        yield Source(json, None, str(document.said["workbench"].get("id") or json.resolve()), json.stem)
+    elif document.is_maniskills and h5.is_file():
+        try:
+            names = trajectories(h5)
+        except UnreadableRecording:
+            return
+        yield from (Source(h5, name, f"{h5.resolve()}#{name}", f"{h5.stem}#{name}") for name in names)
+    elif rrd.is_file():
+        yield Source(rrd, None, str(rrd.resolve()), rrd.stem)
+
+
+def _in_dataset(folder: Path) -> Iterator[Source]:
+    try:
+        numbers = [facts.trajectory for facts in lerobot_rows(folder)]
+    except UnreadableRecording:
+        numbers = ["0"]  # whoever reads it is told why
+    for number in numbers:
+        yield Source(folder, number, f"{folder.resolve()}#{number}", f"{folder.name}#{number}")
+
+
+def _document(path: Path) -> Document:
+    try:
+        return read_document(path)
+    except (OSError, WrongDocument):
+        return Document({})

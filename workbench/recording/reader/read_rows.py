@@ -1,0 +1,297 @@
+"""From the files of one name to rows: what is read, and what is said of files that cannot be.
+
+The ``.json`` is enough for all but the sum of rewards and the pictures of ManiSkill's trajectories, which are in the ``.h5``. A bare
+``.rrd``, as they were written before there was a ``.json``, has to be read through, which takes a tenth of a second and
+more: one reason for an index.
+
+A broken file is a row as well: a person who looks for a recording should find it, with what is wrong with it, rather
+than find nothing. A ``.json`` that is something else (a folder of recordings may be a folder of much) is none.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from workbench.machine.files import NotARegularFile, open_regular_file
+from workbench.recording.episode.document import (
+    Document,
+    EpisodeWords,
+    WrongDocument,
+    read_document,
+    wrong_size,
+)
+from workbench.recording.episode.encoded_pictures import open_picture, small_jpeg
+from workbench.recording.episode.episode import acted_by_from, acted_by_in_words
+from workbench.recording.episode.row import (
+    Entry,
+    Facts,
+    Kind,
+    clean_note,
+    clean_tags,
+    moment,
+    text,
+    total,
+    truth,
+    whole,
+)
+from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.tags import read_notes
+from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, broken
+
+THUMBNAIL_PIXELS = 96
+THUMBNAIL_BYTES = 8192
+"""A thumbnail as it was recorded is taken as it is up to here, and made smaller beyond."""
+MOST_EPISODES = 20_000
+"""Of one file that are listed."""
+
+_LARGEST_PICTURE = 4096
+"""Pixels of a side of a picture that a thumbnail is made of."""
+
+
+def read_found(folder: Path, found: Found) -> list[Entry]:
+    """The recordings in these files: none, one, or one a trajectory. Whatever is wrong is said in a row."""
+    try:
+        entries = _read(folder, found)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
+        # Files of strangers: what they can be wrong in has no end, and one of them must not hide the others.
+        entries = [_broken(found, f"cannot be read ({error})")]
+    if NOTES in found.sizes:
+        notes = read_notes(found.path(folder, NOTES))
+        entries = [
+            (facts if facts.kind == "workbench" else _noted(facts, notes), picture)
+            for facts, picture in entries
+        ]
+    return entries
+
+
+def _read(folder: Path, found: Found) -> list[Entry]:
+    if ".json" in found.sizes:
+        try:
+            document = read_document(found.path(folder, ".json"))
+        except WrongDocument as error:
+            return [_broken(found, str(error))]
+        if document.is_ours:
+            return [_ours(found, document)]
+        if document.said and found.key.split("/")[-2:] == DATASET_KEY:
+            return _lerobots(folder, found)
+        if document.is_maniskills:
+            return _maniskills(folder, found, document)
+        if ".h5" in found.sizes:
+            return [_broken(found, "names neither an env nor episodes")]
+    elif ".h5" in found.sizes:
+        name = Path(found.key).name
+        return [
+            broken(found, f"{name}.h5 needs {name}.json beside it, which names the env and the episodes.")
+        ]
+    if ".rrd" in found.sizes:
+        return [_rrd_only(folder, found)]
+    return []
+
+
+def _broken(found: Found, what: str) -> Entry:
+    return broken(found, f"{Path(found.key).name}{next(iter(found.sizes))} {what}.")
+
+
+def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts:
+    tags, note = notes.get(facts.trajectory or "", ((), ""))
+    return replace(facts, tags=tags, note=note)
+
+
+def _ours(found: Found, document: Document) -> Entry:
+    name = Path(found.key).name
+    lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
+    problem = f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None
+    try:
+        written = document.description().files or {}
+    except WrongDocument as error:
+        written, problem = {}, problem or text(f"{name}.json {error}.", 500)
+    for suffix, size in found.sizes.items():
+        # What only the bytes tell is told when it is opened: a list of thousands reads none of them.
+        if problem is None and (why := wrong_size(written, suffix, size)) is not None:
+            problem = f"{name}{suffix} was cut short or changed: {why}."
+    described = document.said["workbench"]
+    facts = replace(_episode("workbench", described, found.times[".json"] / 1e9), problem=problem)
+    return facts, _thumbnail(described.get("thumbnail"))
+
+
+def _episode(kind: Kind, said: dict[str, Any], if_undated: float) -> Facts:
+    """Of an episode of ours: its ``.json`` and its ``.rrd`` say the same under the same names."""
+    seed = whole(said.get("seed"))
+    return Facts(
+        kind,
+        task=text(said.get("task")),
+        uid=text(said.get("id"), 64),
+        written=moment(said.get("written_at")) or if_undated,
+        seed=None if seed is None or seed < 0 else seed,
+        env_index=whole(said.get("env_index")),
+        length=whole(said.get("length")),
+        total_reward=total(said.get("return")),
+        success=truth(said.get("success")),
+        success_once=truth(said.get("success_once")),
+        fail=truth(said.get("fail")),
+        control_mode=text(said.get("control_mode")),
+        acted_by=_acted_by(said.get("acted_by")),
+        source_hash=text(said.get("source_hash"), 64),
+        tags=clean_tags(said.get("tags")),
+        note=clean_note(said.get("note")),
+        recovered=said.get("recovered") is True,
+    )
+
+
+def _acted_by(said: object) -> str:
+    """A list in a ``.json``, words already in a ``.rrd``."""
+    if not isinstance(said, list):
+        return text(said)
+    try:
+        return text(acted_by_in_words(acted_by_from(said)))
+    except (TypeError, ValueError):
+        return ""
+
+
+def _thumbnail(encoded: object) -> bytes | None:
+    """A small jpeg of the base64 in a description; None for what is no picture."""
+    if not isinstance(encoded, str):
+        return None
+    try:
+        content = base64.b64decode(encoded.partition("base64,")[2] or encoded)
+        with open_picture(content) as image:
+            if image.format == "JPEG" and max(image.size) <= 2 * THUMBNAIL_PIXELS:
+                if len(content) <= THUMBNAIL_BYTES:
+                    return content
+            return small_jpeg(image, THUMBNAIL_PIXELS)
+    except (ValueError, OSError):
+        return None
+
+
+def _maniskills(folder: Path, found: Found, document: Document) -> list[Entry]:
+    """One row an episode of ManiSkill's ``RecordEpisode`` and of its demonstrations: they have the same form."""
+    name = Path(found.key).name
+    written = found.newest / 1e9
+    count = len(document.said["episodes"])
+    try:
+        task, problem = text(document.env().env_id), None
+    except WrongDocument as error:
+        task, problem = "", text(f"{name}.json {error}.", 500)
+    if ".h5" not in found.sizes:
+        if not task:
+            return []  # a .json of something else that has episodes
+        lost = f"{name}.h5, which {name}.json describes, is missing."
+        return [(Facts("maniskill", task=task, written=written, problem=lost), None)]
+    said = [_or_why(document, number) for number in range(min(count, MOST_EPISODES))]
+    names = [f"traj_{one.episode_id}" for one in said if isinstance(one, EpisodeWords)]
+    totals, pictures, broken = _look_into(found.path(folder, ".h5"), names)
+    problem = problem or broken
+    if not task and problem is None:
+        problem = f"{name}.json does not name the env."
+    entries: list[Entry] = []
+    for one in said:
+        if isinstance(one, str):
+            why = problem or text(f"{name}.json {one}.", 500)
+            entries.append((Facts("maniskill", task=task, written=written, problem=why), None))
+            continue
+        trajectory = f"traj_{one.episode_id}"
+        lost = None if problem or trajectory in totals else f"{name}.h5 has no {trajectory}."
+        facts = Facts(
+            "maniskill",
+            task=task,
+            trajectory=trajectory,
+            written=written,
+            seed=one.seed,
+            length=whole(one.elapsed_steps),
+            total_reward=totals.get(trajectory),
+            success=truth(one.success),
+            fail=truth(one.fail),
+            control_mode=text(one.control_mode),
+            acted_by=text(document.source_type),
+            problem=problem or lost,
+        )
+        entries.append((facts, pictures.get(trajectory)))
+    if count > MOST_EPISODES:
+        more = f"{name}.json names {count - MOST_EPISODES:,} episodes more than the {MOST_EPISODES:,} that are listed of a file."
+        entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
+    return entries
+
+
+def _or_why(document: Document, number: int) -> EpisodeWords | str:
+    try:
+        return document.episode(number)
+    except WrongDocument as error:
+        return str(error)
+
+
+def _lerobots(folder: Path, found: Found) -> list[Entry]:
+    """One row an episode of a LeRobot dataset, which is known by its ``meta/info.json``."""
+    # Arrow's threads must not be there when a reader is forked, and most libraries hold no dataset.
+    from workbench.recording.lerobot.read import lerobot_rows
+
+    written = found.newest / 1e9
+    try:
+        rows = lerobot_rows(found.path(folder, ".json").parents[1])
+    except UnreadableRecording as error:
+        return [(Facts("lerobot", written=written, problem=text(str(error), 500)), None)]
+    return [(replace(facts, written=written), None) for facts in rows]
+
+
+def _look_into(
+    path: Path, trajectories: list[str]
+) -> tuple[dict[str, float | None], dict[str, bytes], str | None]:
+    """Of each trajectory that is in the ``.h5`` the sum of rewards (None where they were not recorded) and a thumbnail, where
+    it holds what a camera saw; and what is wrong with the file."""
+    totals: dict[str, float | None] = {}
+    pictures: dict[str, bytes] = {}
+    try:
+        with open_h5(path) as file:
+            for name in trajectories:
+                group = file.group(name)
+                if group is None:
+                    continue
+                totals[name] = None
+                rewards = group.get("rewards")
+                if isinstance(rewards, H5Dataset) and rewards.is_numbers:
+                    totals[name] = total(float(rewards.read().sum(dtype=np.float64)))
+                if (picture := _last_picture(group)) is not None:
+                    pictures[name] = picture
+    except RefusedH5 as error:
+        return totals, pictures, f"{path.name} {error}."
+    except NotARegularFile as error:
+        return totals, pictures, f"{path.name} {error.strerror}."
+    except (OSError, RuntimeError, KeyError, ValueError):
+        return totals, pictures, f"{path.name} is damaged, or still being written."
+    return totals, pictures, None
+
+
+def _last_picture(group: H5Group) -> bytes | None:
+    """A small jpeg of what the first camera saw last, in colour; None where no picture was recorded."""
+    cameras = group.group("obs/sensor_data")
+    for name in cameras or ():
+        camera = None if cameras is None else cameras.group(name)
+        rgb = None if camera is None else camera.get("rgb")
+        if isinstance(rgb, H5Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
+            if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _LARGEST_PICTURE:
+                return small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)), THUMBNAIL_PIXELS)
+    return None
+
+
+def _rrd_only(folder: Path, found: Found) -> Entry:
+    # It takes rerun along, which is half a second that a library without such files has no need of.
+    from workbench.recording.rerun.read import read_properties
+
+    path = found.path(folder, ".rrd")
+    try:
+        open_regular_file(path).close()
+        said = read_properties(path)
+    except NotARegularFile as error:
+        return _broken(found, str(error.strerror))
+    except (OSError, ValueError, RuntimeError):
+        return _broken(found, "is no recording that rerun can read, or was cut short")
+    episode = said.get("episode", {})
+    if not episode:
+        return _broken(found, "is a recording of rerun, but not of an episode")
+    return _episode("rrd only", episode, found.newest / 1e9), None

@@ -1,0 +1,336 @@
+"""Recordings are read, and mended, in processes of their own, which may do that with their folder and nothing else (`reader`).
+
+What a page shows and what is exported may come from anybody, and it is read by HDF5, Arrow, rerun, ffmpeg and Pillow:
+millions of lines in C, C++ and Rust. So none of them opens a recording in the process that serves the page. Whatever
+ends the process that does, or takes it too long, is a sentence about that one recording.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from workbench.core.scene.shapes import SharedShapes
+from workbench.recording.episode.document import task_file
+from workbench.recording.episode.encoded_pictures import Modality
+from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.row import Entry, clean_facts, text
+from workbench.recording.episode.source import Kind, Source, UnreadableRecording
+from workbench.recording.reader.episode_wire import Garbled, KnownShapes, unpacked
+from workbench.recording.reader.processes import Answered, NotThere, Reader, ReaderEnded, nursery
+from workbench.recording.reader.requests import (
+    EpisodeRead,
+    Failed,
+    ForRerun,
+    Open,
+    PictureAt,
+    PictureRead,
+    Recover,
+    Recovered,
+    Rows,
+    RowsRead,
+    Sources,
+    SourcesFound,
+    ToldRerun,
+)
+from workbench.recording.reader.scan import NOTES, Found, broken
+from workbench.recording.writing.publish import RecordingError
+
+ROW_SECONDS = 30.0
+OPEN_SECONDS = 60.0
+PICTURE_SECONDS = 70.0
+"""A film is taken apart when its first frame is looked at."""
+MENDING_SECONDS = 1800.0
+"""An hour with four cameras takes some minutes."""
+PICTURE_PATIENCE = 0.2
+"""Seconds that a picture waits for another recording to be opened."""
+MOST_READERS = 4
+LARGEST_THUMBNAIL = 64 << 10
+_AT_ONCE = 8
+"""Rows that are asked for together: the reader goes on while the last ones are put into the table."""
+_JPEG = b"\xff\xd8\xff"
+T = TypeVar("T")
+
+_lock = threading.Lock()
+_readers: OrderedDict[tuple[Path, bool], Reader] = OrderedDict()
+_shapes = KnownShapes()
+
+
+def start_reading() -> None:
+    """Begin to start what reads recordings, before one is wanted. Returns at once; raises OSError."""
+    nursery.start()
+
+
+def stop_reading() -> None:
+    """End all processes that read recordings; who wants one read has them started again."""
+    with _lock:
+        readers = list(_readers.values())
+        _readers.clear()
+    for reader in readers:
+        reader.close()
+    nursery.end()
+
+
+def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
+    """The recordings in these files of a library's folder, with a thumbnail each. Whatever is wrong is said in a row.
+
+    Raises:
+        OSError: no process can be started to read them.
+    """
+    wanted = list(wanted)
+    reader = _reader(folder, episodes=False)
+    reader.allow(_beyond(path for found in wanted for path in found.paths(folder)))
+    for begin in range(0, len(wanted), _AT_ONCE):
+        some = wanted[begin : begin + _AT_ONCE]
+        asked = [Rows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some]
+        answers = reader.ask_all(asked, ROW_SECONDS)
+        for found, answer in zip(some, answers, strict=True):
+            yield found, _entries(found, answer)
+
+
+def read_recording(
+    kind: Kind, path: Path, part: str = "", shapes: SharedShapes | None = None, folder: Path | None = None
+) -> Episode:
+    """An episode. Its pictures are read one by one when they are looked at.
+
+    Args:
+        part: which one of the file or dataset; empty for a recording of ours.
+        shapes: of other recordings, to be shared.
+        folder: below which the process that reads it may read; by default that of the file.
+
+    Raises:
+        UnreadableRecording: it cannot be read; the message says what is wrong.
+        OSError: its files cannot be got at.
+    """
+    path = Path(path).absolute()
+    folder = folder or (path if kind == "lerobot" else path.parent)
+    beside = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
+    reader = _reader(folder, episodes=True)
+    reader.allow(_beyond(beside))
+    shapes = SharedShapes() if shapes is None else shapes
+    sharing, known = _shapes.of(shapes)
+    wanted = Open(kind, path, part, sharing)
+    read, process = _asked(reader, wanted, EpisodeRead, path.name)
+    opened = _Opened(reader, wanted, process, read.opened, path.name)
+    try:
+        episode = unpacked(read, opened.picture, process, shapes, known)
+    except Garbled as error:
+        raise UnreadableRecording(f"{path.name} is a recording, but a broken one: {error}.") from error
+    if kind == "ours":
+        found = task_file(read.source_path, episode.info.task, path.parent)
+        if found is not None:
+            episode.info = replace(episode.info, source_file=found)
+    return episode
+
+
+def find_sources(path: Path) -> list[Source]:
+    """The recordings that a file is or a folder holds. Raises as `read_recording`."""
+    return _found(path, trajectories=False)
+
+
+def find_trajectories(path: Path) -> list[str]:
+    """Names of the episodes in an ``.h5`` of ManiSkill's, in the order of their numbers. Raises as `read_recording`."""
+    return [source.part for source in _found(path, trajectories=True) if source.part is not None]
+
+
+def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
+    """What rerun calls the recording in an ``.rrd``, and the blueprint in it. Raises as `read_recording`."""
+    path = Path(path).absolute()
+    reader = _reader(path.parent, episodes=True)
+    reader.allow(_beyond([path]))
+    told, _ = _asked(reader, ForRerun(path), ToldRerun, path.name)
+    return told.store, told.blueprint
+
+
+def mend(folder: Path) -> tuple[Path, ...]:
+    """Make what dead writers left in `folder` episodes; returns the .rrd of each.
+
+    A folder that came from elsewhere may bring journals along. So it is done by a process that may write below that folder
+    alone, and has a limit on memory and time; it is started only where something was left.
+
+    Raises:
+        RecordingError: files cannot be written, or the folder not read, or it was given up; the journals stay.
+    """
+    from workbench.recording.writing.journal import FOLDER  # with Arrow, which a server need not wait for
+
+    failed = f"Cannot recover what lies in {folder}: "
+    try:
+        if not any(os.scandir(folder / FOLDER)):
+            return ()
+    except FileNotFoundError:
+        return ()
+    except OSError as error:
+        raise RecordingError(f"{failed}{error.strerror}") from error
+    reader = Reader(Path("/"), episodes=False, writes=folder.absolute())
+    try:
+        answer = reader.ask(Recover(folder.absolute()), MENDING_SECONDS).answer
+    except OSError as error:
+        raise RecordingError(f"{failed}it {error}") from error
+    finally:
+        reader.close()
+    if isinstance(answer, Recovered):
+        # Names alone: the process that says them has read what came from elsewhere.
+        return tuple(folder / Path(name).name for name in answer.made)
+    why = answer if isinstance(answer, Failed) else Failed("unreadable", f"it gave {type(answer).__name__}.")
+    raise RecordingError(why.words if why.why == "system" else f"{failed}{why.words}")
+
+
+def recovered_in_words(paths: Sequence[str]) -> str:
+    """Of what a session that was killed left half written, and this one mended; empty for nothing."""
+    if not paths:
+        return ""
+    one = len(paths) == 1
+    named = ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+    return (
+        f"{len(paths)} episode{'' if one else 's'} that an earlier session left half written "
+        f"{'was' if one else 'were'} mended: {named}"
+    )
+
+
+def _found(path: Path, trajectories: bool) -> list[Source]:
+    path = Path(path).absolute()
+    reader = _reader(path if path.is_dir() else path.parent, episodes=True)
+    reader.allow(_beyond([path]))
+    found, _ = _asked(reader, Sources(path, trajectories), SourcesFound, path.name)
+    return [replace(one, id=text(one.id, 8192), name=text(one.name, 400)) for one in found.sources]
+
+
+def _reader(folder: Path, episodes: bool) -> Reader:
+    key = (Path(folder).absolute(), episodes)
+    gone = None
+    with _lock:
+        if key not in _readers:
+            _readers[key] = Reader(key[0], episodes)
+        _readers.move_to_end(key)
+        if len(_readers) > MOST_READERS:
+            _, gone = _readers.popitem(last=False)
+        reader = _readers[key]
+    if gone is not None:
+        gone.close()  # one that somebody still has pictures of is started again when they ask
+    return reader
+
+
+def _beyond(paths: Iterable[Path]) -> list[Path]:
+    """Where links lead that stand in place of files: out of the folder, perhaps."""
+    return [Path(os.path.realpath(path)) for path in paths if os.path.islink(path)]
+
+
+def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
+    answer = answered.answer if isinstance(answered, Answered) else answered
+    if isinstance(answer, RowsRead):
+        return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
+    why = "gave something that is no row"
+    if isinstance(answer, Failed):
+        why = answer.words
+    elif isinstance(answer, ReaderEnded):
+        # It is read again when it has changed, or by who opens it.
+        why = f"{answer}, and is left alone until it changes"
+    # Which of them it was, nobody knows any more.
+    suffixes = ", ".join(suffix for suffix in found.sizes if suffix != NOTES)
+    return [broken(found, f"{Path(found.key).name} ({suffixes}) {why}.")]
+
+
+def _thumbnail(jpeg: bytes | None) -> bytes | None:
+    """It goes to the browser as it is."""
+    return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= LARGEST_THUMBNAIL else None
+
+
+def _asked(reader: Reader, request: Open | Sources | ForRerun, kind: type[T], name: str) -> tuple[T, int]:
+    """The answer, and the number of the process that gave it."""
+    try:
+        answered = reader.ask(request, OPEN_SECONDS)
+    except ReaderEnded as error:
+        raise UnreadableRecording(f"{name} {error}.") from error
+    answer = answered.answer
+    if isinstance(answer, Failed):
+        if answer.why == "system":
+            raise OSError(answer.words)
+        raise UnreadableRecording(answer.words)
+    if not isinstance(answer, kind):
+        raise UnreadableRecording(f"{name} gave {type(answer).__name__}.")
+    return answer, answered.process
+
+
+class _Opened:
+    """An episode that is open in a reader for as long as somebody may look at its pictures."""
+
+    def __init__(self, reader: Reader, wanted: Open, process: int, opened: int, name: str) -> None:
+        self._reader, self._wanted, self._name = reader, wanted, name
+        self._lock = threading.Lock()
+        self._failed: OSError | None = None
+        self._is_open_in(process, opened)
+
+    def picture(self, camera: int, modality: Modality, index: int, encoded: bool) -> PictureRead:
+        """Raises OSError; ReaderBusy while another recording is being opened."""
+        with self._lock:
+            if self._failed is not None:
+                raise self._failed
+            try:
+                answer = self._ask(camera, modality, index, encoded).answer
+            except ReaderEnded as error:
+                # It would end the next one too, thirty times a second.
+                self._failed = OSError(f"{self._name} {error}")
+                raise self._failed from error
+        if isinstance(answer, PictureRead):
+            return answer
+        raise OSError(answer.words if isinstance(answer, Failed) else "the reader gave no picture")
+
+    def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
+        for _ in range(2):
+            wanted = PictureAt(self._number, camera, modality, index, encoded)
+            try:
+                return self._reader.ask(wanted, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
+            except NotThere:
+                # Something else has ended the process since.
+                read, process = _asked(self._reader, self._wanted, EpisodeRead, self._name)
+                self._is_open_in(process, read.opened)
+        raise ReaderEnded("ended the process that reads recordings")
+
+    def _is_open_in(self, process: int, opened: int) -> None:
+        self._process, self._number = process, opened
+        weakref.finalize(self, self._reader.forget, process, opened).atexit = False
+
+
+# --- Which recordings are meant by naming files, folders or rows of the library; and each of them read ---
+
+
+def read_source(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
+    """The episode; arguments and errors as of `read_recording`."""
+    return read_recording(source.kind, source.path, source.part or "", shapes, folder)
+
+
+def sources_among(paths: Sequence[Path]) -> tuple[Source, ...]:
+    """The recordings that these files are, or that lie in these folders and the folders below them, by name, each once.
+
+    Raises:
+        FileNotFoundError: there is nothing at one of them.
+        UnreadableRecording: a file is, or all folders together hold, no recording; the message says what is looked for.
+    """
+    found: dict[str, Source] = {}
+    for path in paths:
+        path = Path(path)
+        if not path.exists():
+            raise FileNotFoundError(f"There is nothing at {path}: give recordings, or folders of them.")
+        some = find_sources(path)
+        if not some and not path.is_dir():
+            raise _none_in([path])
+        for source in some:
+            found.setdefault(source.id, source)
+    if not paths:
+        raise UnreadableRecording("No recording is named: give recordings, or folders of them.")
+    if not found:
+        raise _none_in(paths)
+    return tuple(found.values())
+
+
+def _none_in(paths: Sequence[Path]) -> UnreadableRecording:
+    return UnreadableRecording(
+        f"There is no recording in {', '.join(map(str, paths))}: looked for are the .rrd, .h5 and .json of the workbench, "
+        ".h5 with .json of ManiSkill, and LeRobot datasets."
+    )

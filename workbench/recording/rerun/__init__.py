@@ -1,0 +1,1 @@
+"""Rerun's files and viewer."""

@@ -1,0 +1,376 @@
+"""An ``.rrd`` of ours as arrays, entity by entity.
+
+Rerun's own query engine is an extra of 100 MB. The chunks of a file are plain Arrow tables, though, and what `layout` put
+in by columns comes out by columns. Values are looked at without a Python object a row.
+
+Most of a file is not read at all. Its pictures stay where they are until one is looked at (`rerun_pictures`). And a mesh
+is in every recording of its scene, often as the very same chunk: one that another recording has brought already is
+known by the chunk's id, in the index, and neither read nor compared again.
+
+An episode of ten thousand steps with four cameras is a few hundred megabytes of encoded pictures, and a review may have
+sixty recordings open. The index of a file says where each chunk of pictures lies and which states it is of, so nothing
+of a picture is read until somebody looks. Then its chunk is, a few megabytes, and kept for a while: whoever looks at a
+picture looks at the next one next. What is kept is bounded for all recordings of the process together.
+
+A file stays open for as long as its pictures may be asked for, so one that is deleted meanwhile can still be looked at.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rerun.chunk import Chunk, LazyStore, RrdReader
+
+from workbench.core.camera_data import CameraInfo
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
+from workbench.machine.files import open_regular_file
+from workbench.recording.episode.encoded_pictures import EncodedPictures, LazyPictures, Modality, encode
+from workbench.recording.rerun.chunks import STEP
+from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
+
+_PROPERTIES = "/__properties"
+_ALL = ("+ /**", f"+ {_PROPERTIES}/**")
+"""What rerun keeps for itself is not among all."""
+
+
+class RerunTable:
+    def __init__(self, path: Path, shapes: SharedShapes | None = None) -> None:
+        """
+        Args:
+            shapes: of other recordings, to be shared.
+
+        Raises OSError, ValueError or RuntimeError where `path` is no ``.rrd``.
+        """
+        self._shapes = SharedShapes() if shapes is None else shapes
+        self._timed: dict[tuple[str, str], list[tuple[NDArray[np.int64], pa.Array]]] = {}
+        self._static: dict[tuple[str, str], pa.Array] = {}
+        self._file = OpenFile(path)
+        self._pictures: dict[tuple[str, str], list[IndexedChunk]] = {}
+        self._known: dict[str, tuple[str, Mesh, Material]] = {}
+        """What entities wear that is not read, as another recording has it."""
+        self._alone: dict[str, IndexedChunk] = {}
+        """The static chunk of an entity that has one and no more."""
+        store = RrdReader(path).store()
+        self._look(index_of(store, STEP))
+        for chunk in self._chunks(store):
+            batch = chunk.to_record_batch()
+            steps = None
+            if not chunk.is_static:
+                index = batch.schema.get_field_index(STEP)
+                if index < 0:
+                    continue
+                steps = batch.column(index).cast(pa.int64(), safe=False).to_numpy()
+            for name, column in _data_of(batch):
+                key = (chunk.entity_path, name)
+                if steps is not None:
+                    self._timed.setdefault(key, []).append((steps, column))
+                elif len(column) and column[len(column) - 1].is_valid:
+                    self._static[key] = column[len(column) - 1].values
+
+    def _look(self, index: Sequence[IndexedChunk]) -> None:
+        """Find in the index what need not be read."""
+        several = set()
+        for place in index:
+            if not place.static:
+                for component in set(place.components) & set(PICTURE_COMPONENTS.values()):
+                    self._pictures.setdefault((place.entity, component), []).append(place)
+            elif place.entity in self._alone:
+                several.add(place.entity)
+            else:
+                self._alone[place.entity] = place
+        for entity in several:
+            del self._alone[entity]
+        for entity, place in self._alone.items():
+            known = self._shapes.known(_mark(place))
+            if known is not None:
+                self._known[entity] = known
+
+    def _chunks(self, store: LazyStore) -> Iterator[Chunk]:
+        # Entity by entity, which is what rerun's reader can leave out before it reads.
+        pictures = [f"- {entity}" for entity in {entity for entity, _ in self._pictures}]
+        yield from store.stream().filter(content=[*_ALL, *pictures], is_static=False)
+        known = [f"- {entity}" for entity in self._known]
+        yield from store.stream().filter(content=[*_ALL, *known], is_static=True)
+
+    def property(self, name: str, component: str) -> Any:
+        """A property's value, a list if there are several, None if there is none."""
+        for (entity, key), values in self._static.items():
+            if entity == f"{_PROPERTIES}/{name}" and key.rsplit(":", 1)[-1] == component:
+                found = values.to_pylist()
+                return found[0] if len(found) == 1 else found
+        return None
+
+    def scalars(self, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Steps (R,) and numbers (R, K) of a batched ``Scalars``; see `rows_at`."""
+        return self._rows(entity, "Scalars:scalars")
+
+    def pose_rows(self, entity: str, frames: NDArray[np.int64], states: int) -> NDArray[np.float32]:
+        """(len(frames), 7) translation and xyzw at these states."""
+        return self._poses(entity, states)[frames]
+
+    def poses(self, entities: Sequence[str], states: int) -> NDArray[np.float32]:
+        """(states, len(entities), 7) position and wxyz; NaN for an entity that is not there."""
+        poses = np.full((states, len(entities), 7), np.nan, dtype=np.float32)
+        for body, entity in enumerate(entities):
+            rows = self._poses(entity, states)
+            poses[:, body, :3] = rows[:, :3]
+            poses[:, body, 3:] = np.roll(rows[:, 3:], 1, axis=-1)
+        return poses
+
+    def _poses(self, entity: str, states: int) -> NDArray[np.float32]:
+        poses = np.full((states, 7), np.nan, dtype=np.float32)
+        for key, place in (("translation", slice(0, 3)), ("quaternion", slice(3, 7))):
+            fixed = self._static.get((entity, f"Transform3D:{key}"))
+            if fixed is not None:
+                poses[:, place] = _plain(fixed).reshape(-1)
+            else:
+                steps, rows = self._rows(entity, f"Transform3D:{key}")
+                if len(steps):
+                    at = rows_at(steps, 0, states)
+                    poses[at >= 0, place] = rows[at[at >= 0]]
+        return poses
+
+    def _rows(self, entity: str, component: str) -> tuple[NDArray[np.int64], NDArray]:
+        """Steps (R,) and values (R, K) of a component with K numbers a row."""
+        found = self._timed.get((entity, component), [])
+        if not found:
+            return np.zeros(0, np.int64), np.zeros((0, 0))
+        steps = np.concatenate([steps for steps, _ in found])
+        values = np.concatenate([_plain(column.flatten()).reshape(len(column), -1) for _, column in found])
+        order = np.argsort(steps, kind="stable")
+        return steps[order], values[order]
+
+    def pictures(
+        self, entity: str, modality: Modality, info: CameraInfo
+    ) -> tuple[NDArray[np.int64], EncodedPictures] | None:
+        """States and pictures of ``<camera>/<modality>``; None where the camera has none. Raises OSError."""
+        places = self._pictures.get((entity, PICTURE_COMPONENTS[modality]), [])
+        if not places:
+            return None
+        places = sorted(places, key=lambda place: (place.steps or (0, 0))[0])
+        return pictures_in(self._file, places, modality, info.height, info.width)
+
+    def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
+        """`bare` with the meshes that its bodies wear, shared with other recordings; `entities` are theirs."""
+        visuals: dict[str, tuple[Mesh, Material, list[int]]] = {}
+        for body, entity in enumerate(entities):
+            number = 0
+            while (worn := self._worn(f"{entity}/{number}", f"{bare.body_names[body]}/{number}")) is not None:
+                name, mesh, material = worn
+                visuals.setdefault(name, (mesh, material, []))[2].append(body)
+                number += 1
+        return replace(
+            bare,
+            visuals=tuple(
+                Visual(name, mesh, material, np.zeros(len(bodies), np.int32), np.array(bodies, np.int32))
+                for name, (mesh, material, bodies) in visuals.items()
+            ),
+        )
+
+    def _worn(self, entity: str, otherwise: str) -> tuple[str, Mesh, Material] | None:
+        """The name of a visual, by default `otherwise`, and what it looks like; None if there is none."""
+        if entity in self._known:
+            return self._known[entity]
+        mesh = self._mesh(entity)
+        if mesh is None:
+            return None
+        name = str(self._one(entity, "visual", otherwise))
+        mesh, material = self._shapes.shared(mesh, self._material(entity))
+        if entity in self._alone and (entity, "visual") in self._static:
+            self._shapes.learn(_mark(self._alone[entity]), name, mesh, material)
+        return name, mesh, material
+
+    def _mesh(self, entity: str) -> Mesh | None:
+        vertices = self._static.get((entity, "Mesh3D:vertex_positions"))
+        if vertices is None:
+            return None
+        held = {
+            key: self._static.get((entity, f"Mesh3D:{component}"))
+            for key, component in (("normals", "vertex_normals"), ("uvs", "vertex_texcoords"))
+        }
+        faces = self._static[entity, "Mesh3D:triangle_indices"]
+        return Mesh(
+            vertices=_plain(vertices).reshape(-1, 3),
+            faces=_plain(faces).reshape(-1, 3),
+            normals=None if held["normals"] is None else _plain(held["normals"]).reshape(-1, 3),
+            uvs=None if held["uvs"] is None else _plain(held["uvs"]).reshape(-1, 2),
+        )
+
+    def _material(self, entity: str) -> Material:
+        buffer = self._static.get((entity, "Mesh3D:albedo_texture_buffer"))
+        texture = None
+        if buffer is not None:
+            form = self._static[entity, "Mesh3D:albedo_texture_format"][0].as_py()
+            rgb = _plain(buffer.flatten()).reshape(form["height"], form["width"], 3)
+            texture = np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
+        colors = self._static.get((entity, "base_color"))
+        r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colors is None else colors.to_pylist()
+        return Material(
+            base_color=(r, g, b, a),
+            metallic=float(self._one(entity, "metallic", 0.0)),
+            roughness=float(self._one(entity, "roughness", 1.0)),
+            texture=texture,
+        )
+
+    def _one(self, entity: str, component: str, otherwise: Any) -> Any:
+        values = self._static.get((entity, component))
+        return otherwise if values is None else values[0].as_py()
+
+
+def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int64]:
+    """(states - first,) which row says what was at each state: the one before where it has none; -1 where there is none yet.
+
+    Rows that say nothing new are left out (`rerun_chunks.telling`).
+    """
+    return np.searchsorted(steps, np.arange(first, states), side="right") - 1
+
+
+def _mark(place: IndexedChunk) -> tuple[bytes, int, int]:
+    """Of one content. Rerun's ids are unique; the sizes are for a file that somebody made by hand."""
+    return (place.id, place.end - place.begin, place.unpacked)
+
+
+def _plain(values: pa.Array) -> NDArray:
+    """The numbers in an array of numbers, of fixed lists of numbers, or of bytes."""
+    while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
+        values = values.flatten()
+    return values.to_numpy(zero_copy_only=False)
+
+
+def read_properties(path: Path) -> dict[str, dict[str, Any]]:
+    """The properties of the first recording in `path`, by name and then by component.
+
+    A component of one value is that value, a longer one a list. It is all that a library needs of a bare ``.rrd``; a file without a footer
+    (its writer was killed) is read as far as it goes.
+
+    Raises:
+        ValueError: `path` holds no recording.
+        OSError: `path` cannot be read.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for chunk in RrdReader(path).stream():
+        if not chunk.entity_path.startswith(_PROPERTIES):
+            continue
+        name = chunk.entity_path[len(_PROPERTIES) :].lstrip("/")
+        batch = chunk.to_record_batch()
+        for component, column in _data_of(batch) if batch.num_rows else ():
+            if (value := column[batch.num_rows - 1].as_py()) is not None:
+                key = component.rsplit(":", 1)[-1]
+                found.setdefault(name, {})[key] = value[0] if len(value) == 1 else value
+    return found
+
+
+def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
+    """The columns of a chunk but its timelines and the ids of its rows."""
+    for field, column in zip(batch.schema, batch.columns):
+        if (field.metadata or {}).get(b"rerun:kind") == b"data":
+            yield field.name, column
+
+
+# --- Pictures of an ``.rrd``, read where they lie when one is looked at -----------------------
+
+
+KEPT_BYTES = 64 << 20
+"""Of decompressed chunks, in the whole process; the newest is kept however large it is."""
+MOST_ROWS = 1_000_000
+"""Of a chunk: its index is believed before anything of it is read."""
+PICTURE_COMPONENTS: dict[Modality, str] = {
+    "rgb": "EncodedImage:blob",
+    "depth": "EncodedDepthImage:blob",
+    "segmentation": "SegmentationImage:buffer",
+}
+
+
+class OpenFile:
+    """A file that can be read from any thread."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError."""
+        self.name = path.name
+        with open_regular_file(path) as file:
+            self._descriptor = os.dup(file.fileno())
+
+    def __del__(self) -> None:
+        if hasattr(self, "_descriptor"):
+            os.close(self._descriptor)
+
+    def __reduce__(self) -> str:
+        # The number of a descriptor means another file in another process, which would be closed with it.
+        raise TypeError("An open recording cannot be sent to another process; send its path.")
+
+    def chunk(self, place: IndexedChunk) -> pa.RecordBatch:
+        """Raises OSError where it is no chunk."""
+        content = os.pread(self._descriptor, place.end - place.begin, place.begin)
+        try:
+            return decode_chunk(content)
+        except ValueError as error:
+            raise OSError(f"{self.name} is damaged at byte {place.begin}: {error}") from error
+
+
+class _Kept:
+    """The chunks that were looked at last."""
+
+    def __init__(self) -> None:
+        self._chunks: OrderedDict[tuple[int, int], tuple[OpenFile, pa.Array]] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def rows(self, file: OpenFile, place: IndexedChunk, component: str) -> pa.Array:
+        """The rows of that component. Raises OSError."""
+        # The file is kept with it, so its id is nobody else's.
+        key = (id(file), place.begin)
+        with self._lock:
+            if key in self._chunks:
+                self._chunks.move_to_end(key)
+                return self._chunks[key][1]
+        rows = file.chunk(place).column(component)
+        with self._lock:
+            if key not in self._chunks:
+                self._chunks[key] = (file, rows)
+                self._bytes += rows.nbytes
+            while self._bytes > KEPT_BYTES and len(self._chunks) > 1:
+                _, (_, gone) = self._chunks.popitem(last=False)
+                self._bytes -= gone.nbytes
+        return rows
+
+
+_kept = _Kept()
+
+
+def pictures_in(
+    file: OpenFile, places: Sequence[IndexedChunk], modality: Modality, height: int, width: int
+) -> tuple[NDArray[np.int64], EncodedPictures]:
+    """One modality of one camera, and (P,) the state of each picture; `places` are its chunks, in order of time. Raises OSError."""
+    component, ends = PICTURE_COMPONENTS[modality], np.cumsum([place.rows for place in places])
+
+    def one(number: int) -> bytes:
+        part = int(np.searchsorted(ends, number, side="right"))
+        rows = _kept.rows(file, places[part], component)
+        content = rows[number - int(ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
+        if modality != "segmentation":
+            return content
+        # Plain ids, as the PNG that they were, or would have been.
+        wide = len(content) == 4 * height * width
+        ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(height, width)
+        return encode("segmentation", ids.astype(np.int32))
+
+    frames = np.concatenate([_steps(file, place) for place in places])
+    return frames, EncodedPictures(modality, LazyPictures(int(ends[-1]), one))
+
+
+def _steps(file: OpenFile, place: IndexedChunk) -> NDArray[np.int64]:
+    if place.rows > MOST_ROWS:
+        raise OSError(f"{file.name} claims {place.rows:,} pictures in one piece")
+    if place.steps is not None and place.steps[1] - place.steps[0] + 1 == place.rows:
+        return np.arange(place.steps[0], place.steps[1] + 1)
+    # A picture here and there: only the chunk itself says of which states.
+    return file.chunk(place).column(STEP).cast(pa.int64(), safe=False).to_numpy()

@@ -1,0 +1,279 @@
+"""Write an episode as an ``.rrd``, and how it looks when it is opened: the same arrangement as the workbench's own page.
+
+Its chunks are made while rerun writes them, so that its pictures are never in memory all at once, and what the disk refuses is
+an error here and not on a thread of rerun's.
+
+The scene is large on the left, what the cameras saw is on the right, and the curves lie below, all moved by one slider over
+``step``. Rerun can also arrange views by itself, but its rules change from release to release and put one view on every
+number, so nothing is left to them.
+"""
+
+from __future__ import annotations
+
+import datetime
+import errno
+import math
+import os
+import re
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import Chunk, LazyChunkStream
+from rerun.error_utils import catch_and_log_exceptions
+
+from workbench.recording.episode.description import describe
+from workbench.recording.episode.document import fields_of, json_text
+from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_in_words, box_of_moving
+from workbench.recording.rerun.append_blueprint import BlueprintBytes, add_blueprint, encode_blueprint
+from workbench.recording.rerun.chunks import STEP, property_chunk, static_chunk
+from workbench.recording.rerun.layout import (
+    EVENTS,
+    LOGS,
+    REWARD_TERMS,
+    WORLD,
+    batch_entity,
+    camera_entities,
+    chunks,
+    evaluate_entity,
+)
+
+MAX_SERIES = 32
+"""An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
+MAX_STACKED = 3
+"""More cameras than this lie behind tabs: one above the other each would be a strip."""
+EYE_DIRECTION = (0.75, 0.85, 0.6)
+"""From where the scene is looked at, seen from its middle: ManiSkill's render cameras do likewise."""
+
+
+def write_rrd(episode: Episode, path: Path) -> None:
+    """Write `episode`, which has a scene, to `path`; what lies there is written over.
+
+    Raises:
+        OSError: it cannot be written, or one of its pictures not be read.
+        ValueError: rerun refuses something in it.
+    """
+    application_id = _application_id(episode.info)
+    # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
+    with catch_and_log_exceptions(strict=True):
+        write_chunks(_chunks(episode), path, application_id)
+        add_blueprint(path, _blueprint(application_id, arrangement(episode)))
+
+
+def _chunks(episode: Episode) -> Iterator[Chunk]:
+    written = datetime.datetime.fromisoformat(episode.info.written_at).timestamp()
+    started = rr.encodings.TimeInt(seconds=written)
+    info = rr.archetypes.RecordingInfo(name=_title(episode), start_time=started)
+    yield static_chunk("/__properties", info)
+    for name, values in properties(episode).items():
+        yield property_chunk(name, values)
+    yield from chunks(episode)
+
+
+def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> None:
+    """Write `chunks` as a recording of its own. Raises OSError, and whatever `chunks` raises."""
+    failed: list[BaseException] = []
+
+    def watched() -> Iterator[Chunk]:
+        try:
+            yield from chunks
+        except GeneratorExit:  # rerun wants no more
+            raise
+        except BaseException as error:
+            failed.append(error)
+            raise
+
+    stream = LazyChunkStream.from_iter(watched())
+    try:
+        # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
+        stream.write_rrd(path, application_id=application_id, recording_id=uuid.uuid4().hex)
+    except RuntimeError as error:
+        if failed:
+            raise failed[0] from None
+        raise _disk_error(error, path) from error
+
+
+def _disk_error(error: RuntimeError, path: Path) -> OSError:
+    """What rerun says of a disk, with the number that the system gave."""
+    number = re.search(r"\(os error (\d+)\)", str(error))
+    if number is None:
+        return OSError(errno.EIO, f"{path.name} could not be written ({error})")
+    return OSError(int(number[1]), os.strerror(int(number[1])), str(path))
+
+
+@lru_cache(maxsize=64)
+def _blueprint(application_id: str, arranged: Arrangement) -> BlueprintBytes:
+    return encode_blueprint(application_id, blueprint_of(arranged))
+
+
+def _application_id(info: EpisodeInfo) -> str:
+    """The viewer keeps one blueprint an application id; a slash in it makes rerun rename it."""
+    return f"workbench {info.task}".replace("/", "-")
+
+
+def _title(episode: Episode) -> str:
+    flags = episode.flags
+    outcome = (
+        "success"
+        if "success" in flags and flags["success"][-1]
+        else "fail"
+        if "fail" in flags and flags["fail"][-1]
+        else "no success"
+    )
+    info = episode.info
+    seed = f"seed {info.seed}" if info.seed >= 0 else "no seed"
+    return f"{info.task} {seed} env {info.env_index}: {outcome}, {episode.length} steps"
+
+
+def properties(episode: Episode) -> dict[str, dict[str, Any]]:
+    """What the file says of the episode as a whole, property by property.
+
+    ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as
+    in ManiSkill's own metrics. ``source`` holds the text of the task's files, so that the episode can
+    be made again where the files have changed since. ``workbench`` is the `Description` for programs.
+    """
+    said = fields_of(describe(episode))
+    words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
+    words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered")
+    plain = {name: said[name] for name in words}
+    for name in ("success", "success_once", "fail", "fail_once"):
+        plain[name] = bool(said[name])
+    plain["acted_by"] = acted_by_in_words(episode.info.acted_by)
+    for name in ("env_kwargs", "reset_options"):
+        plain[name] = json_text(said[name])
+    values: dict[str, dict[str, Any]] = {"episode": plain}
+    if said["versions"]:
+        values["versions"] = dict(said["versions"])
+    if said["source"]:
+        values["source"] = {"files": list(said["source"]), "texts": list(said["source"].values())}
+    # The texts are megabytes in no task, and once is enough.
+    values["workbench"] = {"description": json_text({**said, "source": None})}
+    return values
+
+
+# --- how it looks ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """All that an episode's blueprint hangs on: most episodes of a scene share one."""
+
+    cameras: tuple[tuple[str, str, tuple[str, ...]], ...]
+    """Name, entity and modalities of each."""
+    drawn: tuple[str, ...]
+    """Entities of ``evaluate()`` that are curves."""
+    texts: bool
+    """Whether ``evaluate()`` returned texts."""
+    acted: bool
+    """Whether actions have names, and so curves."""
+    fps: float | None
+    eye: tuple[float, float, float]
+    looked_at: tuple[float, float, float]
+
+
+def arrangement(episode: Episode) -> Arrangement:
+    cameras = episode.cameras
+    entities = camera_entities([camera.info for camera in cameras])
+    entries = [
+        (evaluate_entity(name), column)
+        for name, column in episode.evaluate.items()
+        if not name.startswith(REWARD_TERMS)
+    ]
+    entries += [(batch_entity(name), column) for name, column in episode.batch.items()]
+    drawn = (entity for entity, column in entries if 0 < math.prod(column.shape[1:]) <= MAX_SERIES)
+    eye, looked_at = _eye(episode)
+    return Arrangement(
+        cameras=tuple(
+            (camera.info.name, entity, tuple(camera.pictures)) for camera, entity in zip(cameras, entities)
+        ),
+        drawn=tuple(drawn),
+        texts=bool(episode.texts),
+        acted=bool(episode.action_names),
+        fps=1.0 / episode.info.control_dt if episode.info.control_dt > 0 else None,
+        eye=eye,
+        looked_at=looked_at,
+    )
+
+
+def blueprint_of(arranged: Arrangement) -> rrb.Blueprint:
+    scene = rrb.Spatial3DView(
+        name="Scene",
+        origin=WORLD,
+        # A depth picture in a 3-D view is a cloud of points over the very meshes that it shows.
+        contents=[
+            "$origin/**",
+            *(f"- {entity}/{m}" for _, entity, _ in arranged.cameras for m in ("depth", "segmentation")),
+        ],
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=arranged.eye,
+            look_target=arranged.looked_at,
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+        line_grid=False,
+    )
+    top: rrb.ContainerLike = scene
+    if arranged.cameras:
+        top = rrb.Horizontal(scene, _cameras(arranged), column_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Vertical(top, _curves(arranged), row_shares=[5, 2]),
+        rrb.TimePanel(state="collapsed", timeline=STEP, fps=arranged.fps, play_state="paused"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _cameras(arranged: Arrangement) -> rrb.ContainerLike:
+    alone = len(arranged.cameras) == 1
+    parts = [_camera(*camera, alone) for camera in arranged.cameras]
+    if alone:
+        return parts[0]
+    return rrb.Vertical(*parts) if len(parts) <= MAX_STACKED else rrb.Tabs(*parts)
+
+
+def _camera(name: str, entity: str, modalities: tuple[str, ...], alone: bool) -> rrb.ContainerLike:
+    views = [
+        rrb.Spatial2DView(name=f"{name} {m}", origin=entity, contents=[f"$origin/{m}"]) for m in modalities
+    ]
+    if len(views) == 1:
+        return views[0]
+    if alone:
+        return rrb.Vertical(views[0], rrb.Horizontal(*views[1:]), row_shares=[3, 2], name=name)
+    return rrb.Horizontal(views[0], rrb.Vertical(*views[1:]), column_shares=[2, 1], name=name)
+
+
+def _curves(arranged: Arrangement) -> rrb.ContainerLike:
+    legend = rrb.PlotLegend(visible=True)
+    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward", plot_legend=legend)]
+    if arranged.drawn:
+        views.append(
+            rrb.TimeSeriesView(
+                name="Evaluate", origin="/evaluate", contents=list(arranged.drawn), plot_legend=legend
+            )
+        )
+    if arranged.acted:
+        views.append(rrb.TimeSeriesView(name="Action", origin="/action", plot_legend=legend))
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    origin = LOGS if arranged.texts else EVENTS
+    views.append(rrb.TextLogView(name="Events", origin=origin, columns=columns))
+    return rrb.Horizontal(*views)
+
+
+def _eye(episode: Episode) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Where the eye is and what it looks at: what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
+    assert episode.poses is not None and episode.geometry is not None
+    low, high = box_of_moving(episode.poses[0], episode.geometry.body_kinds)
+    # Of what differs by centimetres from episode to episode nothing hangs on, and the same blueprint is made once.
+    middle = np.round((low + high).astype(np.float64) / 2, 1)
+    direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)
+    distance = round(1.5 * max(float(np.linalg.norm(high - low)), 0.5), 1)
+    eye = middle + distance * direction
+    return (eye[0], eye[1], eye[2]), (middle[0], middle[1], middle[2])

@@ -1,0 +1,1 @@
+"""An episode while it happens: the crash-safe journal, and the files that are made of it."""

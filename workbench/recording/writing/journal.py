@@ -1,0 +1,414 @@
+"""What has happened of an episode so far, on the disk: what is left of it when its writer is killed.
+
+The files of an episode can only be written when it is over (rerun's index comes last, HDF5 cannot be cut, both
+want whole columns), and by then it may be too late: the task's own code runs here, and it hangs, eats the memory, or takes
+native code down. So every row goes into a journal first, ``.writing/<id>.arrow`` in the recordings' folder, and the files are
+made from the journal, by the writer at the end or by the next process that finds it (`recover`).
+
+A journal is an Arrow stream of one table, ``kind``, ``number`` and ``value``, which may end anywhere: what was written whole can be
+read. A state's pictures come before its row, so a state is there with all of its pictures or not at all:
+
+- ``header``: JSON; the scene's meshes lie beside it (`scene_file`);
+- ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: a row of that layout, or several one behind the other;
+- ``acted`` `action`: text of what chooses the actions from this one on, where the header does not say it;
+- ``entry`` `state`: JSON of an entry of ``evaluate()`` that is no number and changes here (`columns.TextWriter`);
+- ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
+
+A row is on the disk within half a second, and its owner does not wait for that: one thread for all journals of the process writes
+what has gathered and makes it last. While a journal is written its file is locked (``flock``), which the system undoes when the
+process dies, however it dies: that is how the dead are told from the living.
+
+An episode that is to survive its writer needs the scene's meshes on the disk from its first row on. They are megabytes
+(ManiSkill's table alone has a texture of 4 MB), and sixty-four envs begin an episode at once. So all
+episodes of one process and one scene share one file: each has a name of its own for it, a hard link, and the file is gone
+when the last name is. Plain arrays and a line of JSON in numpy's own archive, which checks what it reads and runs no code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import stat
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
+
+import numpy as np
+import pyarrow as pa
+
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.machine.files import open_regular_file
+
+FOLDER = ".writing"
+SYNC_SECONDS = 0.4
+"""How long a row may wait before it is written."""
+_BATCH_BYTES = 2 << 20
+"""More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
+_MOST_BATCHES = 4
+"""Of a journal that is read: pictures of some states are asked for camera by camera."""
+_SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
+
+
+class Entry(NamedTuple):
+    kind: str
+    number: int
+    value: bytes
+
+
+Item = Entry | Future[list[Entry]]
+
+
+class Journal:
+    """A journal that is being written."""
+
+    def __init__(self, path: Path) -> None:
+        """Begin the journal `path`, which must not exist; its folder is made. Raises OSError."""
+        self.path = path
+        self._descriptor = _create(path)
+        self._closer = weakref.finalize(self, os.close, self._descriptor)
+        self._size = 0
+        self._waiting: list[Item] = []
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()  # of what waits; never held while the disk works
+        self._writing = threading.Lock()
+        self._error: OSError | None = None
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with self._writing:
+                self._put(_SCHEMA.serialize())
+        except OSError:
+            with contextlib.suppress(OSError):  # what is to be told is why it cannot be begun
+                self.remove()
+            raise
+        _keeper.watch(self)
+
+    @property
+    def size(self) -> int:
+        """Bytes written and waiting."""
+        return self._size + self._waiting_bytes
+
+    def append(self, *items: Item) -> None:
+        """What belongs together, and will be on the disk soon: a state, its row last.
+
+        Entries that somebody is still working at keep their place, and whoever writes waits for them, not the owner.
+
+        Raises:
+            OSError: something that was appended before could not be written, or not be made; this is not kept then.
+        """
+        if self._error is not None:
+            raise self._error
+        added = sum([_size(item) for item in items if isinstance(item, Entry)])
+        with self._lock:
+            self._waiting += items
+            self._waiting_bytes += added
+            full = self._waiting_bytes > _BATCH_BYTES
+        for item in items:
+            if not isinstance(item, Entry):
+                item.add_done_callback(self._weigh)
+        if full:
+            self.write()  # where that fails the next one is told: this one is kept
+
+    def write(self) -> None:
+        """Hand what was appended to the system: a process that dies now loses nothing of it."""
+        with self._writing:
+            if self._error is not None or not self._closer.alive:
+                return
+            with self._lock:
+                items, self._waiting = self._waiting, []
+            entries, done, error = _made(items)
+            if entries:
+                batch = pa.record_batch(
+                    [
+                        pa.array([entry.kind for entry in entries], pa.string()),
+                        pa.array([entry.number for entry in entries], pa.int32()),
+                        pa.array([entry.value for entry in entries], pa.binary()),
+                    ],
+                    schema=_SCHEMA,
+                )
+                try:
+                    self._put(batch.serialize())
+                except OSError as failed:
+                    done, entries, error = 0, [], failed
+            with self._lock:
+                self._waiting = items[done:] + self._waiting
+                self._waiting_bytes -= sum(map(_size, entries))
+            self._error = error
+
+    def _weigh(self, made: Future[list[Entry]]) -> None:
+        if not made.cancelled() and made.exception() is None:
+            with self._lock:
+                self._waiting_bytes += sum(map(_size, made.result()))
+
+    def sync(self) -> None:
+        """Write what was appended and make it last, also through a power cut. An error is raised by the next `append`."""
+        self._written(os.fsync)
+
+    def finish(self) -> None:
+        """Write everything and stop writing; the file stays locked until `close`.
+
+        A process that dies loses nothing of it. For a power cut `sync` it, where it is not to be replaced by something better at once.
+        What could not be written before is tried again. Raises OSError where something still cannot.
+        """
+        _keeper.forget(self)
+        self._error = None
+        self._written(lambda _: None)
+        if self._error is not None:
+            raise self._error
+
+    def _written(self, last: Callable[[int], None]) -> None:
+        self.write()
+        with self._writing:
+            if self._error is not None or not self._closer.alive:
+                return
+            try:
+                last(self._descriptor)
+                if os.fstat(self._descriptor).st_nlink == 0:
+                    gone = "the folder, or the file in it, was removed during the recording"
+                    raise FileNotFoundError(errno.ENOENT, gone)
+            except OSError as error:
+                self._error = error
+
+    def close(self) -> None:
+        """Let go of the file."""
+        _keeper.forget(self)
+        with self._writing:
+            self._closer()
+
+    def remove(self) -> None:
+        """Close, and take the file away."""
+        try:
+            self.path.unlink(missing_ok=True)
+        finally:
+            self.close()
+
+    def _put(self, content: pa.Buffer) -> None:
+        # Where half a batch was written before, this one holds all of that and goes to its place: behind it nobody would find it.
+        view, end = memoryview(content), self._size
+        while view:
+            written = os.pwrite(self._descriptor, view, end)
+            view, end = view[written:], end + written
+        self._size = end
+
+
+def _made(items: Sequence[Item]) -> tuple[list[Entry], int, OSError | None]:
+    """Their entries, and how many of them these are. Where one cannot be made, those of the states before it."""
+    entries: list[Entry] = []
+    whole, done = 0, 0
+    for number, item in enumerate(items, 1):
+        if not isinstance(item, Entry):
+            try:
+                entries += item.result()
+            except Exception as error:
+                why = OSError(errno.EIO, f"a picture could not be encoded ({error})")
+                return entries[:whole], done, why
+            continue
+        entries.append(item)
+        if item.kind == "row":
+            whole, done = len(entries), number
+    return entries, len(items), None
+
+
+def _size(entry: Entry) -> int:
+    return len(entry.value) + len(entry.kind) + 8
+
+
+def _create(path: Path) -> int:
+    for _ in range(10):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:  # another writer was done and took the empty folder away just now
+            continue
+    raise FileNotFoundError(errno.ENOENT, "the folder vanishes as soon as it is made")
+
+
+class _Keeper:
+    """The thread that writes what has gathered in all journals of this process, while there are any."""
+
+    def __init__(self) -> None:
+        self._journals: set[Journal] = set()
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self.before: list[weakref.WeakMethod[Callable[[], None]]] = []
+
+    def watch(self, journal: Journal) -> None:
+        with self._changed:
+            self._journals.add(journal)
+            if self._thread is None or not self._thread.is_alive():  # a forked child has none
+                self._thread = threading.Thread(target=self._run, name="episode-journals", daemon=True)
+                self._thread.start()
+
+    def forget(self, journal: Journal) -> None:
+        with self._changed:
+            self._journals.discard(journal)
+            self._changed.notify()
+
+    def flush(self) -> None:
+        self.before = [held for held in self.before if held() is not None]
+        for held in self.before:
+            if flush := held():
+                flush()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                wake = time.monotonic() + SYNC_SECONDS
+                while self._journals and (left := wake - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                if not self._journals:
+                    self._thread = None
+                    return
+            self.flush()
+            with self._changed:
+                journals = list(self._journals)
+            for journal in journals:
+                journal.write()  # all of them before the first fsync, which may take its time
+            for journal in journals:
+                journal.sync()
+
+
+_keeper = _Keeper()
+
+
+def before_writing(flush: Callable[[], None]) -> None:
+    """Have the bound method `flush` called before journals are written, while its object lives: for who holds rows back.
+
+    On the thread of the journals, so it must not raise.
+    """
+    _keeper.before.append(weakref.WeakMethod(flush))
+
+
+class JournalReader:
+    """A journal that is read, as far as it was written whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError."""
+        self.path = path
+        self._file = open_regular_file(path)
+        self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
+
+    def __iter__(self) -> Iterator[tuple[int, list[Entry]]]:
+        """Its entries, a batch at a time, and where that begins. Raises OSError."""
+        try:
+            self._file.seek(0)
+            if pa.ipc.read_schema(self._file) != _SCHEMA:
+                return
+            begin = self._file.tell()
+            while True:
+                batch, end = self._batch(begin)
+                yield begin, [Entry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))]
+                begin = end
+        except (EOFError, pa.ArrowInvalid):
+            return
+        except OSError as error:
+            if error.errno is not None:  # of the disk, and not Arrow's, whose own has no number
+                raise
+
+    def value(self, place: tuple[int, int]) -> bytes:
+        """Of the entry of that number in the batch that begins there."""
+        return self._batch(place[0])[0].column(2)[place[1]].as_py()
+
+    def _read(self, begin: int) -> tuple[pa.RecordBatch, int]:
+        """The batch that begins there, and where it ends. Raises OSError, EOFError or ArrowInvalid where there is none."""
+        self._file.seek(begin)
+        return pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA), self._file.tell()
+
+    def close(self) -> None:
+        self._batch.cache_clear()
+        self._file.close()
+
+
+def claim(path: Path) -> int | None:
+    """Lock the journal `path` of a dead writer; None where its writer lives, or somebody else is at it, or it is gone.
+
+    The lock lasts until the descriptor that is returned is closed.
+    """
+    try:
+        if not stat.S_ISREG(os.lstat(path).st_mode):
+            return None  # no writer makes such
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(descriptor).st_nlink > 0:  # else whoever held it has just finished with it
+            return descriptor
+    except BlockingIOError:
+        pass
+    except OSError:
+        os.close(descriptor)
+        raise
+    os.close(descriptor)
+    return None
+
+
+# --- The meshes of a scene in a file of their own, while episodes of it are being recorded ----
+
+
+_MESH = tuple(field.name for field in fields(Mesh))
+_lock = threading.Lock()
+_last: tuple[weakref.ref[SceneGeometry], Path] | None = None
+
+
+def keep_scene(geometry: SceneGeometry, path: Path) -> None:
+    """Have `geometry` in the file `path`, which must not exist. Raises OSError."""
+    global _last
+    with _lock:
+        if _last is not None and _last[0]() is geometry and _last[1].parent == path.parent:
+            try:
+                os.link(_last[1], path)
+                return
+            except OSError:  # that episode is over and its file gone, or the filesystem has no links
+                pass
+        _write(geometry, path)
+        _last = (weakref.ref(geometry), path)
+
+
+def read_visuals(path: Path) -> tuple[Visual, ...]:
+    """The visuals of what `keep_scene` kept; none where the file is missing or broken."""
+    try:
+        with open_regular_file(path) as file, np.load(file, allow_pickle=False) as archive:
+            return tuple(_visuals(archive))
+    except (OSError, BadZipFile, KeyError, ValueError, TypeError, EOFError):
+        return ()
+
+
+def _write(geometry: SceneGeometry, path: Path) -> None:
+    arrays: dict[str, Any] = {}
+    visuals = []
+    for index, visual in enumerate(geometry.visuals):
+        held = {name: getattr(visual.mesh, name) for name in _MESH}
+        held |= {"texture": visual.material.texture, "envs": visual.envs, "bodies": visual.bodies}
+        arrays |= {f"{index}/{name}": array for name, array in held.items() if array is not None}
+        material = visual.material
+        visuals.append([visual.name, material.base_color, material.metallic, material.roughness])
+    arrays["scene"] = np.frombuffer(json.dumps({"visuals": visuals}).encode(), dtype=np.uint8)
+    try:
+        with path.open("xb") as file:
+            np.savez(file, **arrays)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _visuals(archive: Any) -> Iterator[Visual]:
+    scene = json.loads(bytes(archive["scene"]))
+    for index, (name, base_color, metallic, roughness) in enumerate(scene["visuals"]):
+        held: dict[str, Any] = {
+            key: archive[f"{index}/{key}"] if f"{index}/{key}" in archive else None
+            for key in (*_MESH, "texture", "envs", "bodies")
+        }
+        r, g, b, a = base_color
+        material = Material((r, g, b, a), metallic, roughness, held["texture"])
+        mesh = Mesh(**{key: held[key] for key in _MESH})
+        yield Visual(name, mesh, material, held["envs"], held["bodies"])

@@ -1,0 +1,1 @@
+"""The camera studio: cameras placed by hand, judged, and written into the file."""

@@ -1,0 +1,1 @@
+"""The past of the batch: moments, curves, one row an env."""

@@ -1,0 +1,481 @@
+"""Every control step of every env since the task was built, to look at and to go back to.
+
+The history is a log, not a tape: what arrives is put at its end and nothing in it is changed. A reset is a
+moment of its own. Going back to step 43 is one too: the envs *jump*, and what follows are new moments behind the
+jump. So the future that was left stays where it was, can be scrubbed through and returned to, and "undo" is
+nothing but going back to the moment before a jump. What one env lived through without a jump is a *stretch*: it
+starts from a snapshot, and its actions, rewards and entries of ``evaluate`` are all here, so it can be run again. An
+*episode* goes from a reset on through the moments that the env was put back to.
+
+Memory is bounded, and what is oldest goes first. Pictures are by far the largest (a human camera's is 0.8 MB, a
+step of 16 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be drawn again, so they may fill no more
+than half of it. Snapshots are kept as the bytes that came, cut into parts that many steps share (see
+`core.snapshots.packing`): a part is kept as long as a step needs it.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import CameraKind, Picture
+from workbench.core.env.step_result import StepResult
+from workbench.core.snapshots.packing import WholeSnapshot
+from workbench.jobs.task import NO_MOMENT, Restored, Stepped
+from workbench.session.history.curves import Columns, RecentSteps
+from workbench.session.history.env_table import KEPT_REWARDS, LOST_REWARD, EnvRows, EnvTable
+from workbench.session.protocol.messages import PastPictures, Pictures, WayBack
+
+RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
+"""What may happen to an env at a moment. Success, failure and a reward that is none: the first in an episode."""
+_OVERHEAD = 2500
+"""Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
+_PICTURES_SHARE = 0.5
+_RECENT = 200
+"""Moments among which one is looked for that pictures belong to: they come some steps late."""
+
+
+@dataclass
+class PartSet:
+    """The parts of a snapshot, shared by all moments that have the same."""
+
+    keys: tuple[int, ...]
+    content: tuple[bytes, ...] | None
+    """None where some of them went to another history: then a snapshot cannot be put back, and is none."""
+    moments: int = 0
+
+
+class SharedParts:
+    """The parts of snapshots, kept once however many moments have them, and as long as one has.
+
+    A snapshot comes as a body and the keys of its parts (`core.snapshots.packing`), most of which are those of the moment
+    before. So moments point to a set of parts, sets count their moments, and parts count their sets.
+    """
+
+    def __init__(self) -> None:
+        self._parts: dict[int, bytes] = {}
+        self._references: dict[int, int] = {}
+        self._last = PartSet((), ())
+        self.used = 0
+        """Bytes."""
+
+    def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> PartSet:
+        """Those of the next moment; `keys` is None where they are those of the moment before."""
+        self._parts.update(new_parts)
+        if keys is not None and keys != self._last.keys:
+            known = self._parts.keys() >= {*keys}
+            self._last = PartSet(keys, tuple(self._parts[key] for key in keys) if known else None)
+        parts = self._last
+        if parts.content is not None and parts.moments == 0:
+            for key in parts.keys:
+                self._references[key] = self._references.get(key, 0) + 1
+                if self._references[key] == 1:
+                    self.used += len(self._parts[key])
+        parts.moments += 1
+        return parts
+
+    def release(self, parts: PartSet) -> None:
+        """A moment that had them is gone."""
+        parts.moments -= 1
+        if parts.moments == 0 and parts.content is not None:
+            for key in parts.keys:
+                self._references[key] -= 1
+                if self._references[key] == 0:
+                    self.used -= len(self._parts[key])
+                    del self._references[key]
+                    # The worker will not send it again while the newest moment has it; that one is kept.
+                    del self._parts[key]
+
+
+@dataclass
+class Moment:
+    """The batch after one reset, control step or jump."""
+
+    serial: int
+    """Counts up over the session."""
+    step: StepResult
+    """Its reward is NaN in an env that was reset, and the recorded one in an env that was put back here."""
+    jumped: NDArray[np.bool_]
+    """(N,) as `Stepped.reset_mask`."""
+    seeds: NDArray[np.int64] | None
+    tick: int
+    """Where this is on the curves."""
+    happened: NDArray[np.uint8]
+    """(N,) of `RESET` ... `TRUNCATED`, added up."""
+    restored: Restored | None
+    number: int
+    """`Stepped.number`."""
+    snapshot: WholeSnapshot | None
+    """Of the whole batch; it shares its bytes with other moments. None where there is none."""
+    parts: PartSet
+    size: int
+    """Bytes, without parts and pictures."""
+    rows: EnvRows
+    """What the table of envs said then."""
+    acted_by: str
+    """As `Stepped.acted_by`."""
+    pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
+    """By env, kind and name of the camera."""
+    outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
+    """Which of the pictures are of a camera that was moved since."""
+    first_said: StepResult | None = None
+    """`step` as it was when this happened, if a newer version has said otherwise since."""
+
+    @property
+    def as_recorded(self) -> StepResult:
+        """What was said when it happened, whichever version said it."""
+        return self.step if self.first_said is None else self.first_said
+
+
+Lived = tuple[Moment, int]
+"""A moment of an episode, with the number that the env had then: another than now where it was given another env's."""
+
+
+@dataclass(frozen=True)
+class ShownMoment:
+    """What the page shows."""
+
+    env: int
+    """The selected one."""
+    num_envs: int
+    poses: NDArray[np.float32] | None
+    """(N, B, 7) of a moment of the past; None for now."""
+
+    def of(self, env: int) -> NDArray[np.float32] | None:
+        """(B, 7) of one env."""
+        return None if self.poses is None else self.poses[env]
+
+
+class Shown(Protocol):
+    """Says which moments the page shows."""
+
+    def shown_moment(self) -> ShownMoment:
+        """That of the selected env."""
+        ...
+
+    def episode_moments(self, most: int) -> tuple[Lived, ...]:
+        """Of the selected env's episode round the one that is shown, at the most so many."""
+        ...
+
+
+class History:
+    """The moments of one built task, oldest first. Not thread-safe: its owner locks."""
+
+    def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
+        """
+        Args:
+            table: of the envs, which has been told of nothing yet.
+            limit: bytes that it may take; the newest moment is kept whatever it takes.
+            first_serial: the number of the first moment.
+        """
+        self._table, num_envs = table, table.rows().num_envs
+        self._num_envs = num_envs
+        self.limit = limit
+        self._moments: deque[Moment] = deque()
+        self._next_serial = first_serial
+        self._parts = SharedParts()
+        self._used = 0
+        self._pictures_used = 0
+        self._pictured: deque[int] = deque()
+        self._jumps: deque[Moment] = deque()
+        self._columns = Columns(num_envs, first_serial)
+        self.steps = RecentSteps(num_envs)
+
+    # --- what comes --------------------------------------------------------------------------------
+
+    def add(self, stepped: Stepped) -> Moment:
+        """The next moment.
+
+        A reward is for an action: where there was none (a reset, a going back) the worker says zero, and what is
+        kept is NaN, or what was said of the moment that was gone back to, or in the other envs what stood before.
+        """
+        restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
+        origin = None if restored is None else self.at(restored.origin)
+        parts = self._parts.take(stepped.part_keys, stepped.new_parts)
+        stepped = replace(stepped, step=self._with_rewards(stepped, origin))
+        rows = self._table.add(
+            stepped,
+            None if origin is None else origin.rows,
+            lambda env: self._rewards_until(env, origin, KEPT_REWARDS),
+        )
+        if not jumps:
+            self.steps.add(stepped.step)
+        snapshot = None
+        if stepped.snapshot and parts.content is not None:
+            snapshot = WholeSnapshot(stepped.snapshot, parts.content)
+        size = _OVERHEAD + len(stepped.snapshot) + stepped.step.nbytes
+        size += EnvRows.bytes_a_step(self._num_envs)
+        moment = Moment(
+            serial=self._next_serial,
+            step=stepped.step,
+            jumped=stepped.reset_mask,
+            seeds=stepped.seeds,
+            tick=self.steps.count,
+            happened=self._events(stepped, rows),
+            restored=restored,
+            number=stepped.number,
+            snapshot=snapshot,
+            parts=parts,
+            size=size,
+            rows=rows,
+            acted_by=sys.intern(stepped.acted_by),
+        )
+        self._write(moment)
+        self._next_serial += 1
+        self._moments.append(moment)
+        if jumps:
+            self._jumps.append(moment)
+        self._used += size
+        self._shrink()
+        return moment
+
+    def renew_last(self, step: StepResult) -> StepResult:
+        """The newest moment was judged anew, by a version that was put on the env that is there.
+
+        Returns:
+            what it says from now on: no other reward where there was no action.
+        """
+        if not self._moments:
+            return step
+        moment = self._moments[-1]
+        if moment.first_said is None:
+            moment.first_said = moment.step
+            moment.size += step.nbytes
+            self._used += step.nbytes
+        moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
+        self._write(moment)
+        return moment.step
+
+    def add_pictures(self, event: Pictures | PastPictures) -> None:
+        """Pictures are kept with the moment that they show, if it still is."""
+        if isinstance(event, PastPictures):
+            moment = self.at(event.origin)
+        else:
+            recent = islice(reversed(self._moments), _RECENT)
+            moment = next((one for one in recent if one.number == event.number), None)
+        if moment is None:
+            return
+        for picture in event.pictures:
+            key = (picture.env, picture.kind, picture.camera)
+            before = moment.pictures.get(key)
+            if before is None:
+                self._pictured.append(moment.serial)
+            moment.pictures[key] = picture
+            moment.outdated.discard(key)
+            change = picture.nbytes - (0 if before is None else before.nbytes)
+            self._pictures_used += change
+            self._used += change
+        self._shrink()
+
+    def camera_moved(self, kind: CameraKind, name: str) -> None:
+        """Pictures that are kept of this camera do not show what it sees now."""
+        for serial in self._pictured:
+            moment = self.at(serial)
+            if moment is not None:
+                moment.outdated.update(key for key in moment.pictures if key[1:] == (kind, name))
+
+    # --- what is there -----------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self._moments)
+
+    @property
+    def used(self) -> int:
+        """Bytes."""
+        return self._used + self._parts.used
+
+    @property
+    def first(self) -> int:
+        """Serial of the oldest moment; one past `last` if there is none."""
+        return self._next_serial - len(self._moments)
+
+    @property
+    def last(self) -> int:
+        """Serial of the newest moment."""
+        return self._next_serial - 1
+
+    def at(self, serial: int) -> Moment | None:
+        """The moment of this number, if it is kept."""
+        return self._moments[serial - self.first] if self.first <= serial <= self.last else None
+
+    def snapshot_at(self, serial: int) -> bytes | None:
+        """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch at that moment; None where there is none."""
+        moment = self.at(serial)
+        return None if moment is None or moment.snapshot is None else pickle.dumps(moment.snapshot)
+
+    def between(self, low: int, high: int) -> Iterable[Moment]:
+        """The kept moments of these serials, both included."""
+        start = self.first
+        return (self._moments[k - start] for k in range(max(low, start), min(high, self.last) + 1))
+
+    def env_rows(self) -> EnvRows:
+        """The table of the envs as it is now."""
+        return self._table.rows()
+
+    def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
+        """What happened to this env between two moments, both included: serials and `RESET` ... added up."""
+        low = max(low, self.first)
+        happened = self._columns.between("happened", low, min(high, self.last))[:, env]
+        return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
+
+    def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
+        """(K,) of this env at the moments between two, both included; NaN where it was reset."""
+        return self._columns.between("reward", max(low, self.first), min(high, self.last))[:, env]
+
+    def jumps_back(self, env: int) -> list[tuple[int, int]]:
+        """Serials of the kept moments at which this env went back, and of those that it went back to."""
+        return [
+            (moment.serial, moment.restored.origin)
+            for moment in self._jumps
+            if moment.restored is not None and moment.restored.origin != NO_MOMENT and moment.jumped[env]
+        ]
+
+    def stretches(self, env: int) -> list[tuple[int, int]]:
+        """First and last serials of what this env lived through without a jump, as far as they are kept; oldest first.
+        Where others jumped, not all moments between are its steps."""
+        if not self._moments:
+            return []
+        jumps = [moment.serial for moment in self._jumps if moment.jumped[env] and moment.serial > self.first]
+        return list(zip([self.first, *jumps], [*(jump - 1 for jump in jumps), self.last], strict=True))
+
+    def stretch_at(self, env: int, serial: int) -> tuple[int, int]:
+        """The one of these that this moment is in."""
+        return next(stretch for stretch in reversed(self.stretches(env)) if stretch[0] <= serial)
+
+    def episode(self, env: int, serial: int, most: int | None = None) -> tuple[Lived, ...]:
+        """The episode that this env is in at a moment, as far as it went; oldest first, see `lived`.
+
+        Args:
+            most: so many moments at most, evenly spread, the first and the last among them; None for all.
+        """
+        lived = [*self.lived(env, self.stretch_at(env, serial)[1])][::-1]
+        count = len(lived) if most is None else min(most, len(lived))
+        chosen = np.unique(np.linspace(0, len(lived) - 1, count).round().astype(int))
+        return tuple(lived[k] for k in chosen)
+
+    def lived(self, env: int, serial: int) -> Iterator[Lived]:
+        """The episode of this env up to a moment, newest first, through the moments that it was put back to.
+
+        Each control step and, at the end, the reset that it began with, as far as they are kept.
+        """
+        for moment, at in self._back(env, serial):
+            jumped = moment.jumped.any()
+            if not jumped or moment.restored is None:
+                yield moment, at
+            if jumped and moment.restored is None:
+                return
+
+    def way_to(self, env: int, serial: int, most: int) -> WayBack | None:
+        """How this env came to a moment from the last exact point, by at most so many steps; None if it is not known.
+
+        Exact points are resets and moments that were put there: from them on the same actions give the same bits.
+        """
+        rows: list[NDArray[np.float32]] = []
+        for moment, at in self._back(env, serial):
+            jump = moment.restored
+            if not moment.jumped.any():
+                if moment.step.action is None or len(rows) == most:
+                    return None
+                rows.append(moment.step.action[at])
+            elif jump is None or (at not in jump.lived_through and jump.origin != NO_MOMENT):
+                if moment.snapshot is None or not rows:
+                    return None
+                return WayBack(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
+        return None
+
+    def _back(self, env: int, serial: int) -> Iterator[Lived]:
+        """The moments that led this env to one, newest first: its control steps and its own jumps, whose origin is
+        gone on from; as far as they are kept."""
+        while (moment := self.at(serial)) is not None:
+            jump, serial = moment.restored, moment.serial - 1
+            if not moment.jumped.any():
+                yield moment, env
+            elif moment.jumped[env]:
+                yield moment, env
+                if jump is not None:
+                    serial, env = jump.origin, jump.source[jump.env_idx.index(env)]
+
+    def last_jump(self, env: int) -> Moment | None:
+        """The jump that brought this env where it is, if it can be taken back.
+
+        Where one was taken back the env stands as it stood before it, so the next is the last one before that:
+        what it did in the future that was left thereby is none of this one's.
+        """
+        until = self.last
+        for moment in reversed(self._jumps):
+            if moment.serial > until or not moment.jumped[env]:
+                continue
+            if moment.restored is not None and moment.restored.undoes is not None:
+                until = moment.restored.origin
+                continue
+            before = self.at(moment.serial - 1)
+            return moment if before is not None and before.snapshot is not None else None
+        return None
+
+    def moved_last_by(self, jump: Moment) -> tuple[int, ...]:
+        """The envs that this jump brought where they are; others that it moved have jumped on since."""
+        moved = (int(env) for env in np.flatnonzero(jump.jumped))
+        return tuple(env for env in moved if self.last_jump(env) is jump)
+
+    # --- the inside --------------------------------------------------------------------------------
+
+    def _shrink(self) -> None:
+        while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:
+            moment = self.at(self._pictured.popleft())
+            if moment is not None and moment.pictures:
+                self._drop_pictures(moment)
+        while self.used > self.limit and len(self._moments) > 1:
+            oldest = self._moments.popleft()
+            self._used -= oldest.size
+            self._drop_pictures(oldest)
+            self._parts.release(oldest.parts)
+            if self._jumps and self._jumps[0] is oldest:
+                self._jumps.popleft()
+
+    def _drop_pictures(self, moment: Moment) -> None:
+        size = sum(picture.nbytes for picture in moment.pictures.values())
+        moment.pictures = {}
+        self._pictures_used -= size
+        self._used -= size
+
+    def _write(self, moment: Moment) -> None:
+        values = {"happened": moment.happened, "reward": moment.step.reward}
+        self._columns.write(moment.serial, self.first, values)
+
+    def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
+        """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""
+        lived = () if moment is None else self.lived(env, moment.serial)
+        rewards = (one.step.reward[of] for one, of in lived if not one.jumped.any())
+        return np.array(list(islice(rewards, most))[::-1], np.float32)
+
+    def _with_rewards(self, stepped: Stepped, origin: Moment | None) -> StepResult:
+        step, jumped, restored = stepped.step, stepped.reset_mask, stepped.restored
+        if step.action is not None or not jumped.any():
+            return step
+        reward = np.full(self._num_envs, np.nan, np.float32)
+        if self._moments:
+            reward[:] = self._moments[-1].step.reward
+        if not stepped.resumed:
+            reward[jumped] = np.nan
+        if restored is not None and origin is not None:
+            reward[list(restored.env_idx)] = origin.step.reward[list(restored.source)]
+        return replace(step, reward=reward)
+
+    def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
+        step, jumped = stepped.step, stepped.reset_mask
+        if jumped.any():
+            # What is so at a moment that was gone back to is no event: it came about where that moment is.
+            return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
+        happened = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
+        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (NOT_A_NUMBER, LOST_REWARD)):
+            if what in rows.first:
+                happened[rows.first[what] == step.elapsed_steps] |= flag
+        return happened

@@ -1,0 +1,427 @@
+"""What a session knows: how the task stands, what its batch lived through, and what the page has chosen.
+
+Every event of the worker changes a little of this, and every snapshot that the page draws is made of it. What an
+event means for what is seen is one idea and worth reading alone, so `LiveState` has no lock, no thread and no message:
+`Session` calls its methods under the lock of `SharedState`, and sends whatever is to be sent.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from workbench.authoring.loading.reference import (
+    RecordedTask,
+    TaskName,
+    class_beside,
+    followed_folder,
+    named_file,
+)
+from workbench.authoring.problem import Problem
+from workbench.core.capture.inspection import Inspection
+from workbench.core.env.step_result import StepResult
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
+from workbench.session.history.env_table import EnvTable
+from workbench.session.live.timeline import Timeline
+from workbench.session.live.view import SessionView
+from workbench.session.process.heartbeat import death_problem, own_files_of
+from workbench.session.process.supervisor import Death
+from workbench.session.protocol.messages import (
+    SCENE_KEPT,
+    Event,
+    Failed,
+    Load,
+    Loaded,
+    Loading,
+    LoadLevel,
+    PastPictures,
+    Pictures,
+    PlaceCamera,
+    Placed,
+    ReadPolicyAgain,
+    RulesBroken,
+    Settings,
+    Status,
+)
+from workbench.session.record.keep_past import PastEpisode, WhatToKeep, episode_round
+
+
+@dataclass
+class LiveState:
+    """See the module's text. Not thread-safe: the session locks."""
+
+    reference: TaskName
+    """The task that was asked for: a file, ``file.py:ClassName``, or a registered env id; or what a recording names."""
+    options: TaskOptions
+    """How it is made, but for the seed."""
+    history_bytes: int
+    """What the past may take."""
+    now: SessionView = SessionView(activity="starting the worker")
+    """What is live, but for what `view` adds."""
+    timeline: Timeline | None = None
+    """None before a task is loaded."""
+    problem_at_run: bool = False
+    """It came while the task ran, not while a version was loaded."""
+    first_due: bool = False
+    """The next step is the one that a new scene begins with: it does not show that anything runs."""
+    clients: int = 0
+    """Pages that are open."""
+    wants_play: bool = False
+
+    def __post_init__(self) -> None:
+        self.set(seed=self.options.seed)
+        self.own_file = named_file(self.reference)
+        """The file that was named, whether or not it ever loaded; None for an env id."""
+        self.own_folder = followed_folder(self.reference)
+        """Modules in or below it are followed with the file; None where nothing is."""
+        self.running_reference = self.reference
+        """The task that runs."""
+
+    def set(self, **changes: Any) -> None:
+        """Replace fields of `now`."""
+        self.now = replace(self.now, **changes)
+
+    # --- what the worker says ----------------------------------------------------------------------
+
+    def loaded(self, event: Loaded, *, restored: bool, stale: bool) -> None:
+        """A version runs.
+
+        Args:
+            restored: it is the last good one, brought back after a worker's death.
+            stale: the files hold another by now.
+        """
+        task, report, before = event.task, event.reload, self.now.task
+        kept = scene_kept(event)
+        if kept and before is not None:
+            # The same scene: who has drawn it can see that by its being the same object.
+            task = replace(task, geometry=before.geometry)
+        self.set(
+            task=task,
+            task_serial=self.now.task_serial + 1,
+            step=event.first,
+            load_milliseconds=sum(event.milliseconds.values()),
+            reload=report,
+            activity="",
+            stale=stale,
+        )
+        self.first_due = not kept
+        if not kept:
+            # What was broken of the rules in this scene comes after it.
+            self.set(rules=None, rules_serial=self.now.rules_serial + 1)
+            same = restored and before is not None and before.source_hash == task.source_hash
+            self._new_scene(task, event.first, its_past_stays=same)
+        elif self.timeline is not None:
+            self.set(step=self.timeline.history.renew_last(event.first))
+        if report is None or report.level not in ("same", "patched"):
+            self.set(cameras_serial=self.now.cameras_serial + 1)
+            self.new_pictures(**{} if kept else {"pictures": {}})
+        if not (restored and self.now.choices):  # else another may have been asked for since
+            self.set(choices=(task.chosen, *task.others) if task.others else ())
+        if task.others and task.source_files and task.file is not None:
+            self.running_reference = class_beside(self.reference, Path(task.file), task.chosen)
+            if task.in_place_of is not None:
+                # Saves bring in what is open; the other is to be chosen when it is mended.
+                self.reference = self.running_reference
+        else:
+            self.running_reference = self.reference
+        if not restored:  # else what killed the worker still stands
+            self.set_problem(None)
+        self._runs()
+
+    def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool) -> None:
+        settings = self.now.settings
+        selected = min(settings.selected_env, task.num_envs - 1)
+        self.set(
+            scene_serial=self.now.scene_serial + 1,
+            settings=replace(settings, sliders=(), selected_env=selected),
+            inspection=None,
+        )
+        if self.timeline is None or not its_past_stays:
+            last = -1 if self.timeline is None else self.timeline.history.last
+            table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode)
+            self.timeline = Timeline(table, self.history_bytes, last + 1)
+
+    def stepped(self, event: Stepped) -> None:
+        if self.timeline is None:
+            self.set(step=event.step)
+        else:
+            moment = self.timeline.add(event)
+            self.set(step=moment.step, step_serial=moment.serial)
+        first, self.first_due = self.first_due, False
+        if self.now.problem is not None and self.problem_at_run and not first:
+            # What failed while running runs again: the task was reset, or the policy changed.
+            self.set_problem(None)
+            self._runs()
+
+    def take(self, event: Event) -> None:
+        """Any other event."""
+        now = self.now
+        if isinstance(event, Loading):
+            self.set(state="loading", activity=event.activity)
+        elif isinstance(event, Failed):
+            self.set_problem(event.problem)
+            self.problem_at_run = now.state != "loading"
+            self.set(
+                state="error",
+                activity="",
+                choices=event.classes or now.choices,
+                stale=now.stale or not self.problem_at_run,
+            )
+        elif isinstance(event, RulesBroken):
+            self.set(rules=event if event.rows else None, rules_serial=now.rules_serial + 1)
+        elif isinstance(event, PastPictures):
+            if self.timeline is not None:
+                self.timeline.history.add_pictures(event)
+                self.new_pictures()
+        elif isinstance(event, Pictures):
+            if self.timeline is not None:
+                self.timeline.history.add_pictures(event)
+            if event.pictures and event.pictures[0].env == now.settings.selected_env:
+                # They come a kind at a time; what nobody looks through any more is not to stay.
+                watched = {(camera.kind, camera.name) for camera in now.settings.cameras}
+                made = {picture.key: picture for picture in event.pictures}
+                shown = {key: p for key, p in {**now.pictures, **made}.items() if key in watched}
+                self.new_pictures(pictures=shown, picture_milliseconds=event.milliseconds)
+        elif isinstance(event, Placed):
+            self._placed(event)
+        elif isinstance(event, Inspection):
+            self.set(inspection=event)
+        elif isinstance(event, Status):
+            self.set(
+                playing=event.playing,
+                steps_per_second=event.steps_per_second,
+                real_time_factor=event.real_time_factor,
+            )
+            if event.activity:
+                self.set(state="loading", activity=event.activity)
+            elif now.state in ("running", "paused", "loading"):
+                self.set(activity="")
+                self._runs()
+
+    def _placed(self, event: Placed) -> None:
+        if event.info is None or self.now.task is None:
+            return
+        infos = tuple(event.info if c.key == event.key else c for c in self.now.task.cameras)
+        self.set(task=replace(self.now.task, cameras=infos))
+        if event.reshaped:
+            self.set(cameras_serial=self.now.cameras_serial + 1)  # what it can show may be something else
+        if self.timeline is not None:
+            self.timeline.camera_moved(*event.key)
+
+    def died(self, death: Death, while_loading: bool, printed: str) -> Problem | None:
+        """The worker is gone.
+
+        Args:
+            while_loading: a version was being loaded, so it is not the running one that killed it.
+            printed: the last lines.
+
+        Returns:
+            what is to be told of it; None where somebody asked for it.
+        """
+        problem = None
+        if not death.asked or death.stack:
+            task = self.now.task
+            source = {} if task is None or while_loading else task.source
+            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, source)
+            self.set_problem(problem)
+            self.problem_at_run = not while_loading
+        if not death.file_waits:
+            self.wants_play = False
+        self.set(
+            playing=False,
+            steps_per_second=0.0,
+            real_time_factor=0.0,
+            state="stopped" if death.gives_up else "starting",
+            activity="" if death.gives_up else "starting another worker",
+        )
+        return problem
+
+    def waits_for_the_file(self) -> None:
+        """A worker is up and has nothing that it could load: the problem stands."""
+        if self.now.state == "starting":
+            self.set(state="error", activity="")
+
+    def set_problem(self, problem: Problem | None) -> None:
+        self.set(problem=problem, problem_serial=self.now.problem_serial + 1)
+
+    def _runs(self) -> None:
+        self.set(state="running" if self.now.playing else "paused")
+
+    def new_pictures(self, **changes: Any) -> None:
+        """Others are shown now."""
+        self.set(pictures_serial=self.now.pictures_serial + 1, **changes)
+
+    # --- what the page asks for --------------------------------------------------------------------
+
+    def change(self, **settings: Any) -> bool:
+        """Choose other `Settings`; the env is the nearest that there is. False if they were chosen."""
+        before, task = self.now.settings, self.now.task
+        new = replace(before, **settings)
+        last = 0 if task is None else task.num_envs - 1
+        new = replace(new, selected_env=min(max(int(new.selected_env), 0), last))
+        if new == before:
+            return False
+        self.set(settings=new)
+        if new.selected_env != before.selected_env:
+            # The other env's picture must not stand beside this env's numbers until a new one comes.
+            self.new_pictures(pictures={})
+        return True
+
+    def choose_class(self, name: str) -> bool:
+        """Ask for another task class of the same file. False if the file has no such class."""
+        if self.own_file is None or name not in self.now.choices:
+            return False
+        file = (
+            self.own_file if self.now.task is None or self.now.task.file is None else Path(self.now.task.file)
+        )
+        self.reference = class_beside(self.reference, file, name)
+        self.set(choices=(name, *(other for other in self.now.choices if other != name)))
+        return True
+
+    def open_file(self, file: Path, class_name: str) -> None:
+        """Ask for a class of another file."""
+        self.reference, self.own_file, self.own_folder = f"{file}:{class_name}", file, file.parent
+        self.set(choices=())
+
+    def file_is_edited(self) -> None:
+        """A file that a recording named is open live and is saved: from now on it is what is on disk that is open."""
+        if isinstance(self.reference, RecordedTask) and self.reference.approved is not None:
+            self.reference = str(self.reference)
+
+    def load_request(
+        self, source: dict[str, str] | None, snapshot: bytes | None = None, level: LoadLevel = "auto"
+    ) -> Load:
+        """See `Load`."""
+        options = replace(self.options, seed=self.now.seed)
+        # The version that ran is brought back although another class of the file was asked for since.
+        reference = self.reference if source is None else self.running_reference
+        any_task = self.now.task is None and isinstance(reference, str)
+        return Load(reference, options, source, level, snapshot, any_task)
+
+    def settings(self) -> Settings:
+        """What the worker is to know of what was chosen."""
+        chosen = self.now.settings
+        return replace(
+            chosen,
+            policy_folder=None if self.folder is None else str(self.folder),
+            cameras=chosen.cameras if self.clients > 0 else (),
+        )
+
+    @property
+    def folder(self) -> Path | None:
+        """Of the task's own file, where a policy's may lie too."""
+        return None if self.own_file is None else self.own_file.parent
+
+    @property
+    def policy(self) -> str | None:
+        """The one that acts."""
+        chosen = self.now.settings
+        return chosen.policy if chosen.action_source == "policy" else None
+
+    def policy_saved(self) -> ReadPolicyAgain:
+        """What was wrong with it before is past; what it stopped goes on, if it is well now."""
+        problem = self.now.problem
+        mended = problem is not None and problem.stage == "policy"
+        if mended:
+            self.set_problem(None)
+            self._runs()
+        return ReadPolicyAgain(play=mended and self.wants_play)
+
+    # --- what is read --------------------------------------------------------------------------------
+
+    def own_files(self) -> list[str]:
+        """The author's files, as far as they are known."""
+        return own_files_of(() if self.now.task is None else self.now.task.source_files, self.own_file)
+
+    def newest_moment(self) -> bytes | None:
+        """Pickled for `Load.snapshot`; None before a task is loaded."""
+        return (
+            None if self.timeline is None else self.timeline.history.snapshot_at(self.timeline.history.last)
+        )
+
+    def what_to_keep(
+        self,
+        env_idx: tuple[int, ...] | None,
+        load: Load | None,
+        placed: tuple[PlaceCamera, ...],
+        before: bool = False,
+    ) -> WhatToKeep | str:
+        """See `Session.keep_past`; in a sentence why there is nothing to keep."""
+        if self.now.task is None or self.timeline is None or load is None:
+            return "no task is loaded"
+        history, shown = self.timeline.history, self.timeline.shown
+        envs = range(self.now.task.num_envs) if env_idx is None else env_idx
+        serial = None if shown is None else shown.serial
+        found = {env: episode_round(history, env, serial, before) for env in envs}
+        episodes = tuple(episode for episode in found.values() if isinstance(episode, PastEpisode))
+        if not episodes:
+            env, why = next(iter(found.items()))
+            return f"nothing was kept of env {env}: {why}"
+        return WhatToKeep(self.now.task, load, placed, episodes)
+
+    def view(self, **known: Any) -> SessionView:
+        """A snapshot of what is shown.
+
+        Args:
+            known: fields that others know.
+        """
+        now, timeline = self.now, self.timeline
+        refused = now.problem if now.stale and not self.problem_at_run else None
+        if timeline is None:
+            return replace(now, refused=refused, **known)
+        env, moment = now.settings.selected_env, timeline.shown
+        past = timeline.view(env, now.settings.cameras)
+        view = replace(now, refused=refused, curves=timeline.history.steps.curves(), timeline=past, **known)
+        if moment is None:
+            return view
+        return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))
+
+
+def scene_kept(event: Loaded) -> bool:
+    """Whether the env, its episodes and its past are those that were there before."""
+    return event.reload is not None and event.reload.level in SCENE_KEPT
+
+
+class SharedState:
+    """What a session knows, behind the one lock, and how a page hears that something of it is new.
+
+    Pages, the worker's thread, the file watcher and the recorder all change it. A page asks for everything at once
+    (`Session.view`), so it needs only be told *that* there is something: a counter, and a wait for its next value.
+    """
+
+    def __init__(self, state: LiveState) -> None:
+        self.lock = threading.Lock()
+        """Of `state`; to be held for moments only."""
+        self.state = state
+        self._changed = threading.Condition(self.lock)
+        self._count = 0
+        self._closing = False
+
+    @contextmanager
+    def changing(self) -> Iterator[LiveState]:
+        """The state, with the lock held, to set fields of it; then notes that they are new."""
+        with self.lock:
+            yield self.state
+        self.note()
+
+    def note(self) -> None:
+        """Something is new. Not to be called with the lock held."""
+        with self._changed:
+            self._count += 1
+            self._changed.notify_all()
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Block until something is new since the counter `seen`; returns the counter as it is now."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._count != seen or self._closing, timeout)
+            return self._count
+
+    def close(self) -> None:
+        """From now on nobody waits."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()

@@ -1,0 +1,440 @@
+"""The session on the server's side: what the page asks for, and what it sees.
+
+The page's controls call methods here; each only notes the wish and sends a message, so none waits for
+the env. The worker's events come one by one on one thread and change the `LiveState`, of which
+`Session.view` makes a snapshot. When the worker dies, `KeptWorker` starts another, which is greeted with
+the last version that ran, and the page never goes away.
+
+What is done here is to bring those together: who is asked, and who is told of what. What an event means is in
+`live_state`, which version is loaded, and when, in `versions`, how the past is gone through in `timeline`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from workbench.authoring.loading.reference import TaskName
+from workbench.core.capture.inspection import Section
+from workbench.core.capture.recorded_run import RecordedRun
+from workbench.jobs.policy import PolicyFile
+from workbench.jobs.pool import Answer, Progress
+from workbench.jobs.task import Stepped, TaskOptions
+from workbench.machine.processes.watched_thread import listen, stop_listening
+from workbench.session.cameras.studio import CameraStudio
+from workbench.session.history.env_table import EnvRows
+from workbench.session.live.live_state import LiveState, SharedState, scene_kept
+from workbench.session.live.timeline import TimeTravel
+from workbench.session.live.versions import Versions
+from workbench.session.live.view import SessionView
+from workbench.session.process.askers import Asker, Background
+from workbench.session.process.captured_output import PrintedLine, PrintedLog
+from workbench.session.process.heartbeat import Busy
+from workbench.session.process.supervisor import Death, KeptWorker, WorkerOptions
+from workbench.session.protocol.messages import (
+    Event,
+    Failed,
+    Inspect,
+    Loaded,
+    Placed,
+    Play,
+    Request,
+    Reset,
+    SetCapture,
+    SingleStep,
+    StepBack,
+    WarmUp,
+)
+from workbench.session.record.keep_past import PastKeeper
+from workbench.session.record.live import LiveRecorder
+from workbench.session.rescore.background import StoppedBy
+from workbench.session.rescore.past import Judge, Judgement, what_a_load_means
+
+HISTORY_BYTES = 256 * 1024**2
+"""What the past may take unless somebody says otherwise."""
+
+
+class Session:
+    """One task, one worker, any number of pages. All methods are thread-safe and return at once."""
+
+    def __init__(
+        self,
+        task: TaskName,
+        options: TaskOptions,
+        *,
+        recordings: Path,
+        history_bytes: int = HISTORY_BYTES,
+        worker: WorkerOptions | None = None,
+        make_worker: Callable[..., KeptWorker] = KeptWorker,
+        on_event: Callable[[Event], None] = lambda event: None,
+        on_line: Callable[[PrintedLine], None] = lambda line: None,
+        on_notice: Callable[[str], None] = lambda words: None,
+    ) -> None:
+        """
+        Args:
+            task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names, cleared.
+            recordings: folder that recorded episodes go to; made when the first is written.
+            history_bytes: memory that the past may take.
+            worker: limits of the worker process, and whether there is a spare one.
+            make_worker: what the worker is kept by: another, for tests that need none.
+            on_event: called with every event of the worker, and its death as a failure, on the session's thread
+                (the terminal).
+            on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
+            on_notice: called, on any thread, with a sentence that is to be seen in the terminal too.
+        """
+        self._on_event = on_event
+        self._print = on_line
+        self._state = LiveState(task, options, history_bytes)
+        self._shared = SharedState(self._state)
+        self._lock, self._note = self._shared.lock, self._shared.note
+        self._sending_settings = threading.Lock()
+        """Taken before `_lock`."""
+        self._step_in: tuple[Callable[[tuple[int, ...]], StepBack], bool] | None = None
+        """What is to be gone into, and whether by all envs, as soon as a task is there."""
+        self._step_backs = itertools.count(1)
+        self._printed = PrintedLog(self._on_lines)
+        self.versions = Versions(
+            self._shared, self._send, lambda: self._worker.replace(), on_save=self._on_save
+        )
+        """Which version of the file runs, and what is loaded in its place."""
+        self._worker = make_worker(
+            worker or WorkerOptions(),
+            WarmUp(options),
+            greet=self.versions.greeting,
+            on_event=self._handle,
+            on_death=self._on_death,
+            on_busy=self._on_busy,
+            own_files=self.versions.own_files,
+            output=self._printed.feed,
+        )
+        self._recorder = LiveRecorder(
+            recordings, self._note, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
+        )
+        self._background = Background()
+        """The process that does all that is done beside playing."""
+        self.keeper = PastKeeper(recordings, self._recorder.finisher, self._note, self._background)
+        self.judge = Judge(self._note, self._background)
+        self._policy_file = PolicyFile(self._on_policy_saved)
+        self.past = TimeTravel(self._shared, self._send, self.pause)
+        """What the batch lived through."""
+        self._asker = Asker(self._send)
+        self.studio = CameraStudio(
+            self._send,
+            self._asker,
+            self._background,
+            self._note,
+            self.past,
+            self.versions.same_again,
+            self.versions.open_file,
+        )
+        """Cameras placed by hand."""
+        listen(self._say)
+        self.versions.start()
+        self._worker.start()
+
+    # --- what the page reads -----------------------------------------------------------------------
+
+    def view(self) -> SessionView:
+        """A snapshot; cheap enough for every frame."""
+        known = {
+            "recording": replace(self._recorder.status(), keeping=self.keeper.status()),
+            "printed": self._printed.view(),
+            "vitals": self._worker.vitals,
+            "judgement": self.judge.judging.view,
+        }
+        with self._lock:
+            view = self._state.view(**known)
+        return replace(view, studio=self.studio.view(view.step, view.settings.selected_env))
+
+    def env_rows(self) -> EnvRows | None:
+        """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
+        with self._lock:
+            return None if self._state.timeline is None else self._state.timeline.history.env_rows()
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Block until something changed since the counter `seen`; returns the counter as it is now."""
+        return self._shared.wait(seen, timeout)
+
+    @property
+    def worker_pid(self) -> int | None:
+        """Process id of the worker; None while there is none."""
+        return self._worker.pid
+
+    # --- what the page asks for --------------------------------------------------------------------
+
+    def interrupt(self) -> None:
+        """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
+        self._worker.interrupt()
+
+    def clear_printed(self) -> None:
+        """Forget what the author's code printed."""
+        self._printed.clear()
+        self._note()
+
+    def play(self) -> None:
+        self.past.seek(None)
+        self._set_playing(True)
+
+    def pause(self) -> None:
+        self._set_playing(False)
+
+    def _set_playing(self, playing: bool) -> None:
+        with self._shared.changing() as state:
+            state.set(playing=playing)
+            state.wants_play = playing
+        self._send(Play(playing))
+
+    def step(self) -> None:
+        """One control step; pauses first."""
+        self.past.seek(None)
+        self.pause()
+        self._send(SingleStep())
+
+    def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
+        """All envs with the session's seed, or some with fresh seeds."""
+        self.past.seek(None)
+        self._send(Reset(env_idx, self._state.now.seed if env_idx is None else None))
+
+    def set_seed(self, seed: int) -> None:
+        """Take another seed and reset all envs with it."""
+        with self._lock:
+            self._state.set(seed=int(seed))
+        self.reset()
+
+    def change(self, **settings: Any) -> None:
+        """Choose otherwise: fields of `Settings`."""
+        with self._lock:
+            if not self._state.change(**settings):
+                return
+            policy, folder = self._state.policy, self._state.folder
+        self._send_settings()
+        self._policy_file.follow(policy, folder)
+        self._note()
+
+    def _on_policy_saved(self) -> None:
+        with self._lock:
+            request = self._state.policy_saved()
+        # A policy beside the task is taken for one of its modules too, of which "nothing changed" is said.
+        self._say("the policy's file was saved: it is read anew")
+        self._note()
+        self._send(request)
+
+    def inspect(self, sections: tuple[Section, ...]) -> None:
+        """Read the selected env out, once; the answer becomes `SessionView.inspection`."""
+        with self._lock:
+            env = self._state.now.settings.selected_env
+        self._send(Inspect(env, sections))
+
+    def set_clients(self, count: int) -> None:
+        """How many pages are open; with none, no picture is rendered."""
+        with self._lock:
+            before, self._state.clients = self._state.clients, count
+        if (before == 0) != (count == 0):
+            self._send_settings()
+
+    def start_recording(self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False) -> None:
+        """Record these envs (all if None): from a reset on that is made now, until it is stopped.
+
+        Args:
+            next_episode: reset nothing, and record of each env only the episode that begins with its next reset.
+        """
+        with self._lock:
+            task = self._state.now.task
+        if task is None:
+            return
+        envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
+        self._recorder.start(task, envs, one_each=next_episode)
+        self._send(SetCapture(envs, from_reset=True))
+        if not next_episode:
+            self.reset(None if env_idx is None else envs)
+        self._note()
+
+    def stop_recording(self) -> None:
+        """Write what was gathered of the episodes under way, and stop."""
+        self._send(SetCapture(()))
+        self._recorder.stop()
+        self._note()
+
+    def keep_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
+        """Record after the fact: the episode of each of these envs (of all if None) round the moment that is shown.
+
+        Live, that is the episode that runs, or the one before if that has no step yet. `SessionView.recording` says how
+        far it is and what came of it.
+
+        Args:
+            before: the episode before that one.
+        """
+        load = self.versions.same_again()
+        placed = self.studio.placed_cameras()
+        with self._lock:
+            what = self._state.what_to_keep(env_idx, load, placed, before)
+        if isinstance(what, str):
+            self.keeper.refuse(what)
+        else:
+            self.keeper.keep(what)
+
+    def step_back(
+        self,
+        run: RecordedRun,
+        everywhere: bool = False,
+        source_file: str | None = None,
+        source: Mapping[str, str] = MappingProxyType({}),
+    ) -> int:
+        """Put the selected env, or all, into the last state of a recorded run; pauses there. Before a task is loaded
+        it is done when one is.
+
+        Args:
+            source_file, source: what the task was then; what has changed since is told on arrival.
+
+        Returns:
+            What `TimelineView.entered` is when it is done.
+        """
+        number = next(self._step_backs)
+        self._go_into(lambda env_idx: StepBack(run, env_idx, source_file, dict(source), number), everywhere)
+        return number
+
+    def _go_into(self, request: Callable[[tuple[int, ...]], StepBack], everywhere: bool) -> None:
+        self.past.seek(None)
+        self.pause()
+        with self._lock:
+            task, env = self._state.now.task, self._state.now.settings.selected_env
+            if task is None:
+                self._step_in = request, everywhere
+                return
+        self._send(request(tuple(range(task.num_envs)) if everywhere else (env,)))
+        self._note()
+
+    def show(self, env: int, serial: int) -> None:
+        """Select an env and show a moment of its past."""
+        self.change(selected_env=env)
+        self.past.seek(serial)
+
+    def close(self) -> None:
+        """End the worker and the watcher, and wait for episodes that are being written."""
+        stop_listening(self._say)
+        self._shared.close()
+        self.versions.close()
+        self._policy_file.close()
+        self._worker.stop()
+        self.judge.judging.close()
+        self.studio.close()
+        self.keeper.close()
+        self._background.end()
+        self._recorder.close()
+
+    # --- what the worker says, on the session's thread -------------------------------------------
+
+    def _on_death(self, death: Death) -> None:
+        self._recorder.stop()
+        self.studio.interrupted()
+        problem, kept = self.versions.died(death, self._printed.tail(20))
+        self._note()
+        if problem is not None:
+            self._on_event(Failed(problem, kept))
+
+    def _on_busy(self, busy: Busy | None) -> None:
+        with self._lock:
+            if busy is None and self._state.now.busy is None:
+                return
+            self._state.set(busy=busy)
+        self._note()
+
+    def _handle(self, event: Event) -> None:
+        if isinstance(event, Failed) and self._worker.load_waits and event.problem.interrupted:
+            return  # left for the sake of a newer version, which waits: nobody need hear of it
+        if isinstance(event, Loaded):
+            self._on_loaded(event)
+        elif isinstance(event, Stepped):
+            self._on_stepped(event)
+        elif isinstance(event, Answer | Progress):
+            self._asker.take(event)
+        else:
+            with self._lock:
+                self._state.take(event)
+            if isinstance(event, Placed):
+                self.studio.placed(event, self._state.now.task)
+            if isinstance(event, Failed):
+                self.versions.failed(event)
+                if not self._state.problem_at_run:
+                    self.studio.failed_to_load()
+        self._note()
+        self._on_event(event)
+
+    def _on_loaded(self, event: Loaded) -> None:
+        self._worker.ran()
+        recording, one_each = self._recorder.recording, self._recorder.one_each
+        if not scene_kept(event) or (event.reload is not None and event.reload.level != "same"):
+            # Episodes of the version before end here: their steps and the new ones do not belong together.
+            self._recorder.stop()
+        with self._lock:
+            s = self._state
+            restored, stale = self.versions.came_in(event.task)
+            meaning = what_a_load_means(s.now.task, event, self.judge.judging.view)
+            judgement = None
+            if meaning == "judge" and s.timeline is not None:
+                judgement = Judgement(s.timeline.history)
+            s.loaded(event, restored=restored, stale=stale)
+            level = None if event.reload is None else event.reload.level
+            placed = self.studio.loaded(event.task, level)
+        if judgement is not None:
+            load = self.versions.same_again()
+            assert load is not None
+            self.judge.judge(load, judgement)
+        elif meaning == "forget":
+            self.judge.forget()
+        self.versions.follow(event.task, stale)
+        self._send_settings()
+        self.studio.ask_for(placed)
+        if recording:
+            self._record_on(event, recording, one_each)
+        with self._lock:
+            step_in, self._step_in = self._step_in, None
+        if step_in is not None:
+            self._go_into(*step_in)
+
+    def _record_on(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
+        """A version came in while these envs were recorded."""
+        if not scene_kept(event):
+            self.start_recording(env_idx, next_episode=one_each)
+        elif not self._recorder.recording:
+            # The moment is not to be lost: recording goes on with each env's next episode.
+            with self._lock:
+                task = self._state.now.task
+            if task is not None:
+                self._recorder.start(task, env_idx, one_each)
+
+    def _on_stepped(self, event: Stepped) -> None:
+        with self._lock:
+            self._state.stepped(event)
+        self._recorder.take(event)
+
+    def _on_save(self) -> None:
+        self.judge.stop(StoppedBy.SAVE)
+        self.studio.interrupted()
+
+    def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
+        self._note()
+        for line in lines:
+            self._print(line)
+
+    def _say(self, text: str) -> None:
+        """In the log on the page and in the terminal."""
+        for line in text.splitlines():
+            self._printed.feed("stderr", f"workbench: {line}\n".encode(errors="replace"))
+
+    # --- small things --------------------------------------------------------------------------------
+
+    def _send_settings(self) -> None:
+        # Read and sent in one go, or of two threads the one that read first might send last.
+        with self._sending_settings:
+            with self._lock:
+                settings = self._state.settings()
+            self._send(settings)
+
+    def _send(self, request: Request) -> None:
+        self._worker.send(request)

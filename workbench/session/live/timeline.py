@@ -1,0 +1,381 @@
+"""What of the past is shown, and where one may go from there; and how a page asks for it.
+
+Live is the newest moment. Whoever moves the slider pins another one, and all that the page draws of the batch
+(poses, numbers, pictures) comes from it, out of the server's own memory: the worker hears nothing of it and goes
+on. Only three things are asked of the worker: to go on from a moment, to take back a jump, and, when somebody
+stands still at a moment that has no pictures, to draw it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import CameraKind, Picture
+from workbench.jobs.task import Restored, Stepped
+from workbench.session.history.env_table import EnvTable
+from workbench.session.history.history import History, Lived, Moment, ShownMoment
+from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
+
+if TYPE_CHECKING:
+    from workbench.session.live.live_state import SharedState
+
+Scope = Literal["this", "all", "into all"]
+"""Who goes back: the selected env; every env, each to its own; or every env to the selected env's moment."""
+_MOST_EVENTS = 400
+MOST_STEPS = 400
+"""Control steps that are made again, at the most, to go back to a moment."""
+
+
+@dataclass(frozen=True)
+class TimelineView:
+    """The past in numbers, for the page. Moments are named by serials, which count up and never come again."""
+
+    first: int = 0
+    last: int = -1
+    """The kept moments; `last` is the live one."""
+    shown: int | None = None
+    """The moment that is shown; None while live."""
+    tick: int = 0
+    """Where the shown moment is on the curves."""
+    used: int = 0
+    limit: int = 0
+    """Bytes."""
+    moments: int = 0
+    can_go_on: bool = False
+    """Whether the shown moment can be gone back to."""
+    undo: str | None = None
+    """What `TimeTravel.undo` would take back, in words."""
+    not_carried: tuple[str, ...] = ()
+    """What the last going back could not put back, each with its reason."""
+    arrived: str = ""
+    """Where the last jump came from, and how, if that was a recording."""
+    entered: int = 0
+    """Number of the last `Session.step_back` that has arrived; 0 for none."""
+    wants_pictures: bool = False
+    """The shown moment has no pictures of the cameras that are looked through."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A part of the past of one env, to be drawn under the slider."""
+
+    low: int
+    high: int
+    """Serials, both included."""
+    events: tuple[tuple[int, int], ...]
+    """Serial, and what happened (`history.RESET` ... added up)."""
+    reward: NDArray[np.float32]
+    """(high - low + 1,)"""
+    branches: tuple[tuple[int, int], ...]
+    """Serials at which the env went back, and of the moments that it went back to."""
+    stretches: tuple[tuple[int, int], ...]
+    """First and last serial of what it lived through without a jump."""
+
+
+class Timeline:
+    """The history of the present task and the moment that is shown. Not thread-safe: the session locks."""
+
+    def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
+        """See `History`."""
+        self.history = History(table, limit, first_serial)
+        self._num_envs = table.rows().num_envs
+        self._shown: int | None = None
+        self._jump: Restored | None = None
+        """Of the last jump."""
+        self._entered = 0
+        self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
+
+    # --- what comes ----------------------------------------------------------------------------------
+
+    def add(self, stepped: Stepped) -> Moment:
+        moment = self.history.add(stepped)
+        if stepped.reset_mask.any():
+            self._jump = stepped.restored
+        if stepped.restored is not None and stepped.restored.number:
+            self._entered = stepped.restored.number
+        if self._shown is not None and self._shown < self.history.first:
+            self._shown = self.history.first  # what was looked at had to go
+        return moment
+
+    # --- what is shown -------------------------------------------------------------------------------
+
+    @property
+    def shown(self) -> Moment | None:
+        """The pinned moment; None while live."""
+        return None if self._shown is None else self.history.at(self._shown)
+
+    @property
+    def at(self) -> int:
+        """Serial of the moment that is shown, the newest while live."""
+        return self.history.last if self._shown is None else self._shown
+
+    def seek(self, serial: int | None) -> None:
+        """Pin a moment, the nearest that is kept; the newest, or None, is live."""
+        if serial is None or serial >= self.history.last:
+            self._shown = None
+        else:
+            self._shown = max(serial, self.history.first)
+
+    def seek_by(self, steps: int) -> None:
+        """Some moments on (or back, if negative) from what is shown."""
+        self.seek(self.at + steps)
+
+    def seek_step(self, env: int, step: int) -> None:
+        """To that control step of the present episode of this env, through its goings back; or the nearest kept."""
+        lived = self.history.lived(env, self.history.last)
+        serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in lived}
+        if serials:
+            self.seek(serials[min(serials, key=lambda known: abs(known - step))])
+
+    def seek_event(self, env: int, direction: int) -> None:
+        """To the next (1) or last (-1) event of this env; forward from the last one is live."""
+        here = self.at
+        if direction > 0:
+            after = self.history.events(env, here + 1, self.history.last)
+            self.seek(after[0][0] if after else None)
+        else:
+            before = self.history.events(env, self.history.first, here - 1)
+            self.seek(before[-1][0] if before else self.history.first)
+
+    def camera_moved(self, kind: CameraKind, name: str) -> None:
+        """See `History.camera_moved`; what is shown is drawn again when it is asked for."""
+        self.history.camera_moved(kind, name)
+        self._asked = None
+
+    def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
+        """Those of the shown moment that were kept."""
+        moment = self.shown
+        if moment is None:
+            return {}
+        return {(kind, name): p for (of, kind, name), p in moment.pictures.items() if of == env}
+
+    def view(self, env: int, cameras: tuple[CameraRequest, ...]) -> TimelineView:
+        history, moment = self.history, self.shown
+        at = moment if moment is not None else history.at(history.last)
+        jump = history.last_jump(env)
+        missed, how = ({}, "") if self._jump is None else (self._jump.not_carried, self._jump.how)
+        return TimelineView(
+            first=history.first,
+            last=history.last,
+            shown=self._shown,
+            tick=0 if at is None else at.tick,
+            used=history.used,
+            limit=history.limit,
+            moments=len(history),
+            can_go_on=moment is not None and moment.snapshot is not None,
+            undo=None if jump is None else _in_words(jump, history.moved_last_by(jump), self._num_envs),
+            not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
+            arrived=how,
+            entered=self._entered,
+            wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
+        )
+
+    def strip(self, env: int, low: int, high: int) -> Strip:
+        """The past of one env between two moments."""
+        history = self.history
+        low, high = max(low, history.first), min(high, history.last)
+        return Strip(
+            low,
+            high,
+            tuple(history.events(env, low, high)[-_MOST_EVENTS:]),
+            history.rewards(env, low, high),
+            tuple(pair for pair in history.jumps_back(env) if low <= pair[0] <= high),
+            tuple(
+                (max(first, low), min(last, high))
+                for first, last in history.stretches(env)
+                if last >= low and first <= high
+            ),
+        )
+
+    # --- what is asked of the worker -------------------------------------------------------------------
+
+    def go_on(self, env: int, scope: Scope) -> Restore | None:
+        """Ask to go on from the shown moment, which is left for live; None where that cannot be."""
+        moment = self.shown
+        snapshot = None if moment is None else self.history.snapshot_at(moment.serial)
+        if moment is None or snapshot is None:
+            return None
+        envs = (env,) if scope == "this" else tuple(range(self._num_envs))
+        source = (env,) * len(envs) if scope == "into all" else envs
+        self._shown = None
+        return self._restore(snapshot, envs, source, moment.serial)
+
+    def undo(self, env: int) -> Restore | None:
+        """Ask to take back this env's last jump, in all envs that it brought where they are; None if there is none."""
+        jump = self.history.last_jump(env)
+        if jump is None:
+            return None
+        snapshot = self.history.snapshot_at(jump.serial - 1)
+        if snapshot is None:
+            return None
+        envs = self.history.moved_last_by(jump)
+        self._shown = None
+        return self._restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
+
+    def _restore(
+        self,
+        snapshot: bytes,
+        envs: tuple[int, ...],
+        source: tuple[int, ...],
+        origin: int,
+        undoes: int | None = None,
+    ) -> Restore:
+        history = self.history
+        found = {i: history.way_to(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
+        ways = {i: way for i, way in found.items() if way is not None}
+        beginnings = {way.start for way in ways.values()}
+        starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
+        return Restore(snapshot, envs, source, origin, undoes, ways, starts)
+
+    def draw(self, env: int, cameras: tuple[CameraRequest, ...]) -> DrawPast | None:
+        """Ask for the pictures that the shown moment lacks; once for each moment, env and choice of cameras."""
+        moment = self.shown
+        if moment is None:
+            return None
+        lacking = self._lacking(moment, env, cameras)
+        asked = (moment.serial, env, lacking)
+        if not lacking or asked == self._asked:
+            return None
+        self._asked = asked
+        return DrawPast(moment.step.poses[env].copy(), env, lacking, moment.serial)
+
+    def _lacking(
+        self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...]
+    ) -> tuple[CameraRequest, ...]:
+        def lacks(camera: CameraRequest) -> bool:
+            key = (env, camera.kind, camera.name)
+            picture = moment.pictures.get(key)
+            return (
+                picture is None
+                or key in moment.outdated
+                or any(getattr(picture, m) is None for m in camera.modalities)
+            )
+
+        return tuple(camera for camera in cameras if lacks(camera))
+
+
+def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
+    what = "reset" if jump.restored is None else "going back"
+    if jump.restored is not None and jump.restored.recording:
+        what = "going live"
+    if num_envs == 1:
+        return what
+    if len(envs) == num_envs:
+        return f"{what} of all"
+    return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
+
+
+class TimeTravel:
+    """What the batch lived through. All methods are thread-safe and return at once."""
+
+    def __init__(
+        self, shared: SharedState, send: Callable[[Request], None], pause: Callable[[], None]
+    ) -> None:
+        """
+        Args:
+            shared: what the session knows.
+            send: tells the worker.
+            pause: stops playing.
+        """
+        self._state, self._lock, self._note = shared.state, shared.lock, shared.note
+        self._send, self._pause = send, pause
+
+    # --- looked at -------------------------------------------------------------------------------
+
+    def seek(self, serial: int | None) -> None:
+        """Show a moment of the past, by its number (see `TimelineView`); None shows what is live."""
+        self._seek(lambda timeline: timeline.seek(serial))
+
+    def seek_by(self, steps: int) -> None:
+        """Show a moment before (negative) or after the one that is shown."""
+        self._seek(lambda timeline: timeline.seek_by(steps))
+
+    def seek_step(self, env: int, step: int) -> None:
+        """Show the moment at which this env was at that step of its present episode."""
+        self._seek(lambda timeline: timeline.seek_step(env, step))
+
+    def seek_event(self, direction: int) -> None:
+        """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
+        env = self._env
+        self._seek(lambda timeline: timeline.seek_event(env, direction))
+
+    def draw(self) -> None:
+        """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
+        with self._lock:
+            s = self._state
+            request = None if s.timeline is None else s.timeline.draw(self._env, s.now.settings.cameras)
+        if request is not None:
+            self._send(request)
+
+    # --- gone back to ----------------------------------------------------------------------------
+
+    def go_on(self, scope: Scope) -> None:
+        """Put envs back to the shown moment; the simulation goes on from there (see `timeline.Scope`)."""
+        self._travel(lambda timeline, env: timeline.go_on(env, scope))
+
+    def undo(self) -> None:
+        """Take back the selected env's last reset or going back, and pause there."""
+        self._pause()
+        self._travel(lambda timeline, env: timeline.undo(env))
+
+    # --- read ------------------------------------------------------------------------------------
+
+    def strip(self, low: int, high: int) -> Strip | None:
+        """The selected env's past between two moments; None before a task is loaded."""
+        with self._lock:
+            s = self._state
+            return None if s.timeline is None else s.timeline.strip(self._env, low, high)
+
+    def stretch(self) -> tuple[int, int] | None:
+        """First and last moment of what the selected env lived through round the shown moment, without a jump."""
+        with self._lock:
+            timeline = self._state.timeline
+            if timeline is None or not len(timeline.history):
+                return None
+            return timeline.history.stretch_at(self._env, timeline.at)
+
+    def shown_moment(self) -> ShownMoment:
+        """Which env is looked at, and where its bodies are if that is not live."""
+        with self._lock:
+            s = self._state
+            shown = None if s.timeline is None else s.timeline.shown
+            count = 0 if s.now.task is None else s.now.task.num_envs
+            return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
+
+    def episode_moments(self, most: int) -> tuple[Lived, ...]:
+        """Moments, at the most so many, of the selected env's episode round the one that is shown."""
+        with self._lock:
+            s = self._state
+            if s.timeline is None or not len(s.timeline.history):
+                return ()
+            return s.timeline.history.episode(self._env, s.timeline.at, most)
+
+    @property
+    def _env(self) -> int:
+        return self._state.now.settings.selected_env
+
+    def _seek(self, seek: Callable[[Timeline], None]) -> None:
+        with self._lock:
+            timeline = self._state.timeline
+            if timeline is None:
+                return
+            before = timeline.shown
+            seek(timeline)
+            if timeline.shown is before:
+                return
+            self._state.new_pictures()
+        self._note()
+
+    def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
+        with self._lock:
+            timeline = self._state.timeline
+            request = None if timeline is None else ask(timeline, self._env)
+            self._state.new_pictures()
+        if request is not None:
+            self._send(request)
+        self._note()

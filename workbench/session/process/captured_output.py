@@ -1,0 +1,229 @@
+"""What the author's code printed: the last lines, whatever it prints.
+
+A print in a loop is a gigabyte in a minute. Each line that is split, decoded, kept and sent to a terminal costs
+microseconds of the server, which is the page's: a flood of millions would freeze it. So the bytes are taken as
+they come, in large pieces; so many lines a second are looked at, of the others only the number is known.
+
+What it printed may be anything: controls are shown, colours are kept apart from the text (`terminal_text`), and of a
+line that is written over, as by a progress bar, there is the last version, also while it goes on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+from rich.ansi import AnsiDecoder
+from rich.style import Style
+
+from workbench.machine.text import COLOURS, HARMLESS, colour_codes, plain_text
+
+PLAIN = Style.null()
+SWITCHES = ("bold", "dim", "italic", "underline", "reverse", "strike")
+
+_LONGEST_LINE = 2000
+_LINES_KEPT = 1000
+_LINES_PER_SECOND = 400
+"""More are counted and dropped. Faster than anybody reads, and 1 % of a core."""
+_BAR_TOLD_EVERY = 0.1
+"""Seconds."""
+_KEPT_OF_PIECE = 16_384
+"""Bytes at the end of a piece that are looked at when the piece is one of a flood."""
+
+
+class Run(NamedTuple):
+    """Characters of one style, none of them a control."""
+
+    text: str
+    style: Style
+
+
+@dataclass(frozen=True)
+class PrintedLine:
+    stream: str
+    """``stdout`` or ``stderr``."""
+    text: str
+    """Without colours, every control shown escaped."""
+    runs: tuple[Run, ...] = ()
+    """The same text with its colours; empty where it has none."""
+
+
+@dataclass(frozen=True)
+class Printed:
+    """The log as it was at one moment."""
+
+    serial: int
+    lines: tuple[PrintedLine, ...]
+    """Oldest first; last what stands without an end of line, where it was written over: a progress bar."""
+    dropped: int
+    """Lines that came too fast to be kept."""
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        return tuple(line.text for line in self.lines)
+
+
+NOTHING_PRINTED = Printed(0, (), 0)
+
+
+class PrintedLog:
+    """Fed by the threads that read the worker's output; read by the page. All methods are thread-safe."""
+
+    def __init__(self, on_lines: Callable[[list[PrintedLine], int], None]) -> None:
+        """
+        Args:
+            on_lines: called with new lines and how many were dropped before them, on the threads that feed; with
+                none where a line that is not ended was written over.
+        """
+        self._on_lines = on_lines
+        self._lock = threading.Lock()
+        self._lines: deque[PrintedLine] = deque(maxlen=_LINES_KEPT)
+        self._dropped = 0
+        self._serial = 0
+        self._rest: dict[str, bytes] = {}
+        self._styles: dict[str, Style] = {}
+        """What each stream's next line begins with."""
+        self._budget = float(_LINES_PER_SECOND)
+        self._refilled = time.monotonic()
+        self._told_of_bar = 0.0
+        self._view = NOTHING_PRINTED
+
+    def feed(self, stream: str, piece: bytes) -> bool:
+        """The next bytes of a stream, in any pieces; none at its end. True while they come too fast."""
+        ended = not piece
+        with self._lock:
+            if ended:
+                # What stands without an end of line is the last line.
+                piece = b"\n" if self._rest.get(stream) else b""
+            now = time.monotonic()
+            earned = (now - self._refilled) * _LINES_PER_SECOND
+            self._budget, self._refilled = min(self._budget + earned, float(_LINES_PER_SECOND)), now
+            found, dropped = self._split(stream, piece)
+            # The last lines of a flood say more than its first ones, and the very last the most.
+            over = len(found) - max(1, int(self._budget))
+            if over > 0:
+                found, dropped = found[over:], dropped + over
+            self._budget = max(0.0, self._budget - len(found))
+            lines = [self._line(stream, line) for line in found]
+            if ended:
+                self._styles.pop(stream, None)
+            self._dropped += dropped
+            self._lines.extend(lines)
+            bar = b"\r" in self._rest[stream]
+            if lines or dropped or bar:
+                self._serial += 1
+            told = bool(lines or dropped) or (bar and now - self._told_of_bar > _BAR_TOLD_EVERY)
+            if told and bar:
+                self._told_of_bar = now
+        if told:
+            self._on_lines(lines, dropped)
+        return dropped > 0
+
+    def clear(self) -> None:
+        with self._lock:
+            self._lines.clear()
+            self._dropped = 0
+            self._serial += 1
+
+    def view(self) -> Printed:
+        with self._lock:
+            if self._view.serial != self._serial:
+                self._view = Printed(self._serial, (*self._lines, *self._unfinished()), self._dropped)
+            return self._view
+
+    def tail(self, count: int) -> str:
+        """The last `count` lines, as one text."""
+        return "\n".join(self.view().texts[-count:])
+
+    def _split(self, stream: str, piece: bytes) -> tuple[list[bytes], int]:
+        """The lines that end in `piece`, and how many of it were not even looked at."""
+        dropped = 0
+        if len(piece) > _KEPT_OF_PIECE and self._budget < _LINES_PER_SECOND / 2:
+            cut = piece.rfind(b"\n", 0, len(piece) - _KEPT_OF_PIECE) + 1
+            dropped = piece.count(b"\n", 0, cut)
+            if cut:
+                piece, self._rest[stream] = piece[cut:], b""
+        *whole, rest = (self._rest.get(stream, b"") + piece).split(b"\n")
+        # Of a bar that is drawn for minutes only the last version is needed, and the one that is being written.
+        if rest.count(b"\r") > 1:
+            rest = b"\r".join(rest.rsplit(b"\r", 2)[1:])
+        # Without an end of line in sight: cut there, or a gigabyte without one would fill us up.
+        if len(rest) > _LONGEST_LINE:
+            whole.append(rest)
+            rest = b""
+        self._rest[stream] = rest
+        return whole, dropped
+
+    def _line(self, stream: str, raw: bytes) -> PrintedLine:
+        line, self._styles[stream] = _read(stream, raw, self._styles.get(stream, PLAIN))
+        return line
+
+    def _unfinished(self) -> list[PrintedLine]:
+        found = [
+            _read(stream, rest, self._styles.get(stream, PLAIN))[0]
+            for stream, rest in self._rest.items()
+            if b"\r" in rest
+        ]
+        return [line for line in found if line.text]
+
+
+def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
+    """A line, and the style that the one after it begins with."""
+    # What went back to the line's beginning wrote over what stood there.
+    seen = raw.rstrip(b"\r").rpartition(b"\r")[2]
+    cut = seen if len(seen) <= _LONGEST_LINE else seen[:_LONGEST_LINE] + "…".encode()
+    runs, after = coloured_runs(cut.decode(errors="replace"), style)
+    text = "".join(run.text for run in runs)
+    return PrintedLine(stream, text, tuple(runs) if any(run.style != PLAIN for run in runs) else ()), after
+
+
+def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[Run], Style]:
+    """One line as runs, and the style that the next line begins with.
+
+    Args:
+        style: the one that the line before ended with.
+    """
+    runs: list[Run] = []
+    end = 0
+    for found in COLOURS.finditer(text):
+        _add(runs, text[end : found.start()], style)
+        style = _changed(style, found[1])
+        end = found.end()
+    _add(runs, text[end:], style)
+    return runs, style
+
+
+def for_terminal(runs: Iterable[Run]) -> str:
+    """These runs for a terminal that has colours; it is plain again after them."""
+    return "".join(run.style.render(run.text) for run in runs)
+
+
+def _add(runs: list[Run], text: str, style: Style) -> None:
+    if not text:
+        return
+    text = plain_text(text, "\t")
+    if runs and runs[-1].style == style:
+        text = runs.pop().text + text
+    runs.append(Run(text, style))
+
+
+@lru_cache(4096)
+def _changed(style: Style, numbers: str) -> Style:
+    """After the numbers of an ``ESC [ numbers m``."""
+    decoder = AnsiDecoder()
+    decoder.style = style
+    for first, *more in colour_codes(numbers):
+        if first in (38, 48):
+            decoder.decode_line(f"\x1b[{';'.join(map(str, (first, *more)))}m")
+        elif first in HARMLESS:
+            decoder.decode_line(f"\x1b[{24 if (first, more) == (4, [0]) else first}m")
+    found = decoder.style
+    # What was switched off looks as what never was on.
+    colour, background = (None if c is None or c.is_default else c for c in (found.color, found.bgcolor))
+    on = Style.parse(" ".join(name for name in SWITCHES if getattr(found, name)))
+    return Style(color=colour, bgcolor=background) + on

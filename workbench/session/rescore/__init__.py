@@ -1,0 +1,1 @@
+"""Past moments and recordings rescored with today's code."""

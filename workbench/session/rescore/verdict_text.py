@@ -1,0 +1,197 @@
+"""What a verdict says, in words and as rows: the page, the terminal and files show these."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from workbench.jobs.verdict import FLAGS, Verdict
+from workbench.machine.text import length, mean_text, number_text
+from workbench.recording.episode.source import Source
+
+PUT_IN = " With the recorded states put in at every step nothing drifts."
+"""What can be done about drift from a recording."""
+_MOST_NAMED = 4
+
+
+def what_changed(verdict: Verdict[Any]) -> str:
+    """Success and fail, or else the reward; ``as it was`` where nothing is another."""
+    if verdict.why_not:
+        return f"not judged: {verdict.why_not}"
+    flags = (("success", verdict.success), ("fail", verdict.fail))
+    told = [_turned(name, was, now) for name, (was, now) in flags if was != now]
+    if told:
+        return ", ".join(told)
+    if verdict.differs:
+        at = f", from step {verdict.first_difference}"
+        if "reward" in verdict.differing:
+            return _reward_change(verdict) + at
+        return f"{' and '.join(name for name in FLAGS if name in verdict.differing)} at other steps{at}"
+    if verdict.differing:
+        return f"as it was, but for {', '.join(verdict.differing[:3])}"
+    return "as it was"
+
+
+def _turned(name: str, was: int | None, now: int | None) -> str:
+    """When a flag turned true, and turns true now; None is never."""
+    before = "never" if was is None else f"at step {was}"
+    return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
+
+
+def _reward_change(verdict: Verdict[Any]) -> str:
+    """By how much the rewards changed, or that they are no finite numbers now or were not."""
+    if math.isfinite(verdict.largest):
+        return f"reward by up to {number_text(verdict.largest)}"
+    was, now = verdict.returns
+    if math.isfinite(was):
+        return f"reward {number_text(now)} now"
+    return (
+        f"reward no longer {number_text(was)}"
+        if math.isfinite(now)
+        else f"reward {number_text(now)} at other steps"
+    )
+
+
+def returns(verdict: Verdict[Any]) -> str:
+    if math.isnan(verdict.returns[0]) and np.isnan(verdict.old_reward).all():
+        return f"none → {number_text(verdict.returns[1])}"
+    return _was_now(*map(number_text, verdict.returns))
+
+
+def drift(verdict: Verdict[Any]) -> str:
+    """How far the bodies were from the record."""
+    if verdict.metres is None:
+        return "not known"
+    return "none" if verdict.metres == 0 else length(verdict.metres)
+
+
+def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Collection[str] = ()) -> str:
+    """One sentence on what differs.
+
+    Args:
+        others: further entries that differ, such as those that one version has not.
+    """
+    judged = [verdict for verdict in verdicts if not verdict.why_not]
+    if not judged:
+        return "No episode could be judged." if verdicts else ""
+    differing, yet = sum(verdict.differs for verdict in judged), " so far" * so_far
+    if differing:
+        return f"{differing} of {counted(len(judged), 'episode')} {'differs' if differing == 1 else 'differ'}{yet}."
+    sentence = f"Nothing differs in {counted(len(judged), 'episode')}{yet}: reward, success and fail are as they were."
+    named = sorted({*others, *(name for verdict in judged for name in verdict.differing)})[:_MOST_NAMED]
+    return sentence + (f" Other entries differ: {', '.join(named)}." if named else "")
+
+
+def numbers(verdicts: Sequence[Verdict[Any]]) -> list[str]:
+    """Success and return over all of them, then and now; and how many were not judged."""
+    judged = [verdict for verdict in verdicts if not verdict.why_not]
+    told: list[str] = []
+    if any(verdict.has_success for verdict in judged):
+        successes = (sum(verdict.success[k] is not None for verdict in judged) for k in (0, 1))
+        told.append(f"episodes with success: {_was_now(*map(str, successes))}")
+    if judged:
+        means = (mean_text([verdict.returns[k] for verdict in judged]) for k in (0, 1))
+        told.append(f"mean return: {_was_now(*means)}")
+    skipped = len(verdicts) - len(judged)
+    return told + ([f"{counted(skipped, 'episode')} not judged"] if judged and skipped else [])
+
+
+def summary(verdicts: Sequence[Verdict[Any]]) -> str:
+    """All of that in one line."""
+    return " ".join((headline(verdicts), *(f"{told[0].upper()}{told[1:]}." for told in numbers(verdicts))))
+
+
+def doubts(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
+    """How far the bodies came from the record, and where that makes the comparison doubtful; empty if not known.
+
+    Args:
+        advice: a sentence for where it does.
+    """
+    known = [verdict for verdict in verdicts if verdict.metres is not None]
+    if not known:
+        return ""
+    furthest = max(known, key=lambda verdict: verdict.metres or 0.0)
+    metres, radians = furthest.metres or 0.0, max(verdict.radians for verdict in known)
+    if metres == 0 and radians == 0:
+        return "Every body is where it was, to the last bit: what differs comes of the code."
+    amount = f"{length(metres)} and {math.degrees(radians):.2g}°"
+    if not (far := is_doubtful(known)):
+        return f"States drifted by at most {amount}: the rewards are comparable."
+    return (
+        f"In {counted(far, 'episode')} bodies came up to {amount} from where they were, furthest in {furthest.of.name}: "
+        f"what differs there may come of that, and not of the code.{advice}"
+    )
+
+
+def is_doubtful(verdicts: Sequence[Verdict[Any]]) -> int:
+    """In how many of them what differs may come of other states."""
+    return sum(verdict.drifted for verdict in verdicts)
+
+
+def not_carried(verdicts: Sequence[Verdict[Any]]) -> tuple[str, ...]:
+    """What could not be put back, each once with its reason."""
+    return tuple(dict.fromkeys(f"{what}: {why}" for v in verdicts for what, why in v.missed.items()))
+
+
+def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
+    """One flat dict an episode, as JSON can say it."""
+    return [
+        {
+            "episode": verdict.of.name,
+            "file": str(verdict.of.path),
+            "trajectory": verdict.of.part,
+            "task": verdict.task,
+            "seed": verdict.seed if verdict.seed >= 0 else None,
+            "length": verdict.length,
+            "success_before": verdict.success[0],
+            "success_now": verdict.success[1],
+            "fail_before": verdict.fail[0],
+            "fail_now": verdict.fail[1],
+            "return_before": verdict.returns[0],
+            "return_now": verdict.returns[1],
+            "differs": verdict.differs,
+            "first_difference": verdict.first_difference,
+            "largest_reward_change": verdict.largest,
+            "other_entries": ", ".join(verdict.others),
+            "drift_metres": verdict.metres,
+            "drift_at": verdict.drift_at,
+            "first_state_put_in": verdict.begins_otherwise,
+            "not_carried": "; ".join(f"{what}: {why}" for what, why in verdict.missed.items()),
+            "not_judged": verdict.why_not,
+        }
+        for verdict in verdicts
+    ]
+
+
+def as_csv(verdicts: Sequence[Verdict[Source]]) -> str:
+    rows = as_rows(verdicts)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*rows[0]] if rows else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def as_json(verdicts: Sequence[Verdict[Source]]) -> str:
+    """With ``NaN`` and infinities as null, which JSON has not."""
+    rows = [{key: _finite(value) for key, value in row.items()} for row in as_rows(verdicts)]
+    return json.dumps(rows, indent=1) + "\n"
+
+
+def counted(number: int, what: str) -> str:
+    """``1 episode``, ``3 episodes``."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _was_now(was: str, now: str) -> str:
+    return was if was == now else f"{was} → {now}"
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not -float("inf") < value < float("inf") else value

@@ -1,0 +1,1 @@
+"""The worker process: it owns the env and is the only one that steps it."""

@@ -1,0 +1,194 @@
+"""The worker's part in the past: a moment is gone back to, lived up to again where that can be, put there otherwise;
+and moments are judged again by the code that it has.
+
+A state that is put into an env lacks what PhysX keeps to itself, its contacts above all, so the run goes on otherwise
+than it did wherever bodies press on each other (`core.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an
+episode of this session begins where PhysX has no past (`core.snapshots.snapshot.begin_anew`), as does what follows a moment that was
+put there. From such an exact point the same actions lead to the same moment, contacts and all. Whether they did is
+compared to the last byte, and where they did not (the code was edited, the task draws numbers for the whole batch)
+the moment is put there as before. What is not in PhysX comes from the moment's snapshot either way.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Callable, Mapping
+from itertools import count
+
+from workbench.authoring.problem import Interrupted, TaskError
+from workbench.core.env import actions
+from workbench.core.env.step_result import StepResult
+from workbench.core.simulation.cpu_system import batched_system
+from workbench.core.snapshots.snapshot import (
+    RestoreReport,
+    Snapshot,
+    in_this_state,
+    only_these_move,
+    restore_memory,
+    restore_snapshot,
+)
+from workbench.jobs.from_recording import changed_since
+from workbench.jobs.open_task import OpenedTask, blamed, restore_checked, step_checked
+from workbench.jobs.replay import arrive, how
+from workbench.jobs.task import NO_MOMENT, Restored
+from workbench.session.protocol.messages import Restore, StepBack
+from workbench.session.protocol.questions import Judged, JudgeMoments
+
+MOST_SECONDS = 8.0
+"""A way back that takes longer is given up, and the moment put there."""
+
+
+def go_back(
+    opened: OpenedTask, request: Restore, on_step: Callable[[int, int], None]
+) -> tuple[StepResult, Restored]:
+    """Let the envs of `request` stand at its moment.
+
+    Args:
+        on_step: called with the number of steps that were made again, and of all.
+
+    Raises:
+        TaskError: the task's code raised at the moment itself.
+    """
+    task, env = opened.env, opened.env.env
+    snapshot: Snapshot = pickle.loads(request.snapshot)
+    source = dict(zip(request.env_idx, request.source, strict=True))
+    lived = _live_through(opened, request, snapshot, source, on_step)
+    put = [i for i in request.env_idx if i not in lived]
+    report = RestoreReport((), {})
+    with blamed("restore", opened.loaded, task):
+        if put:
+            report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
+        if lived:
+            # Of all of them together: what the task keeps for the batch belongs to the moment of all.
+            every, own = list(source), all(i == of for i, of in source.items())
+            positions = [snapshot.env_idx.index(of) for of in source.values()]
+            whole = own and snapshot.num_envs == env.num_envs == len(every)
+            _, missed = restore_memory(env, snapshot.memory, every, positions, whole)
+            report = RestoreReport((), {**missed, **_of_simulation(report)})
+        step = task.judge()
+    steps = max((len(request.ways[i].actions) for i in lived), default=0)
+    return step, Restored(
+        request.env_idx,
+        request.source,
+        request.origin,
+        request.undoes,
+        report.not_carried,
+        how=_how(request, len(lived), len(put), steps),
+        lived_through=tuple(lived),
+    )
+
+
+def _live_through(
+    opened: OpenedTask,
+    request: Restore,
+    snapshot: Snapshot,
+    source: Mapping[int, int],
+    on_step: Callable[[int, int], None],
+) -> list[int]:
+    """Make the steps of all ways again; gives the envs that are at the moment then, to the last byte."""
+    task, env = opened.env, opened.env.env
+    width = actions.width(task.parts)
+    ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (width,)}
+    px = batched_system(env.scene)
+    if px is None or not ways:
+        return []
+    others = [i for i in range(task.num_envs) if i not in ways]
+    starts = {number: pickle.loads(start) for number, start in request.starts.items()}
+    total = max(len(way.actions) for way in ways.values())
+    began = time.monotonic()
+    try:
+        with only_these_move(env, [*ways], task.snapshot(others) if others else None):
+            for done in count():
+                # The shorter ways begin later, so that all end with the same step.
+                for number, start in starts.items():
+                    begin = [
+                        i for i, w in ways.items() if w.start == number and total - len(w.actions) == done
+                    ]
+                    if begin:
+                        restore_snapshot(env, start, begin, [ways[i].source for i in begin])
+                if done == total:
+                    break
+                waiting = [i for i, way in ways.items() if total - len(way.actions) > done]
+                px.hold_still({*others, *waiting})
+                at = {i: max(0, done - total + len(way.actions)) for i, way in ways.items()}
+                rows = {i: way.actions[at[i]] for i, way in ways.items()}
+                step_checked(task, opened.loaded, actions.action_of(task.parts, task.num_envs, rows))
+                on_step(done + 1, total)
+                if time.monotonic() - began > MOST_SECONDS:
+                    return []
+            return [i for i in ways if in_this_state(env, i, snapshot, source[i])]
+    except TaskError as error:
+        if isinstance(error.__cause__, Interrupted):
+            raise
+        return []  # an edited hook fails on the way: what it says of the moment itself is told
+
+
+def _of_simulation(report: RestoreReport) -> dict[str, str]:
+    """What was missed of it in envs that were put there; of the task's memory all is said anew."""
+    return {what: why for what, why in report.not_carried.items() if what.startswith("fresh physics")}
+
+
+def _how(request: Restore, lived: int, put: int, steps: int) -> str:
+    if not lived or steps == 0:
+        return ""
+    again = f"{steps} steps were made again, and " if steps > 1 else "a step was made again, and "
+    if not put:
+        return f"{again}every body is where it was, to the last bit."
+    return f"{again}in {lived} of {lived + put} envs every body is where it was, to the last bit; the others were put there."
+
+
+def going_back(done: int, total: int) -> str:
+    """For the status line, while it takes long."""
+    return f"going back: step {done} of {total}"
+
+
+def judge_moments(opened: OpenedTask, request: JudgeMoments) -> Judged:
+    """Live through the moments of `request`, in order; stops at the first that raises, which is then told."""
+    steps: list[StepResult] = []
+    missed: dict[str, str] = {}
+    for moment in request.moments:
+        try:
+            if moment.snapshot is None:
+                steps.append(step_checked(opened.env, opened.loaded, moment.action))
+                continue
+            snapshot = pickle.loads(moment.snapshot)
+            step, report = restore_checked(
+                opened.env, opened.loaded, snapshot, moment.env_idx, moment.env_idx
+            )
+        except TaskError as error:
+            return Judged(tuple(steps), missed, error.problem)
+        steps.append(step)
+        if len(moment.env_idx) == opened.env.num_envs:
+            # With some of the envs what holds for the whole batch is never put back: neither was it in the record.
+            missed |= report.not_carried
+    return Judged(tuple(steps), missed)
+
+
+# --- into a recording ----------------------------------------------------------------------------------
+
+
+def step_back(
+    opened: OpenedTask, request: StepBack, on_step: Callable[[int], None]
+) -> tuple[StepResult, Restored]:
+    """Let the envs of `request` stand at the last state of its run.
+
+    Raises:
+        TaskError: the task's code raised on the way; the envs stand somewhere on it.
+    """
+    run = request.run
+    step, arrival = arrive(opened, run, run.length, request.env_idx, on_step)
+    source = request.env_idx
+    where = f"{run.name}, step {run.length}"
+    loaded = opened.loaded
+    file = None if loaded.file is None else str(loaded.file)
+    changed = changed_since(request.source_file, request.source, file, loaded.source)
+    said = f"{where} (changed since: {changed}): {how(arrival)}" if changed else f"{where}: {how(arrival)}"
+    return step, Restored(
+        request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said, number=request.number
+    )
+
+
+def going_there(request: StepBack, done: int) -> str:
+    """For the status line, while it takes long."""
+    return f"going to {request.run.name}: step {done} of {request.run.length}"

@@ -1,0 +1,515 @@
+"""The worker process: it imports the author's file, owns the env, and is the only one that steps it.
+
+It is a process of its own because SAPIEN holds the interpreter lock while it steps and renders, and
+because the author's code may loop for ever or crash: the page must go on. One loop does everything, so
+nothing ever touches the env while it steps: take the requests that have come, take a step if one is
+due, make pictures if somebody looks, sleep until the next of these.
+
+The server starts it through `worker_start`, with one end of a socket pair. Whatever the loop does is noted in
+shared memory (`pulse`), and while it is the author's code it can be left by hand (`interrupts`).
+
+What is here is the loop, and what each request does to the env. How a version comes in is in `reload`, what the
+envs do next in `acting`, what is told of each step in `step_events`, what the cameras do in `worker_cameras`, and how
+the author's code is called, and left, in `held_task`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from workbench.authoring.loading.reference import named_file
+from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
+from workbench.core.capture.inspect_env import inspect_env
+from workbench.core.env.step_result import StepResult
+from workbench.core.maniskill_private import mark_camera_configs
+from workbench.jobs.actions import Acting
+from workbench.jobs.open_task import OpenedTask, Opening, reset_checked, step_checked, warm_up
+from workbench.jobs.pool import Answer, CannotAnswer, Progress
+from workbench.jobs.task import Restored
+from workbench.jobs.verdict import Rescore
+from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.machine.processes.wire import Call, Question, pack
+from workbench.session.process.debugger import (
+    CannotDebug,
+    listen_for_debugger,
+    listening_for_a_debugger,
+    wait_for_debugger,
+)
+from workbench.session.process.heartbeat import Doing, PulseWriter
+from workbench.session.process.interrupts import Interrupts
+from workbench.session.protocol.messages import (
+    SCENE_KEPT,
+    Cancel,
+    DrawPast,
+    Failed,
+    Inspect,
+    ListenForDebugger,
+    Load,
+    Loaded,
+    Loading,
+    PlaceCamera,
+    Play,
+    Quit,
+    ReadPolicyAgain,
+    ReloadReport,
+    Reset,
+    Restore,
+    RulesBroken,
+    SetCapture,
+    Settings,
+    SingleStep,
+    Status,
+    StepBack,
+    WarmUp,
+)
+from workbench.session.protocol.questions import (
+    CameraQuestion,
+    CaptureMoment,
+    JudgeMoments,
+    MakeScene,
+    RunCameras,
+)
+from workbench.session.worker.cameras import WorkerCameras
+from workbench.session.worker.go_back import go_back, going_back, going_there, judge_moments, step_back
+from workbench.session.worker.guarded_task import HeldTask, ServerLine
+from workbench.session.worker.make_scene import SceneEnv
+from workbench.session.worker.pacing import Pacer, Rate, now_and_then
+from workbench.session.worker.reload import Running, load_version
+from workbench.session.worker.step_events import StepEvents
+
+_STATUS_PERIOD = 0.25
+_IDLE = 0.5
+"""Seconds to sleep when nothing is due; a request ends the sleep at once."""
+
+
+class Worker:
+    """The state of the loop; see the module's text."""
+
+    def __init__(self, connection: int, pulse: PulseWriter) -> None:
+        self._pulse = pulse
+        self._interrupts = Interrupts()
+        self._line = ServerLine(connection, self._interrupts)
+        self._steps = StepEvents()
+        self._held = HeldTask(self._line, self._interrupts, pulse, self._steps, self._pause)
+        self._cameras = WorkerCameras(self._held, self._on_first_picture)
+        self._loaded_by: Load | None = None
+        self._last: StepResult | None = None
+        self._playing = False
+        self._started_in = CurrentFolder()
+        self._scene = SceneEnv()
+        self._acting = Acting(self._started_in)
+        self._settings = Settings()
+        self._pacer = Pacer(0.05)
+        self._rate = Rate()
+        self._status_sent = 0.0
+        self._rules_sent = 0.0
+        self._rules_told = RulesBroken(())
+        self._rules_serial: tuple[object, int] = None, 0
+        self._quit = False
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            Load: self._load,
+            Play: self._play,
+            SingleStep: lambda request: self._control_step(),
+            Reset: self._reset,
+            Settings: self._change,
+            ReadPolicyAgain: self._read_policy_again,
+            PlaceCamera: self._cameras.place,
+            SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
+            Restore: lambda request: self._held.guarded(partial(self._go, request)),
+            StepBack: lambda request: self._held.guarded(partial(self._go, request)),
+            DrawPast: self._cameras.draw_past,
+            ListenForDebugger: self._listen_for_debugger,
+            Inspect: self._inspect,
+            Cancel: lambda request: None,
+            Quit: self._stop,
+        }
+
+    def run(self) -> None:
+        """Until the server says so or hangs up."""
+        self._interrupts.install()
+        while not (self._quit or self._line.closed):
+            self._pulse.begin("idle")
+            self._line.listen(self._sleep())
+            while (request := self._line.next()) is not None:
+                if isinstance(request, Call):
+                    self._call(request)
+                    continue
+                work = partial(self._handlers[type(request)], request)
+                self._held.at_work(_DOING.get(type(request)), work)
+            now = time.monotonic()
+            if self._playing and self._pacer.due(now):
+                self._pacer.spend()
+                self._held.at_work("stepping", self._control_step)
+            if self._cameras.placing_due:
+                self._held.at_work("stepping", self._cameras.place_waiting)
+            self._cameras.make(nothing_else_to_do=not self._playing)
+            self._send_status(time.monotonic())
+            if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
+                self._tell_of_rules()
+
+    # --- questions ---------------------------------------------------------------------------------
+
+    def _call(self, call: Call) -> None:
+        """Answered whatever happens, or who asked would wait for ever."""
+        answers: list[Answer] = []
+        doing = _DOING.get(type(call.request))
+        problem = self._held.at_work(doing, lambda: answers.append(self._answer(call)))
+        if problem is not None:
+            answers = [Answer(call.number, why=problem.message, problem=problem)]
+        self._line.send(answers[0])
+
+    def _answer(self, call: Call) -> Answer:
+        def tell(done: int, total: int, part: object = None) -> None:
+            self._line.send(Progress(call.number, done, total, b"" if part is None else pack(part)))
+
+        try:
+            return Answer(call.number, pack(self._value(call.request, tell)))
+        except CannotAnswer as error:
+            return Answer(call.number, why=str(error))
+        except TaskError as error:
+            if self._held.drop_steps_if_left(error):
+                self._held.back_to_the_moment()
+            return Answer(call.number, why=str(error), problem=error.problem)
+
+    def _value(self, question: Question[Any], tell: Callable[..., None]) -> object:
+        if isinstance(question, WarmUp):
+            return warm_up(question.options, lambda: not self._line.waits())
+        if isinstance(question, Load):
+            loaded: list[Loaded] = []
+            self._load_version(question, loaded.append)
+            return loaded[0]
+        if isinstance(question, MakeScene):
+            return self._scene.scene(question, tell)
+        opened = self._held.opened
+        if opened is None:
+            raise CannotAnswer("no task is loaded")
+        if isinstance(question, CameraQuestion):
+            return self._cameras.answer(opened, question, tell)
+        if isinstance(question, PlaceCamera):
+            return self._cameras.place_now(opened, question)
+        if isinstance(question, Reset):
+            return self._reset_envs(opened, question.env_idx, self._seeds(question))
+        if isinstance(question, JudgeMoments):
+            return judge_moments(opened, question)
+        if isinstance(question, CaptureMoment):
+            return self._cameras.capture(opened, question)
+        assert isinstance(question, Rescore)
+        # Not for every worker: it brings rerun and what reads recordings, a third of a second.
+        from workbench.jobs import rescore_run
+
+        return rescore_run.answer(opened, question, tell)
+
+    # --- requests ----------------------------------------------------------------------------------
+
+    def _sleep(self) -> float:
+        waits = [_IDLE]
+        if self._playing:
+            waits.append(self._pacer.wait())
+        picture = self._cameras.wait(time.monotonic())
+        if picture is not None:
+            waits.append(picture)
+        return min(waits)
+
+    def _load(self, request: Load) -> None:
+        try:
+            self._load_version(request, self._line.send)
+        except TaskError as error:
+            self._held.drop_steps_if_left(error)
+            self._line.send(Failed(error.problem, self._held.opened is not None, error.classes))
+
+    def _load_version(self, request: Load, tell: Callable[[Loaded], None]) -> None:
+        self._cameras.settle()
+        with self._started_in.again():
+            self._held.asked_for = named_file(request.task)
+        before, running = self._held.opened, None
+        if before is not None and self._loaded_by is not None and self._last is not None:
+            running = Running(self._loaded_by, before, self._last)
+        try:
+            # What the version before did to the current folder is not for this one, unless it fails.
+            with self._started_in.again(stay=True):
+                opened, report = load_version(
+                    request,
+                    running,
+                    Opening(
+                        on_activity=lambda activity: self._line.send(Loading(activity)),
+                        on_finding=lambda finding: None,  # see `_tell_of_rules`
+                        begins_anew=True,
+                    ),
+                )
+        except TaskError:
+            self._cameras.put_back()  # trying new cameras took the old ones away
+            raise
+        # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
+        with self._interrupts.shielded():
+            self._take_over(opened, report, request, tell)
+            self._tell_of_rules()
+
+    def _take_over(
+        self, opened: OpenedTask, report: ReloadReport | None, request: Load, tell: Callable[[Loaded], None]
+    ) -> None:
+        before, self._held.opened = self._held.opened, opened
+        self._loaded_by, self._last = request, opened.first
+        if report is None or report.level not in ("same", "patched"):
+            self._cameras.forget_placed()
+        if report is not None and report.level in SCENE_KEPT:
+            self._cameras.look_again()
+            self._cameras.scene_changed()
+            # The meshes are 9 MB for a Panda, and the server has them: 0.2 s on a reload's way to the page.
+            unchanged = replace(opened.description.geometry, visuals=())
+            description = replace(opened.description, geometry=unchanged)
+            tell(Loaded(description, opened.first, opened.milliseconds, report))
+            return
+        self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
+        if report is None or not report.carried:
+            self._acting.seed(request.options.seed)
+        self._rate.clear()
+        # Those of the scene before; the server, which hears of the new one later, says the same.
+        self._settings = replace(self._settings, sliders=())
+        self._acting.sliders = ()
+        self._cameras.look_again()
+        self._steps.new_scene()
+        tell(Loaded(opened.description, opened.first, opened.milliseconds, report))
+        # The past begins with the reset, and what a first step is taken back to is this.
+        resumed = report is not None and report.level == "restarted" and bool(report.carried)
+        mask = np.ones(opened.env.num_envs, bool)
+        self._send_step(opened.first, mask, opened.env.episode_seeds, resumed=resumed)
+        if before is not None:
+            before.env.close()
+
+    def _listen_for_debugger(self, request: ListenForDebugger) -> None:
+        try:
+            listen_for_debugger(request.port, self._pulse.hold)
+        except CannotDebug as error:
+            print(f"workbench: no debugger can attach: {error}", file=sys.stderr)
+            return
+        print(f"workbench: {listening_for_a_debugger(request.port, request.wait)}", file=sys.stderr)
+        if request.wait:
+            self._pulse.begin("waiting for a debugger")
+            wait_for_debugger(self._pulse.hold)
+
+    def _play(self, request: Play) -> None:
+        self._playing = request.playing and self._held.opened is not None
+        self._pacer.start(time.monotonic())
+        self._rate.clear()
+        self._send_status(None)
+
+    def _reset(self, request: Reset) -> None:
+        if self._held.opened is not None:
+            seeds = self._seeds(request)
+            self._held.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
+
+    def _seeds(self, request: Reset) -> int | list[int] | None:
+        # The random actions start again with the seed, or "reset" would not repeat an episode.
+        if request.seed is not None:
+            self._acting.seed(request.seed)
+        count = 0 if request.env_idx is None else len(request.env_idx)
+        return self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
+
+    def _change(self, new: Settings) -> None:
+        old, self._settings = self._settings, new
+        if new.speed != old.speed:
+            self._pacer.speed = new.speed
+            self._pacer.start(time.monotonic())
+        self._acting.sliders = new.sliders
+        self._cameras.watch(new.selected_env, new.cameras)
+        if (new.action_source, new.policy, new.policy_folder) != (
+            old.action_source,
+            old.policy,
+            old.policy_folder,
+        ):
+            self._held.at_work("importing the policy", self._take_actions)
+
+    def _take_actions(self) -> bool:
+        """From where the settings say. Whether they can be had from there."""
+        s = self._settings
+        try:
+            beside = None if s.policy_folder is None else Path(s.policy_folder)
+            self._acting.use(s.action_source, s.policy, beside)
+        except TaskError as error:
+            self._held.drop_steps_if_left(error)
+            # Before a task is loaded it would pass for a failure of the load; the first step says it.
+            if self._held.opened is not None:
+                self._held.fail(error.problem)
+            return False
+        return True
+
+    def _read_policy_again(self, request: ReadPolicyAgain) -> None:
+        if self._take_actions() and request.play and not self._playing:
+            self._play(Play(True))
+
+    def _inspect(self, request: Inspect) -> None:
+        # The page asked while another version, with fewer envs, was on its way.
+        if self._held.opened is not None and request.env < self._held.opened.env.num_envs:
+            self._line.send(inspect_env(self._held.opened.env, request.env, request.sections))
+
+    def _stop(self, request: Quit) -> None:
+        self._quit = True
+
+    # --- stepping ----------------------------------------------------------------------------------
+
+    def _control_step(self) -> None:
+        self._held.guarded(self._step_once)
+
+    def _step_once(self, opened: OpenedTask) -> None:
+        if opened.env.observes_pictures:
+            self._cameras.settle()  # the observation is about to draw the same scene
+        step = step_checked(opened.env, opened.loaded, self._acting.next_action(opened.env))
+        self._rate.tick(time.monotonic())
+        self._send_step(step, np.zeros(opened.env.num_envs, bool))
+        ended = np.flatnonzero(step.terminated | step.truncated)
+        if len(ended) == 0:
+            return
+        if self._settings.episode_end == "reset":
+            self._reset_envs(opened, tuple(int(i) for i in ended), self._acting.fresh_seeds(len(ended)))
+        elif self._settings.episode_end == "pause":
+            self._pause()
+
+    def _reset_envs(
+        self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
+    ) -> StepResult:
+        self._cameras.finish_picture()  # a reset may build the scene anew
+        step = self._reset_with_seeds(opened, env_idx, seed)
+        self._cameras.put_back()
+        self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
+        return step
+
+    def _reset_with_seeds(
+        self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
+    ) -> StepResult:
+        """Reset these envs: those that are recorded each alone, so that its seed gives the same start anywhere.
+
+        What envs that are reset together draw from torch's generator hangs on all of them, and on the first one's seed.
+        """
+        every = range(opened.env.num_envs) if env_idx is None else env_idx
+        alone = [env for env in every if env in self._steps.recorded] if len(every) > 1 else []
+        if seed is None or not alone:
+            return reset_checked(opened.env, opened.loaded, seed, env_idx)
+        seeds = dict(
+            zip(every, range(seed, seed + len(every)) if isinstance(seed, int) else seed, strict=True)
+        )
+        step = None
+        if env_idx is None:
+            step = reset_checked(
+                opened.env, opened.loaded, seed
+            )  # what only a reset of all does: a new scene
+        elif rest := [env for env in every if env not in alone]:
+            step = reset_checked(opened.env, opened.loaded, [seeds[env] for env in rest], rest)
+        for env in alone:
+            step = reset_checked(opened.env, opened.loaded, [seeds[env]], [env])
+        assert step is not None
+        return step
+
+    def _go(self, request: Restore | StepBack, opened: OpenedTask) -> None:
+        self._cameras.settle()  # the envs get new scenes, with the same entities, and may make steps
+        try:
+            if isinstance(request, Restore):
+                step, restored = go_back(opened, request, self._tell_now_and_then(going_back))
+            else:
+                tell = self._tell_now_and_then(partial(going_there, request))
+                step, restored = step_back(opened, request, tell)
+        except TaskError:
+            self._held.back_to_the_moment()
+            raise
+        finally:
+            self._cameras.put_back()
+        self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
+        self._send_status(None)
+
+    def _tell_now_and_then(self, words: Callable[..., str]) -> Callable[..., None]:
+        """What tells how far a long way is, in `words` of its arguments."""
+        return now_and_then(lambda *done: self._send_status(None, words(*done)), _STATUS_PERIOD)
+
+    def _send_step(
+        self,
+        step: StepResult,
+        reset_mask: np.ndarray,
+        seeds: np.ndarray | None = None,
+        restored: Restored | None = None,
+        resumed: bool = False,
+    ) -> None:
+        assert self._held.opened is not None
+        self._last = step
+        if self._steps.pictures_due(step, reset_mask):
+            self._cameras.settle()  # the same scene is about to be drawn
+        acted_by = "" if restored else self._acting.name
+        event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored, acted_by, resumed)
+        self._cameras.scene_changed()
+        self._line.send(event)
+
+    # --- what the server is told besides -----------------------------------------------------------
+
+    def _pause(self) -> None:
+        self._playing = False
+        self._send_status(None)
+
+    def _on_first_picture(self, there: bool) -> None:
+        if not there:
+            self._send_status(None, "compiling the renderer's shaders, once")
+            return
+        self._pacer.start(time.monotonic())
+        self._send_status(None)
+
+    def _send_status(self, now: float | None, activity: str = "") -> None:
+        """Every quarter of a second while playing, or at once when `now` is None."""
+        moment = time.monotonic()
+        if now is not None and (not self._playing or now - self._status_sent < _STATUS_PERIOD):
+            return
+        self._status_sent = moment
+        steps = self._rate.per_second(moment) if self._playing else 0.0
+        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
+
+    def _tell_of_rules(self) -> None:
+        """What the task that is held has broken, if that is something else than was told."""
+        self._rules_sent = time.monotonic()
+        opened = self._held.opened
+        rules = None if opened is None else opened.env.broken_rules
+        serial = rules, 0 if rules is None else rules.serial
+        if serial == self._rules_serial:
+            return
+        self._rules_serial = serial
+        rows, more = ((), 0) if rules is None else (rules.rows, rules.more)
+        known = {row.key for row in self._rules_told.rows}
+        told = RulesBroken(rows, more, tuple(row for row in rows if row.key not in known))
+        if told.rows or self._rules_told.rows:
+            self._line.send(told)
+        self._rules_told = told
+
+
+def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
+    """(N,) True for these envs; for all where it is None."""
+    mask = np.zeros(opened.env.num_envs, bool)
+    mask[slice(None) if env_idx is None else list(env_idx)] = True
+    return mask
+
+
+_DOING: dict[type, Doing] = {
+    Load: "loading",
+    RunCameras: "loading",
+    SingleStep: "stepping",
+    Reset: "resetting",
+    Restore: "resetting",
+    StepBack: "resetting",
+    ReadPolicyAgain: "importing the policy",
+    WarmUp: "warming up",
+    ListenForDebugger: "starting",
+}
+"""The requests and questions that may run the author's code, or take long for other reasons."""
+
+
+def work(connection: int, pulse: PulseWriter) -> None:
+    """The life of the process; `connection` is the file descriptor of its end of the socket pair."""
+    # The tensors hold a few thousand numbers: threads over them only wait for each other (measured:
+    # 16 PickCube envs ran 2.8 times faster with one thread than with two).
+    torch.set_num_threads(1)
+    mark_camera_configs()
+    nobody_presses_ctrl_c()
+    Worker(connection, pulse).run()

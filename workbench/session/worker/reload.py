@@ -1,0 +1,340 @@
+"""From the version that runs to the version that was saved, with as much of the moment as can be kept.
+
+Three things can happen to the env. It stays, and gets the new class (``patched``, and ``cameras`` with the cameras
+made anew). Or another is built beside it, and takes over its state by name (``rebuilt``). Or it has gone with its
+worker, and a new one takes over a snapshot that the server kept (``restarted``). Whichever it is, the new version
+must first show that it works: on a copy of the present moment where only what looks at it changed, with a reset and a
+step (which are undone) where those changed too. What fails leaves everything as it was, and raises.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.authoring.loading.load import LoadedTask, Refused, load_task, take_back, with_late_imports
+from workbench.authoring.loading.modules import read_source
+from workbench.authoring.loading.reference import class_beside
+from workbench.authoring.problem import Interrupted, TaskError
+from workbench.authoring.reload.call_graph import line_in
+from workbench.authoring.reload.inherited import inherited_by
+from workbench.authoring.reload.level import RESET_HOOKS, Change, find_change
+from workbench.core.broken_rule import BrokenRules
+from workbench.core.cameras.render import list_cameras
+from workbench.core.env import actions
+from workbench.core.env.hot_swap import (
+    can_exchange_cameras,
+    exchange_cameras,
+    keep_observation_space,
+    put_class,
+    rehearse_hooks,
+)
+from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.maniskill_private import task_class
+from workbench.core.rules import Finding
+from workbench.core.snapshots.snapshot import RestoreReport, Snapshot, restore_snapshot
+from workbench.jobs.open_task import (
+    Clock,
+    OpenedTask,
+    Opening,
+    blamed,
+    build_task,
+    import_task,
+    notices_of,
+    reset_checked,
+    returns_check,
+    with_advice,
+)
+from workbench.session.protocol.messages import Load, ReloadReport
+
+
+@dataclass(frozen=True)
+class Running:
+    """The version that runs now."""
+
+    request: Load
+    """How it was loaded."""
+    opened: OpenedTask
+    last: StepResult
+    """The present moment."""
+
+
+class _MustRebuild(Exception):
+    """Why the new code does not fit the live env after all."""
+
+
+def load_version(
+    request: Load,
+    running: Running | None,
+    opening: Opening | None = None,
+) -> tuple[OpenedTask, ReloadReport | None]:
+    """Load the task, or the version of it that is on disk now, keeping what can be kept of `running`.
+
+    With the levels ``same``, ``patched`` and ``cameras`` the env of the result is that of `running`; with the
+    others it is another, and closing the old one is the caller's. No picture may be under way.
+
+    Raises:
+        TaskError: the version does not work; `running` is as it was.
+    """
+    opening = opening or Opening(begins_anew=True)
+    before = None if running is None else with_late_imports(running.opened.loaded)
+    loaded = import_task(request.task, request.options, request.source, opening)
+    try:
+        return _bring_in(request, running, before, loaded, opening)
+    except TaskError as error:
+        # The author of a task that runs knows what else is in the file, and so does a person who chose one in it.
+        knows_others = False
+        if running is None:
+            found = _another(request, loaded, error, opening)
+            if found is not None:
+                return found, None
+        else:
+            same = running.opened.loaded.chosen == loaded.chosen
+            knows_others = same or not loaded.alternatives
+            if same and not isinstance(error.__cause__, _MAY_BE_OF_THE_BATCH):
+                raise  # a slip in a name is told at once
+        raise with_advice(
+            error,
+            loaded,
+            request.options,
+            lambda: load_task(request.task, source=request.source),
+            knows_others,
+        ) from error.__cause__
+
+
+_MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
+"""What torch and numpy raise over shapes, of which one env may have none."""
+
+
+def _another(request: Load, tried: LoadedTask, error: TaskError, opening: Opening) -> OpenedTask | None:
+    """The first other task of a file that opens, where any will do; None if there is none."""
+    if not request.any_task or isinstance(error.__cause__, Interrupted) or tried.file is None:
+        return None
+    for name in tried.alternatives:
+        opening.on_activity(f"trying {name}")
+        loaded = load_task(class_beside(request.task, tried.file, name), source=request.source)
+        loaded = replace(loaded, in_place_of=Refused(tried.chosen, str(error)))
+        try:
+            return build_task(loaded, request.options, replace(opening, clock=Clock()))
+        except TaskError as further:
+            take_back(loaded)
+            if isinstance(further.__cause__, Interrupted):
+                raise
+        except BaseException:
+            take_back(loaded)
+            raise
+    return None
+
+
+def _bring_in(
+    request: Load,
+    running: Running | None,
+    before: LoadedTask | None,
+    loaded: LoadedTask,
+    opening: Opening,
+) -> tuple[OpenedTask, ReloadReport | None]:
+    try:
+        change = _what_changed(request, running, before, loaded)
+        if running is not None and change.level != "rebuilt":
+            try:
+                opening.on_activity("trying the new version")
+                return _exchange(running, loaded, change, opening.clock)
+            except _MustRebuild as why:
+                change = replace(change, level="rebuilt", reason=str(why))
+        return _build(request, running, loaded, change, opening)
+    except BaseException:
+        # The last good version must not go on with the new one's helper modules and registrations.
+        take_back(loaded)
+        raise
+
+
+# --- which level -----------------------------------------------------------------------------------
+
+
+def _what_changed(
+    request: Load, running: Running | None, before: LoadedTask | None, loaded: LoadedTask
+) -> Change:
+    if running is None or before is None:
+        return Change("rebuilt", "")
+    if not loaded.followed:
+        return Change("rebuilt", "it was asked for")
+    if loaded.file is not None and before.file != loaded.file:
+        return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.chosen}")
+    if before.chosen != loaded.chosen:
+        return Change("rebuilt", f"{loaded.chosen} is another task than {before.chosen}")
+    if before.env_id != loaded.env_id:
+        return Change("rebuilt", _registered_otherwise(before, loaded))
+    if replace(running.request.options, seed=0) != replace(request.options, seed=0):
+        return Change("rebuilt", "the options changed")
+    files = {*before.source, *loaded.source}
+    inherited = inherited_by(loaded.cls, files)
+    texts = {**_still_there(before, request), **loaded.source}
+    change = find_change(before.source, texts, str(loaded.file), loaded.class_name, inherited)
+    if loaded.robot is not None and change.level != "same":
+        return Change("rebuilt", f"a robot is part of the scene ({change.reason})")
+    if request.level in ("auto", change.level):
+        return change
+    said = f"{request.level} was asked for"
+    if request.level != "rebuilt":
+        said += f" ({change.level} would have been chosen: {change.reason})"
+    # What was not found safe is tried as if everything had changed.
+    hooks = change.hooks if change.level in ("patched", "cameras") else RESET_HOOKS
+    return Change(request.level, said, hooks)
+
+
+def _registered_otherwise(before: LoadedTask, loaded: LoadedTask) -> str:
+    """Of one class with another id; an unregistered one goes by its own name."""
+    if loaded.env_id == loaded.class_name:
+        lost = "" if before.max_episode_steps is None else ", and so has no time limit"
+        return f"{loaded.chosen} is not registered as {before.env_id} any more{lost}"
+    if before.env_id == before.class_name:
+        return f"{loaded.chosen} is registered as {loaded.env_id} now"
+    return f"{loaded.chosen} is registered as {loaded.env_id} now, and not as {before.env_id}"
+
+
+def _still_there(before: LoadedTask, request: Load) -> dict[str, str]:
+    """Modules that the version before imported inside its hooks, which the new one may do as well."""
+    texts: dict[str, str] = {}
+    for path in before.source:
+        given = (request.source or {}).get(path)
+        try:
+            texts[path] = given if given is not None else read_source(path)
+        except (OSError, SyntaxError):
+            continue
+    return texts
+
+
+# --- the env stays -----------------------------------------------------------------------------------
+
+
+def _exchange(
+    running: Running, loaded: LoadedTask, change: Change, clock: Clock
+) -> tuple[OpenedTask, ReloadReport]:
+    opened, env = running.opened, running.opened.env.env
+    if change.level == "cameras" and not can_exchange_cameras(env):
+        raise _MustRebuild(f"{change.reason}, and GPU simulation cannot exchange cameras")
+    before = task_class(env)
+    rules = opened.env.broken_rules or BrokenRules({})
+    kept_rules = rules.copy()
+    put_class(env, loaded.cls)
+    left: dict[str, str] = {}
+    try:
+        if change.level != "same":
+            rules.edited(lambda row: _place_now(row, opened.loaded, loaded))
+        task = TaskEnv(
+            env,
+            loaded.max_episode_steps,
+            check=returns_check(loaded, opened.env.num_envs),
+            obs=opened.env.obs,
+        )
+        if change.level == "cameras":
+            with blamed("build", loaded, task):
+                exchange_cameras(env)
+        if change.tried_hooks:
+            resets = "_initialize_episode" in change.tried_hooks
+            with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
+                left = rehearse_hooks(env, change.tried_hooks)
+        clock.lap("rehearse")
+        first = running.last if change.level == "same" else _judge(task, loaded, running.last, change)
+        if change.level != "same":
+            keep_observation_space(env, task.obs)
+    except BaseException:
+        put_class(env, before)
+        rules.put_back(kept_rules)
+        if change.level == "cameras":
+            exchange_cameras(env)
+        raise
+    clock.lap("judge")
+    loaded = with_late_imports(loaded)
+    description = replace(
+        opened.description,
+        source_files=tuple(str(path) for path in loaded.source_files),
+        source_hash=loaded.source_hash,
+        source=dict(loaded.source),
+        max_episode_steps=loaded.max_episode_steps,
+        chosen=loaded.chosen,
+        others=loaded.others,
+        in_place_of=None,
+        notices=notices_of(loaded, running.request.options),
+    )
+    if change.level == "cameras":
+        description = replace(description, cameras=list_cameras(env))
+    report = ReloadReport(change.level, change.reason, not_carried=left)
+    return OpenedTask(loaded, task, description, first, clock.laps), report
+
+
+def _place_now(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str, int] | None:
+    """Where a row's line is in the new version; None where its function says something else now."""
+    if row.file is None or row.line is None or row.file not in before.source:
+        return None if row.file is None else (row.file, row.line or 1)
+    text = after.source.get(row.file)
+    line = None if text is None else line_in(before.source[row.file], text, row.line)
+    return None if line is None else (row.file, line)
+
+
+def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
+    # Without an action no reward is given; it is computed all the same, or its mistakes would come out later.
+    action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
+    try:
+        with blamed("step", loaded, task):
+            judged = task.judge(action)
+    except TaskError as error:
+        if change.hooks & RESET_HOOKS:
+            raise _MustRebuild(
+                f"{change.reason}, and this moment lacks what a reset makes now ({error.problem.message})"
+            ) from error
+        raise
+    if last.action is None:
+        return replace(judged, reward=np.zeros_like(judged.reward), action=None)
+    return judged
+
+
+# --- another env ---------------------------------------------------------------------------------------
+
+
+def _build(
+    request: Load, running: Running | None, loaded: LoadedTask, change: Change, opening: Opening
+) -> tuple[OpenedTask, ReloadReport | None]:
+    snapshot = _moment(request, running, loaded)
+    opened = build_task(loaded, request.options, opening)
+    if snapshot is None:
+        report = ReloadReport("rebuilt", change.reason) if running is not None else None
+        return opened, report
+    action = None if running is None else running.last.action
+    try:
+        first, restored = _restore(opened, snapshot, action)
+    except TaskError as error:
+        # The new version works, as its rehearsal has shown; only not from this moment on.
+        first = reset_checked(opened.env, opened.loaded, request.options.seed)
+        restored = RestoreReport((), {"the moment": f"the new version fails in it: {error.problem.message}"})
+    except BaseException:
+        opened.env.close()
+        raise
+    opening.clock.lap("restore")
+    level = "restarted" if running is None else "rebuilt"
+    reason = change.reason if running is not None else "the worker was started anew"
+    report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried))
+    return replace(opened, first=first, milliseconds=opening.clock.laps), report
+
+
+def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snapshot | None:
+    """What is to be shown after the build; None for a fresh episode."""
+    if request.snapshot is not None:
+        return pickle.loads(request.snapshot)
+    if running is None or running.opened.loaded.chosen != loaded.chosen:
+        return None
+    return running.opened.env.snapshot()
+
+
+def _restore(
+    opened: OpenedTask, snapshot: Snapshot, action: np.ndarray | None
+) -> tuple[StepResult, RestoreReport]:
+    task = opened.env
+    there = [i for i in snapshot.env_idx if i < task.num_envs]
+    fits = action is not None and action.shape == (task.num_envs, actions.width(task.parts))
+    with blamed("reset", opened.loaded, task):
+        report = restore_snapshot(task.env, snapshot, there)
+        return task.judge(action if fits else None), report

@@ -1,0 +1,1 @@
+"""The two pages put together, and the ways between them."""

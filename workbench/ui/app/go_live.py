@@ -1,0 +1,304 @@
+"""From the review into the live env, and back: what "Go on live from here" opens, in which code, and the way there.
+
+Where the recording's task is open already, its env (or all) is put into the recorded state; else another session is
+opened for it beside the one that is open. The review stays, and says what it waits for, until the env stands in that
+state, or until only the live page can help: the task's code failed, or may have to be interrupted. Sessions that are
+opened here are closed here, with the folder of a recorded text.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import viser
+
+from workbench.authoring.loading.reference import TaskName
+from workbench.core.capture.recorded_run import RecordedRun
+from workbench.jobs.from_recording import (
+    CannotStepIn,
+    options_of,
+    reference_of,
+    run_of,
+    why_not_into,
+    write_source,
+)
+from workbench.jobs.task import TaskOptions
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.side_files import side_files_in_words
+from workbench.session.clearance import Clearances, NotCleared, Wanted
+from workbench.session.live.session import Session
+from workbench.session.review.view import ReviewView
+from workbench.ui.live.banners import is_busy_for_long
+from workbench.ui.review.rescore import RECORDED, TODAYS
+from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import render, sentence
+
+if TYPE_CHECKING:
+    from workbench.ui.app.workplace import Workplace
+
+
+ONE, ALL = "the selected env", "all envs"
+NEW_ENVS = 4
+"""Envs of a session that is opened for all of them."""
+
+
+MakeSession = Callable[[TaskName, TaskOptions], Session]
+
+
+@dataclass
+class _Way:
+    """From a recording to a live env."""
+
+    info: EpisodeInfo
+    run: RecordedRun
+    state: int
+    given_up: threading.Event = field(default_factory=threading.Event)
+    thread: threading.Thread | None = None
+    """Waits for somebody to say that the code may run."""
+    number: int = 0
+    """What `TimelineView.entered` is when it is there."""
+    problems: int = 0
+    session: Session | None = None
+    """That is put into the state; None while somebody is asked. Set last."""
+
+    def is_over(self) -> bool:
+        """Whether the live page has something to show now."""
+        if self.session is None:
+            return False
+        view = self.session.view()
+        arrived = view.timeline.entered == self.number
+        failed = view.problem_serial > self.problems or view.state == "stopped"
+        return arrived or failed or is_busy_for_long(view)
+
+    def words(self) -> str:
+        """What is waited for."""
+        task = self.info.task
+        if self.session is None:
+            return f"asking whether the code of {task} may run"
+        view = self.session.view()
+        if view.task is None:
+            doing = f"loading {task} at step {self.state}"
+        else:
+            doing = f"putting {task} into step {self.state}"
+        return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
+
+
+class StepIn:
+    """Goes live from recordings.
+
+    Args:
+        place: The pages, and the session that is open, if one is.
+        make_session: Opens a task; gets what `Session` gets.
+        clearances: Say what of the code that recordings name may run.
+        base: What is the same for all that is opened.
+    """
+
+    def __init__(
+        self,
+        place: Workplace,
+        make_session: MakeSession,
+        clearances: Clearances,
+        base: TaskOptions,
+    ) -> None:
+        self._place, self._make, self._clearances, self._base = place, make_session, clearances, base
+        self._first = place.session
+        self._lock = threading.Lock()
+        self._own: tuple[Session, Path | None] | None = None
+        self.recorded_source, self.everywhere = False, False
+        self._way: _Way | None = None
+
+    def go(self, id: str, state: int) -> None:
+        """Go on live from a state of an opened recording; on the way there, stay in the review after all."""
+        if self._way is not None:
+            self._give_up()
+            return
+        review = self._place.shelf.review.view()
+        one = next((one for one in review.opened if one.id == id), None)
+        if one is None:
+            return
+        try:
+            run = run_of(one.episode, state)
+        except CannotStepIn as error:
+            self._say(str(error))
+            return
+        info = one.episode.info
+        if (why := self._clearances.why_not_its_arguments(info)) is not None:
+            self._say(sentence(why))
+            return
+        if self.recorded_source:
+            run = replace(run, name=f"{run.name} as it was recorded")
+        self._way = way = _Way(info, run, state)
+        there = None if self.recorded_source else self._open_already(info)
+        if there is not None:
+            self._enter(there, way)
+            return
+        wanted = Wanted(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
+        # An answer may take long, and this is one of the few threads that the page's buttons have.
+        way.thread = threading.Thread(
+            target=self._clear_and_go, args=(way, wanted), name="clear", daemon=True
+        )
+        way.thread.start()
+
+    def _open_already(self, info: EpisodeInfo) -> Session | None:
+        """A session that has this task open, in today's code."""
+        with self._lock:
+            session = self._place.session
+            if session is not None and (self._own is None or self._own[1] is None):
+                task = session.view().task
+                if task is None or not why_not_into(task, info):
+                    return session
+            known = self._first if self._first is not session else None
+            task = None if known is None else known.view().task
+            return known if task is not None and not why_not_into(task, info) else None
+
+    def _clear_and_go(self, way: _Way, wanted: Wanted) -> None:
+        folder: Path | None = None
+        try:
+            reference = self._clearances.clear(wanted, way.given_up.is_set)
+            if wanted.recorded_text:
+                folder, reference = write_source(wanted.info)
+        except (CannotStepIn, NotCleared) as error:
+            if not way.given_up.is_set():
+                self._say(sentence(str(error)))
+            if self._way is way:
+                self._way = None
+            return
+        with self._lock:
+            if way.given_up.is_set():
+                if folder is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
+                return
+            session = self._open(reference, options_of(wanted.info, self._count(), self._base), folder)
+        self._enter(session, way)
+
+    def _enter(self, session: Session, way: _Way) -> None:
+        self._place.session = session
+        way.problems = session.view().problem_serial
+        way.number = session.step_back(way.run, self.everywhere, way.info.source_file, way.info.source)
+        way.session = session
+
+    def _give_up(self) -> None:
+        way, self._way = self._way, None
+        if way is not None:
+            way.given_up.set()
+
+    def going(self) -> str:
+        """What is waited for on the way to the live env; empty while nobody is on it."""
+        way = self._way
+        return "" if way is None else way.words()
+
+    def change_pages_when_there(self) -> None:
+        way = self._way
+        if way is not None and way.is_over():
+            self._way = None
+            self._place.pages.show("live")
+
+    def review_is_back(self) -> None:
+        """The page of recordings is shown anew: nobody is on the way any more who is not asked something."""
+        if self._way is not None and self._way.session is not None:
+            self._way = None
+
+    def can_go_home(self) -> bool:
+        """Whether another session is live than the one that was opened first."""
+        return self._first is not None and self._place.session is not self._first
+
+    def go_home(self) -> None:
+        """Back to the session that was opened first; the other ends."""
+        if self._first is None:
+            return
+        self._place.session = self._first
+        self._place.pages.show("live")
+        with self._lock:
+            self._let_go()
+
+    def close(self) -> None:
+        """End what was opened here; the pages must be stopped."""
+        way = self._way
+        self._give_up()
+        if way is not None and way.thread is not None:
+            way.thread.join()
+        with self._lock:
+            own, self._own = self._own, None
+        if own is not None:
+            _end(*own)
+
+    def _count(self) -> int:
+        return NEW_ENVS if self.everywhere else 1
+
+    def _open(self, reference: TaskName, options: TaskOptions, folder: Path | None) -> Session:
+        if self._first is not None:
+            self._first.pause()
+        session = self._make(reference, options)
+        self._let_go()
+        self._own = session, folder
+        return session
+
+    def _let_go(self) -> None:
+        """End the session that was opened here. Its page, if that is shown, is taken away before it is missed."""
+        if self._own is not None:
+            threading.Thread(target=_end, args=self._own, name="end-session", daemon=True).start()
+        self._own = None
+
+    def _say(self, text: str) -> None:
+        tell_all(self._place.server, "This recording cannot be gone into", text, "red")
+
+
+class StepInPart(PagePart[ReviewView]):
+    """How to go live: the code, and into which envs."""
+
+    def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
+        self._step_in = step_in
+        step_in.review_is_back()
+        self._about: object = None
+        """Which recording and code the note below the code was made for."""
+        gui = server.gui
+        self._folder = gui.add_folder("Going on live", expand_by_default=False, visible=False)
+        with self._folder:
+            self._code = gui.add_dropdown(
+                "Code",
+                (TODAYS, RECORDED),
+                initial_value=RECORDED if step_in.recorded_source else TODAYS,
+                hint="Today's code of the task, or the recorded text, opened from a folder that goes when you are done",
+            )
+            self._besides = gui.add_html("")
+            self._envs = gui.add_dropdown(
+                "Into",
+                (ONE, ALL),
+                initial_value=ALL if step_in.everywhere else ONE,
+                hint="Which envs are put into the recorded state",
+            )
+            self._home = gui.add_button(
+                "Back to the task opened first", icon=viser.Icon.ARROW_BACK_UP, visible=False
+            )
+        self._code.on_update(lambda _: self._chosen())
+        self._envs.on_update(lambda _: self._chosen())
+        self._home.on_click(lambda _: step_in.go_home())
+
+    def draw(self, view: ReviewView) -> None:
+        self._step_in.change_pages_when_there()
+        home = self._step_in.can_go_home()
+        self._folder.visible = bool(view.opened) or home
+        self._home.visible = home
+        info = None if view.chosen is None else view.chosen.episode.info
+        if self._about != (info and info.id, self._step_in.recorded_source):
+            self._about = info and info.id, self._step_in.recorded_source
+            words = ""
+            if info is not None and self._step_in.recorded_source:
+                words = side_files_in_words(info.source_file, info.side_files)
+            self._besides.content = render("note", text=words) if words else ""
+
+    def _chosen(self) -> None:
+        self._step_in.recorded_source = self._code.value == RECORDED
+        self._step_in.everywhere = self._envs.value == ALL
+
+
+def _end(session: Session, folder: Path | None) -> None:
+    session.close()
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)

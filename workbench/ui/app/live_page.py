@@ -1,0 +1,309 @@
+"""The page: its parts put together, and redrawn as the session goes on (`redraw_loop`).
+
+Whenever the session has something new, one immutable snapshot is taken, and every part compares it with
+what it drew last. So a part is a function of the snapshot, nothing is sent twice, and callbacks of the
+page, which run in any thread and any order, only ever ask the session for something.
+
+With no page open nothing is drawn, and the session is told so that it renders nothing either.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import viser
+
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
+from workbench.ui.cameras.panel import CamerasPanel
+from workbench.ui.cameras.studio import StudioPanel
+from workbench.ui.live.banners import Banner, BusyBanner
+from workbench.ui.live.env_panel import EnvPanel
+from workbench.ui.live.episodes_panel import RecordPanel
+from workbench.ui.live.inspect_panel import ForceArrows, InspectPanel
+from workbench.ui.live.log_panel import LogPanel
+from workbench.ui.live.rescored import JudgedAbove, JudgementPanel
+from workbench.ui.live.reward import CurvesPanel, NumbersPanel
+from workbench.ui.live.run_panel import RunPanel
+from workbench.ui.live.status_line import RulesMark, StatusLine
+from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
+from workbench.ui.live.timeline import TimelinePanel
+from workbench.ui.live.version_panel import VersionPanel
+from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
+from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
+from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.widgets.parts import Clock, PagePart, Parts
+from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
+from workbench.ui.widgets.templates import render
+
+PANEL_WIDTH = 340
+ENVS_WIDTH = 520
+
+
+class Page:
+    """The workbench's page on this server, showing this session.
+
+    Args:
+        server: Of viser, already behind its door.
+        session: What is shown and asked.
+        dark: How it begins.
+        on_review: Called when a person wants to see the recordings.
+        stage: The 3-D view; None makes one.
+        commands: Of the program; in the palette as well.
+        clock: That the parts of the page go by.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        dark: bool = True,
+        on_review: Callable[[], None] = lambda: None,
+        stage: Stage | None = None,
+        commands: tuple[Command, ...] = (),
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self._server = server
+        self._session = session
+        self._clock = clock
+        self._on_review = on_review
+        self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
+        self._layout: EnvLayout | None = None
+        self._scene_serial = -1
+        self._built: tuple[bool, int] | None = None
+        self._waits_for_human = False
+        stage = stage or Stage(server)
+        self._scene, self._framing = stage.scene, stage.framing
+
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(PANEL_WIDTH)
+        server.gui.set_panel_label("Workbench")
+
+        status = StatusLine(
+            server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
+        )
+        self._rules = RulesMark(server)
+        run_tab, in_tabs = self._add_tabs(dark)
+        self._timeline = TimelinePanel(server, session, clock)
+        self._add_table_of_envs()
+        banner = Banner(server, session.versions.reload, session.versions.restart_worker)
+        busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker)
+        floating = self._envs, self._timeline, banner, busy_banner
+        self._parts = Parts((status, self._rules, *in_tabs, *floating), clock)
+
+        self._mark = SelectionMark(server)
+        self._frustums = CameraFrustums(server)
+        self._forces = ForceArrows(server)
+        commands = (*self._commands(), *commands)
+        register(server, commands)
+        with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
+            server.gui.add_html(render("keys", commands=commands))
+        server.scene.on_click()(self._on_scene_click)
+
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
+        """Returns the Run tab, which other parts put something into, and what is in all of them."""
+        server, session, clock, on_review = self._server, self._session, self._clock, self._on_review
+        tabs = server.gui.add_tab_group()
+        run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
+        with run_tab:
+            self._run = RunPanel(server, session)
+            self._view_panel = ViewPanel(server, dark)
+            version = VersionPanel(server, session)
+        with tabs.add_tab("Cameras", viser.Icon.CAMERA):
+            self._cameras = CamerasPanel(
+                server,
+                lambda cameras: session.change(cameras=cameras),
+                studio_shows=lambda: self._studio.shows,
+                clock=clock,
+            )
+        with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
+            self._studio = StudioPanel(server, session, clock)
+        with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
+            reward = [
+                NumbersPanel(server),
+                JudgedAbove(server),
+                CurvesPanel(server),
+            ]
+            self._judgement = JudgementPanel(server, session)
+        with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
+            self._inspect = InspectPanel(server, session, clock)
+        with tabs.add_tab("Episodes", viser.Icon.MOVIE):
+            self._record = RecordPanel(server, session)
+            review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
+            review.on_click(lambda _: on_review())
+        with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
+            log = LogPanel(server, session.clear_printed)
+        on_run = self._run, self._view_panel, version
+        return run_tab, [*on_run, self._studio, *reward, self._judgement, self._inspect, self._record, log]
+
+    def _add_table_of_envs(self) -> None:
+        self._env_window = self._server.gui.add_panel(order=5.0)
+        with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
+            self._envs = EnvPanel(self._server, self._session)
+        self._env_window.dock_left()
+        self._env_window.set_width(ENVS_WIDTH)
+        # A strip at the edge until somebody wants it: it takes half of a small screen's view.
+        self._env_window.minimize()
+        self._envs_open = False
+
+    # --- life ------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Draw it, and go on with that in a thread of its own."""
+        self._loop.start()
+
+    def stop(self) -> None:
+        """Stop to redraw; returns when the loop has ended."""
+        self._loop.stop()
+        # The session may live on under another page, and nobody looks at what it would render.
+        self._session.set_clients(0)
+
+    @property
+    def dark(self) -> bool:
+        return self._view_panel.dark
+
+    def redraw(self) -> None:
+        """Draw the session as it is now."""
+        view = self._session.view()
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
+
+    def _draw_panels(self, view: SessionView) -> None:
+        self._parts.draw(view)
+        self._cameras.draw(view.seen)
+
+    def _toggle_envs(self) -> None:
+        self._envs_open = not self._envs_open
+        if self._envs_open:
+            self._env_window.expand()
+        else:
+            self._env_window.minimize()
+
+    def _count_clients(self) -> int:
+        count = self._framing.follow()
+        self._session.set_clients(count)
+        return count
+
+    # --- the 3-D view ----------------------------------------------------------------------------
+
+    def _draw_scene(self, view: SessionView) -> None:
+        task, step, seen = view.task, view.step, view.seen
+        if (
+            task is None
+            or step is None
+            or seen is None
+            or step.poses.shape[:2]
+            != (
+                task.num_envs,
+                len(task.geometry.body_names),
+            )
+        ):
+            # Between two versions a step of the old one may stand beside the new task.
+            return
+        one = self._view_panel.only_selected and task.num_envs > 1
+        env = min(view.selected_env, task.num_envs - 1)
+        if view.scene_serial != self._scene_serial or self._layout is None:
+            self._scene_serial = view.scene_serial
+            self._layout = lay_out(task.geometry, step.poses)
+            self._server.gui.set_panel_label(task.env_id)
+            self._built = None
+        built = (one, self._view_panel.triangles)
+        if built != self._built:
+            self._built = built
+            self._scene.build(
+                task.geometry, self._layout, step.poses, env if one else None, self._view_panel.triangles
+            )
+        self._scene.move(step.poses, self._layout, env if one else None)
+        self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
+        pictures = self._cameras.shown_pictures(seen) if self._cameras.show_frustums else {}
+        alone = one or task.num_envs == 1
+        if alone:
+            pictures = without_the_viewpoint(pictures, view.pictures)
+        offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
+        placed = self._studio.draw_in_view(view, offset)
+        self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
+        self._forces.draw(self._inspect.forces(view), offset)
+        # A scene of another size is framed anew; a reload that keeps the size never moves the view.
+        size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
+        if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
+            self._waits_for_human = alone
+            self.frame(view)
+        if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
+            # The human camera's place comes with its first picture, after the scene.
+            self._waits_for_human = False
+            self.frame(view, untouched_only=True)
+        self._framing.frame_untouched(lambda aspect, height: self._viewpoint(view, aspect, height))
+
+    def frame(self, view: SessionView, untouched_only: bool = False) -> None:
+        """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""
+        if self._layout is not None and view.task is not None:
+            self._framing.frame(lambda aspect, height: self._viewpoint(view, aspect, height), untouched_only)
+
+    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint:
+        assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
+        if self._view_panel.only_selected or view.task.num_envs == 1:
+            human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
+            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV)
+            acting = None
+            if human is None and view.step is not None:
+                acting = acting_box(view.task.geometry, view.step.poses, self._layout)
+            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
+        return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
+
+    def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+        layout, view = self._layout, self._session.view()
+        if layout is None or view.task is None:
+            return
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        if (camera := self._frustums.under_ray(*ray)) is not None:
+            self._studio.select(camera)
+            return
+        if self._view_panel.only_selected:
+            return
+        env = env_under_ray(layout, *ray)
+        if env is not None and env < view.task.num_envs:
+            self._session.change(selected_env=env)
+
+    # --- keys ------------------------------------------------------------------------------------
+
+    def _commands(self) -> list[Command]:
+        session, run, timeline = self._session, self._run, self._timeline
+        judgement = self._judgement
+        return [
+            Command("Review recordings", self._on_review, "V"),
+            Command("Play or pause", run.toggle_play, "space"),
+            Command("Single step", session.step, "S"),
+            Command("Reset all envs", session.reset, "R"),
+            Command("Reset the selected env", run.reset_this, "R", "shift"),
+            Command("Take back the last reset or going back", session.past.undo, "U"),
+            *timeline.commands(),
+            Command("The first moment", timeline.go_to_the_first, "home"),
+            Command("What is live", timeline.go_live, "end"),
+            Command("Go on from here, in the selected env", timeline.go_on, "G"),
+            Command(
+                "To the next episode that is judged otherwise now", lambda: judgement.go_to_difference(1), "J"
+            ),
+            Command(
+                "To the last episode that is judged otherwise now",
+                lambda: judgement.go_to_difference(-1),
+                "J",
+                "shift",
+            ),
+            Command("Next env", lambda: run.select_neighbour(1), "N"),
+            Command("Previous env", lambda: run.select_neighbour(-1), "P"),
+            Command("Open or close the table of envs", self._toggle_envs, "B"),
+            Command("Next env whose last episode failed", lambda: self._envs.select_next("failed"), "E"),
+            Command("Next env with something odd", lambda: self._envs.select_next("flagged"), "E", "shift"),
+            Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
+            Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
+            Command("Start or stop recording", self._record.toggle, "C"),
+            Command("Keep what I just saw", self._record.keep, "C", "shift"),
+            Command("Open or close the list of warnings", self._rules.toggle, "W"),
+            Command("Load the file again", session.versions.reload, "L"),
+            Command("Interrupt what the task is doing", session.interrupt, "I"),
+            Command("Restart the worker", session.versions.restart_worker, "L", "shift"),
+            Command("Dark or light", self._view_panel.toggle_dark, "D"),
+            *self._studio.commands(),
+        ]

@@ -1,0 +1,407 @@
+"""The review: recordings in place of a live env, on the same page, with the same timeline and keys.
+
+It is put together as the live page is: one loop waits until the review has something new, takes a snapshot, and every
+part draws what is new to it. There is no worker and no task file; what is shown comes from the recordings.
+
+It lies where the live one lies and looks the same, but counts forwards: a recording has a beginning and an end, and
+nothing is added to it. With several recordings each has a line of its own on the strip, placed as they are aligned.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import viser
+
+from workbench.core.camera_data import CameraKey, Picture
+from workbench.recording.library.library import Library
+from workbench.session.live.view import Seen
+from workbench.session.protocol.messages import CameraRequest
+from workbench.session.review.events import success_words
+from workbench.session.review.pictures import PictureReader
+from workbench.session.review.review import MOST_OPEN
+from workbench.session.review.view import ReviewView
+from workbench.ui.app.go_live import StepInPart
+from workbench.ui.cameras.panel import CamerasPanel
+from workbench.ui.library.listing import Action
+from workbench.ui.library.panel import LibraryPanel
+from workbench.ui.review.compare import ReviewComparePanel
+from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
+from workbench.ui.review.panel import ReviewPanel
+from workbench.ui.review.rescore import RescorePanel
+from workbench.ui.review.scene import ReviewIn3D
+from workbench.ui.scene.viewpoint import ViewPanel
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
+from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
+from workbench.ui.widgets.templates import render
+
+if TYPE_CHECKING:
+    from workbench.ui.app.workplace import Workplace
+import numpy as np
+
+from workbench.session.review.review import Review
+from workbench.session.review.view import column_at
+from workbench.ui.live.timeline import (
+    LAST_EVENT,
+    LAST_STEP,
+    MOST_MARKS,
+    NEXT_EVENT,
+    NEXT_STEP,
+    TimeBar,
+    strip_values,
+)
+from workbench.ui.review.scene import shown_together
+
+TOLD_EVERY = 0.1
+"""Seconds, while it plays. Faster, numbers cannot be read."""
+PANEL_WIDTH = 340
+LIBRARY_WIDTH = 520
+LEAST_VIEW = 240
+"""Pixels of the view between the library and another panel."""
+NARROW = 700
+"""Pixels of the view beside the library, from which on there is room for both."""
+TOLD_WIDTH = 20.0
+"""Seconds within which a page says how wide its view has become."""
+BACK = "Back to the live env"
+
+
+class ReviewPage:
+    """The review's page.
+
+    Args:
+        place: Of the recordings, and of what can be done with them.
+        dark: How it begins.
+        clock: That the parts of the page go by.
+    """
+
+    def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
+        self._place, self._clock = place, clock
+        self._server, self._review = server, review = place.server, place.shelf.review
+        self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self._look_and_redraw)
+        self._reader = PictureReader()
+        self._requests: tuple[CameraRequest, ...] = ()
+        self._pictures: dict[CameraKey, Picture] = {}
+        self._pictures_serial = 0
+        self._had_opened = tuple(one.id for one in review.view().opened)
+        self._fold_other: Callable[[bool], None] = lambda folded: None
+        """Folds and unfolds the panel of rerun."""
+        self._other_folded = False
+        self._unfolded = "", 0.0
+        """Which of the two panels came into a page last, and when, until something is done about it."""
+        self._told = DrawDue(TOLD_EVERY, clock)
+        self._framing = place.stage.framing
+
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(PANEL_WIDTH)
+        server.gui.set_panel_label("Recordings")
+        self._status = server.gui.add_html("")
+        self._add_way_back()
+        review_tab, in_tabs = self._add_tabs(dark)
+        self._timeline = ReviewTimeline(server, review, clock)
+        self._in_3d = ReviewIn3D(server, review, place.stage)
+        self._parts = Parts((self._panel, self._timeline, *in_tabs), clock)
+        commands = [*self._commands(), *place.commands, *self._library.commands()]
+        register(server, commands)
+        with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
+            server.gui.add_html(render("keys", commands=commands))
+
+    def _add_way_back(self) -> None:
+        if self._place.session is not None:
+            go_back = self._server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP, color="gray")
+            go_back.on_click(lambda _: self._go_back())
+
+    def _go_back(self) -> None:
+        self._place.pages.show("live")
+
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
+        """Returns the Review tab, which another part is put into, and what is in all of them."""
+        server, review, place = self._server, self._review, self._place
+        library, step_in = place.shelf.library, place.step_in
+        tabs = server.gui.add_tab_group()
+        review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
+        with review_tab:
+            self._panel = ReviewPanel(server, review, step_in.go, step_in.going)
+        with tabs.add_tab("Cameras", viser.Icon.CAMERA):
+            self._cameras_note = server.gui.add_html("")
+            self._cameras = CamerasPanel(
+                server, self._want, "This recording has no pictures.", clock=self._clock
+            )
+        with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
+            numbers, curves = ReviewNumbers(server), ReviewCurves(server)
+        with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
+            compare = ReviewComparePanel(server, review)
+        share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
+        with tabs.add_tab("Judge", viser.Icon.GAVEL):
+            self._rescore = RescorePanel(
+                server, place.rescorer, review, library, place.rescore_choices, place.task_files
+            )
+        self._add_library(library)
+        with share_tab:
+            sharing = place.sharing
+            share = sharing.part(server, library, self._library, self._make_way, self._other_unfolded)
+        with review_tab:
+            going = StepInPart(server, step_in)
+            self._view_panel = ViewPanel(server, dark)
+        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
+
+    def _add_library(self, library: Library) -> None:
+        """The table of recordings, in a panel of its own."""
+        self._library_window = self._server.gui.add_panel(order=5.0)
+        with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
+            self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
+            Presses(self._server).when_unfolded(self._library_unfolded)
+        self._library.add_action(
+            Action(
+                "Side by side",
+                "Watch them all at once, each at its own place (Shift Enter)",
+                self._open_side_by_side,
+                MOST_OPEN,
+                "Open the selected recordings side by side",
+                "enter",
+                "shift",
+            )
+        )
+        self._library.add_action(
+            Action(
+                "Judge again", "Run today's reward and evaluate over them (J)", self._rescore.judge_and_tell
+            )
+        )
+        self._library_window.dock_left()
+        self._library_window.set_width(LIBRARY_WIDTH)
+        self._library_open = True
+        self._place.dialog.tell(self._library.leave_keys)
+        if self._had_opened:
+            self._show_library(False)
+
+    # --- life ------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Draw it, and go on with that in a thread of its own."""
+        self._loop.start()
+
+    def stop(self) -> None:
+        """Stop to redraw; returns when the loop has ended."""
+        self._loop.stop()
+        self._library.close()
+
+    @property
+    def dark(self) -> bool:
+        return self._view_panel.dark
+
+    def _has_viewers(self) -> bool:
+        return self._framing.follow() > 0
+
+    def _look_and_redraw(self) -> None:
+        self._review.look_at_files()
+        self.redraw()
+
+    def redraw(self) -> None:
+        """Draw the review as it is now."""
+        view = self._review.view()
+        self._take_pictures(view)
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
+
+    def _draw_panels(self, view: ReviewView) -> None:
+        """While it plays, less often than the 3-D view, and all of them at once: what they say is of one moment."""
+        if not self._told.is_due(object(), urgent=None if view.playing else object()):
+            return
+        self._make_way_for_the_first(view)
+        self._fold_what_crowds()
+        self._status.content = render(
+            "review_status",
+            view=view,
+            going=self._place.step_in.going(),
+            # Those that `library_keys.js` keeps from doing anything while the library is folded.
+            library_keys=" ".join(self._library.keys),
+            success_words=success_words,
+        )
+        self._draw_cameras(view)
+        self._parts.draw(view)
+
+    def _draw_scene(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        cameras = () if chosen is None else self._reader.cameras(chosen.episode)
+        pictures = self._pictures if self._cameras.show_frustums else {}
+        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.triangles, cameras, pictures)
+
+    def _make_way_for_the_first(self, view: ReviewView) -> None:
+        """The library takes half of a small screen: once a recording is open it is a strip at the edge there."""
+        ids = tuple(one.id for one in view.opened)
+        if ids != self._had_opened:
+            self._had_opened = ids
+            if not ids or self._smallest_view() < NARROW:
+                self._show_library(not ids)
+
+    def _make_way(self, fold: Callable[[bool], None]) -> int:
+        self._fold_other = fold
+        width = self._smallest_view() + (LIBRARY_WIDTH if self._library_open else 0)
+        self._show_library(False)
+        return width
+
+    def _smallest_view(self) -> int:
+        """Pixels that the view is wide, on the page on which it is smallest; 0 where nobody looks."""
+        widths = [client.camera.image_width for client in self._server.get_clients().values()]
+        return min((width for width in widths if width), default=0)
+
+    def _show_library(self, shown: bool) -> None:
+        self._library_open = shown
+        self._unfolded = "", 0.0
+        if shown:
+            # While it is folded, the other panel and the view share the width.
+            self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH + LEAST_VIEW
+            if self._other_folded:
+                self._fold_other(True)
+            self._library_window.expand()
+        else:
+            self._library_window.minimize()
+            if self._other_folded:
+                self._other_folded = False
+                self._fold_other(False)
+
+    def _library_unfolded(self) -> None:
+        self._library_open = True
+        self._unfolded = "library", self._clock()
+
+    def _other_unfolded(self) -> None:
+        self._unfolded = "other", self._clock()
+
+    def _fold_what_crowds(self) -> None:
+        """Of two panels that leave no view, the one that was unfolded last is the one that is wanted.
+
+        A page says how wide its view has become some time later, and where rerun is loading that takes seconds.
+        """
+        last, since = self._unfolded
+        if not last or not 0 < self._smallest_view() < LEAST_VIEW:
+            return
+        self._unfolded = "", 0.0
+        if self._clock() - since > TOLD_WIDTH or not self._library_open:
+            return
+        if last == "library":
+            self._other_folded = True
+            self._fold_other(True)
+        else:
+            self._other_folded = False
+            self._show_library(False)
+
+    # --- cameras -----------------------------------------------------------------------------------
+
+    def _want(self, cameras: tuple[CameraRequest, ...]) -> None:
+        self._requests = cameras
+
+    def _take_pictures(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        pictures = (
+            {}
+            if chosen is None
+            else self._reader.pictures(
+                chosen.episode, view.states[view.selected], self._requests, view.selected
+            )
+        )
+        if pictures.keys() != self._pictures.keys() or any(
+            pictures[key] is not known for key, known in self._pictures.items()
+        ):
+            self._pictures, self._pictures_serial = pictures, self._pictures_serial + 1
+
+    def _draw_cameras(self, view: ReviewView) -> None:
+        episode = None if view.chosen is None else view.chosen.episode
+        self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
+        self._cameras.draw(
+            episode
+            and Seen(
+                self._reader.cameras(episode),
+                # Each recording brings its own cameras.
+                view.opened_serial * 1000 + view.selected,
+                self._pictures,
+                self._pictures_serial,
+                episode.segmentation,
+                view.selected,
+            )
+        )
+
+    # --- keys --------------------------------------------------------------------------------------
+
+    def _commands(self) -> Sequence[Command]:
+        review, timeline = self._review, self._timeline
+        commands = [
+            Command("Play or pause", review.toggle_play, "space"),
+            *timeline.commands(),
+            Command("The first moment", review.to_first, "home"),
+            Command("The last moment", review.to_last, "end"),
+            Command("Next recording", lambda: self._panel.select_neighbour(1), "N"),
+            Command("Previous recording", lambda: self._panel.select_neighbour(-1), "P"),
+            Command("Over each other or side by side", self._panel.toggle_arrangement, "O"),
+            Command("Frame what is shown", self._in_3d.frame, "F"),
+            Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
+            Command("Dark or light", self._view_panel.toggle_dark, "D"),
+            Command("Judge again what is selected, or else what is open", self._judge_chosen, "J"),
+            Command("Go on live from here", self._panel.step_back, "G"),
+        ]
+        if self._place.session is not None:
+            commands.append(Command(BACK, self._go_back, "V"))
+        return commands
+
+    def _judge_chosen(self) -> None:
+        opened = tuple(one.id for one in self._review.view().opened)
+        self._rescore.judge_and_tell(self._library.selected() or opened)
+
+    def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
+        self._panel.lay_side_by_side()
+        self._review.open(ids)
+
+
+# --- The timeline of a review: the live page's slider, strip and keys, over recordings that are whole ---
+
+
+PLAY, PAUSE = "play", "pause"
+FIRST, LAST = "first", "last"
+
+
+class ReviewTimeline(TimeBar[ReviewView]):
+    def __init__(self, server: viser.ViserServer, review: Review, clock: Clock = time.monotonic) -> None:
+        does = {
+            PLAY: review.toggle_play,
+            PAUSE: review.toggle_play,
+            FIRST: review.to_first,
+            LAST: review.to_last,
+        }
+        super().__init__(server, review, "step of the timeline", does, clock)
+        self._drawn: tuple[object, ...] = ()
+        self._fixed: dict[str, object] = {}
+
+    def draw(self, view: ReviewView) -> None:
+        if not self._draw_panel(bool(view.opened), view.position):
+            return
+        self._set_ends(view.first, view.last)
+        self._slider.show(view.position)
+        self._walk.options = walk(view.playing)
+        wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
+        if wanted == self._drawn:
+            return
+        # Only the cursor and the words follow the position.
+        if wanted[1:] != self._drawn[1:]:
+            self._fixed = fixed_values(view)
+        self._drawn = wanted
+        one, state = view.opened[view.selected], view.states[view.selected]
+        self._strip.content = render("review_timeline", view=view, one=one, state=state, **self._fixed)
+
+
+def walk(playing: bool) -> tuple[str, ...]:
+    """The buttons under the strip."""
+    return (FIRST, LAST_EVENT, LAST_STEP, PAUSE if playing else PLAY, NEXT_STEP, NEXT_EVENT, LAST)
+
+
+def fixed_values(view: ReviewView) -> dict[str, object]:
+    """What of the strip stays while the position moves."""
+    rows = [
+        (index, [h for h in view.opened[index].happenings if h.style != "reset"][:MOST_MARKS])
+        for index in shown_together(view)
+    ]
+    reward = np.asarray(view.opened[view.selected].episode.reward, np.float64)
+    after, anchor = np.arange(1, len(reward) + 1), view.anchors[view.selected]
+    over = column_at(after, reward, anchor, np.arange(view.first, view.last + 1)).astype(np.float32)
+    styles = {h.style for _, marks in rows for h in marks}
+    return {"rows": rows, **strip_values(view.first, view.last, over, styles)}

@@ -1,0 +1,250 @@
+"""The two pages of the program and what they need, put together: ``workbench open`` and ``workbench review`` share it.
+
+A folder of recordings is looked through only when somebody wants to see it: the library and the review begin with
+the first review page, and live until the program ends, so that what is open there is still open after a while at the
+live env.
+
+viser has one page a server, and two sets of panels in it would mean hiding half of everything. So a page is taken
+away whole, handles, commands and all, and the other is built in its place; every browser that is open follows. What
+a page shows lives elsewhere: the session plays and records on while its page is away, and the review keeps what is
+open in it. The bodies in the 3-D view stay (`stage`), and nothing of it is sent before the new page has been drawn
+once: controls that say nothing yet, or something else than is so, are never seen.
+
+Swaps are asked for by buttons and keys of the very pages that they take away. So they are done by a thread of their
+own, one after the other.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from workbench.jobs.task import TaskOptions
+from workbench.recording.library.library import Library
+from workbench.recording.reader.reading import mend, recovered_in_words
+from workbench.session.clearance import Clearances
+from workbench.session.live.session import Session
+from workbench.session.rescore.recordings import Rescorer
+from workbench.session.review.recorded_scene import SceneProcess
+from workbench.session.review.review import Review
+from workbench.ui.app.go_live import MakeSession, StepIn
+from workbench.ui.app.review_page import ReviewPage
+from workbench.ui.app.trust_dialog import TrustDialog
+from workbench.ui.review.rescore import RescoreChoices
+from workbench.ui.scene.viewpoint import Stage
+from workbench.ui.server.gated_server import Door
+from workbench.ui.share.panel import Sharing
+from workbench.ui.widgets.hotkeys import Command
+
+if TYPE_CHECKING:
+    from workbench.ui.app.live_page import Page
+import logging
+from typing import TYPE_CHECKING, Literal
+
+import viser
+
+from workbench.machine.processes.watched_thread import watched_thread
+
+if TYPE_CHECKING:
+    from workbench.ui.app.live_page import Page
+    from workbench.ui.app.review_page import ReviewPage
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """The recordings of a folder, and those that are open."""
+
+    library: Library
+    review: Review
+
+
+class Workplace:
+    """Both pages behind one door, and what outlives them.
+
+    Args:
+        door: Of the pages.
+        recordings: The folder that is recorded to and reviewed.
+        make_session: Opens a task that a recording names; gets what `Session` gets.
+        base: What is the same for all tasks that recordings name.
+        session: The live env, if there is one.
+        tasks: Task files in which envs of foreign recordings may be found.
+        trust: Run what recordings name without asking.
+        on_notice: Called, on any thread, with a sentence that is to be seen in the terminal too.
+    """
+
+    def __init__(
+        self,
+        door: Door,
+        recordings: Path,
+        make_session: MakeSession,
+        base: TaskOptions,
+        session: Session | None = None,
+        tasks: tuple[Path, ...] = (),
+        trust: bool = False,
+        on_notice: Callable[[str], None] = lambda words: None,
+    ) -> None:
+        self.server, self._recordings, self._tasks = door.server, recordings, tasks
+        self._imports, self._on_notice = base.imports, on_notice
+        self._shelf: Shelf | None = None
+        self._lock = threading.Lock()
+        self._mending: threading.Thread | None = None
+        self.commands: tuple[Command, ...] = ()
+        """In the palette of both pages; set before the first is shown."""
+        self.session = session
+        """That the live page shows when it is next built."""
+        self.dialog = TrustDialog(self.server)
+        clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
+        self.step_in = StepIn(self, make_session, clearances, base)
+        self.rescorer, self.rescore_choices = Rescorer(clearances, base), RescoreChoices()
+        self.sharing = Sharing(door)
+        self.stage = Stage(self.server)
+        self.pages = Pages(self.server, self.stage, self._page)
+
+    @property
+    def shelf(self) -> Shelf:
+        """Looks into the folder when it is first asked for."""
+        with self._lock:
+            if self._shelf is None:
+                library = Library(self._recordings)
+                library.watch()
+                scenes = SceneProcess(self._tasks, self._imports)
+                self._shelf = Shelf(library, Review(library, make_scene=scenes))
+                if self.session is None:
+                    # A live env's recorder has done it, and is writing.
+                    self._mending = threading.Thread(
+                        target=self._mend, args=(self._shelf,), name="mend", daemon=True
+                    )
+                    self._mending.start()
+            return self._shelf
+
+    def _mend(self, shelf: Shelf) -> None:
+        """Make episodes of what a writer left that was killed."""
+        try:
+            mended = [str(file) for file in mend(self._recordings)]
+        except OSError as error:
+            shelf.review.say(str(error))
+            self._on_notice(str(error))
+            return
+        if mended:
+            what = "An episode that was" if len(mended) == 1 else f"{len(mended)} episodes that were"
+            shelf.review.say(f"{what} left half written by a program that was killed can be seen again.")
+            self._on_notice(recovered_in_words(mended))
+            shelf.library.look_soon()
+
+    def task_files(self) -> tuple[Path, ...]:
+        """The task files that this program was started with, or has open."""
+        task = None if self.session is None else self.session.view().task
+        live = () if task is None or task.file is None else (Path(task.file),)
+        return tuple(file.absolute() for file in (*live, *self._tasks))
+
+    def close(self) -> None:
+        """Stop the pages and what they read from; the first session and the door are their owner's to close."""
+        self.pages.stop()
+        with self._lock:
+            if self._shelf is not None:
+                if self._mending is not None:
+                    self._mending.join(timeout=10.0)
+                self._shelf.review.close()
+                self._shelf.library.close()
+        for part in (self.sharing, self.dialog, self.rescorer.judging, self.step_in):
+            part.close()
+
+    def _page(self, which: Which, dark: bool) -> Page | ReviewPage:
+        if which == "review":
+            self.shelf.library.look_soon()
+            return ReviewPage(self, dark)
+        # What a live env needs is not needed for looking at recordings.
+        from workbench.ui.app.live_page import Page
+
+        assert self.session is not None, "the live page is shown with its session"
+        return Page(
+            self.server, self.session, dark, lambda: self.pages.show("review"), self.stage, self.commands
+        )
+
+
+# --- Which page is on the server: the live env, or the review of recordings -------------------
+
+
+log = logging.getLogger(__name__)
+
+Which = Literal["live", "review"]
+
+
+class Pages:
+    """
+    Args:
+        server: Of viser, already behind its door.
+        stage: The 3-D view that the pages share.
+        make: Builds a page on the (empty) server, given which and whether it is to be dark.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, stage: Stage, make: Callable[[Which, bool], Page | ReviewPage]
+    ) -> None:
+        self._server, self._stage, self._make = server, stage, make
+        self._wake = threading.Condition()
+        self._wish: Which | None = None
+        self._shown: Which | None = None
+        self._page: Page | ReviewPage | None = None
+        self._ending = False
+        self._thread = watched_thread("pages", self._serve)
+
+    def start(self, which: Which) -> None:
+        """Show the first page; returns when it is there."""
+        self._show(which)
+        self._thread.start()
+
+    def show(self, which: Which) -> None:
+        """Ask for a page. Returns at once, so that a button of the page that goes may ask."""
+        with self._wake:
+            self._wish = which
+            self._wake.notify_all()
+
+    def wait_for(self, which: Which, timeout: float) -> bool:
+        """Sleep until that page is there."""
+        with self._wake:
+            return self._wake.wait_for(lambda: self._shown == which, timeout)
+
+    def stop(self) -> None:
+        """Stop the page that is there; it stays as it is until the server closes."""
+        with self._wake:
+            self._ending = True
+            self._wake.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10.0)
+        if self._page is not None:
+            self._page.stop()
+
+    def _serve(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._wish is not None or self._ending)
+                if self._ending:
+                    return
+                wish, self._wish = self._wish, None
+            if wish is None or wish == self._shown:
+                continue
+            try:
+                self._show(wish)
+            except Exception:
+                # Nothing would be left that one could press.
+                log.exception("The page could not be built.")
+
+    def _show(self, which: Which) -> None:
+        dark = self._page.dark if self._page is not None else True
+        if self._page is not None:
+            self._page.stop()
+        with self._server.atomic():
+            if self._page is not None:
+                # Nothing of the page that went is left: handles, commands, callbacks, nodes.
+                self._stage.clear()
+                self._server.gui.reset()
+            self._page = self._make(which, dark)
+            self._page.start()
+        self._server.flush()
+        with self._wake:
+            self._shown = which
+            self._wake.notify_all()

@@ -1,0 +1,1 @@
+"""The Cameras and Studio tabs."""

@@ -1,0 +1,308 @@
+"""The handles on the chosen camera in the 3-D view: one to move and turn it, or an eye and a target; and the view from
+where it stands.
+
+viser has one gizmo, which always lies along its own axes, and knows no steps. So turning about the world's axes is
+done here: that gizmo lies along the world's axes when it is taken, and what it was turned by since is put on the
+camera. Steps are made here too: the camera jumps in steps while the gizmo follows the hand, and is put where the
+camera is when it is let go.
+
+While somebody holds it, it belongs to them: a pose that the server writes then would pull it out of their hand.
+
+To judge a placement one wants to stand where the camera stands. "Look through it" takes the page that asked there, with
+that field of view; while it looks through, it follows the camera (a number that is typed, an undo), and going back leaves
+it where it was. Each page has its own view, so this is kept by page.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import viser
+
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.core.cameras.conventions import axes_of, intrinsic_of, target_of, vertical_fov
+from workbench.session.cameras.view import StudioCamera
+from workbench.ui.cameras.pose_math import (
+    Floats,
+    Frame,
+    Placing,
+    Snap,
+    fov_that_shows_all,
+    looking_at,
+    picture_corners,
+    snapped,
+    turned_in_world,
+    viewer_pose,
+)
+from workbench.ui.scene.env_grid import line_set
+from workbench.ui.scene.viewpoint import USUAL_ASPECT
+from workbench.ui.widgets.inputs import refusals_told
+
+LEFT_ALONE = 60.0
+"""Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
+PIXELS = 76.0
+TARGET_PIXELS = 44.0
+"""Of the handles on the screen."""
+SIGHT_COLOUR = (34, 139, 230)
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    """A camera as it was when a handle was taken: until that is let go, all is one step of undo."""
+
+    key: CameraKey
+    settings: CameraSettings
+    frame: Frame
+    pose: Floats
+    """(7,) in the view."""
+    target: Floats
+    """(3,) in the view."""
+
+
+class CameraGizmo:
+    """There while a camera is chosen.
+
+    Args:
+        snap: the steps that are chosen.
+        own_axes: whether it lies along the camera's own axes.
+        look_at: whether there are an eye and a target in its place.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        placing: Placing,
+        snap: Callable[[], Snap],
+        own_axes: Callable[[], bool],
+        look_at: Callable[[], bool],
+    ) -> None:
+        self._placing = placing
+        self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
+        # A fixed size on the screen: in a grid of sixteen envs one of 10 cm would be a dot.
+        add = partial(server.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
+        self._camera = add("/studio/camera", PIXELS)
+        self._eye = add("/studio/eye", PIXELS, disable_rotations=True)
+        self._target = add("/studio/target", TARGET_PIXELS, disable_rotations=True)
+        self._line = line_set(server, "/studio/line of sight", SIGHT_COLOUR, 2.0)
+        self._held_at = -1e9
+        self._start: _Taken | None = None
+        # Async: callbacks in viser's pool of threads would come in any order.
+        self._camera.on_update(self._on_camera)
+        self._eye.on_update(self._on_point)
+        self._target.on_update(self._on_point)
+
+    @property
+    def held(self) -> bool:
+        return self._start is not None and time.monotonic() - self._held_at < LEFT_ALONE
+
+    def draw(self, camera: StudioCamera | None) -> None:
+        """Put the handles on this camera; None takes them away."""
+        if self.held:
+            if camera is not None:
+                self._draw_line(camera)
+            return
+        self._start = None
+        two = camera is not None and self._look_at()
+        for handle, shown in (
+            (self._camera, camera is not None and not two),
+            (self._eye, two),
+            (self._target, two),
+        ):
+            handle.visible = shown
+        self._draw_line(camera)
+        if camera is None or camera.now is None:
+            return
+        frame = self._placing.frame(camera)
+        pose = frame.to_view(camera.now)
+        _move(self._camera, pose[:3], pose[3:] if self._own_axes() else UNTURNED)
+        _move(self._eye, pose[:3], UNTURNED)
+        _move(self._target, frame.point_to_view(target_of(camera.now)), UNTURNED)
+
+    def _draw_line(self, camera: StudioCamera | None) -> None:
+        """From the eye to the target, which otherwise would be any three arrows in the air."""
+        if camera is None or camera.now is None or not self._look_at():
+            self._line.draw()
+            return
+        ends = camera.now.position, target_of(camera.now)
+        self._line.draw(np.stack([self._placing.frame(camera).point_to_view(end) for end in ends])[None])
+
+    # --- what the hand does ----------------------------------------------------------------------------
+
+    def _take(self) -> bool:
+        camera = self._placing.camera
+        if camera is None or camera.now is None:
+            return False
+        frame = self._placing.frame(camera)
+        pose = frame.to_view(camera.now)
+        target = frame.point_to_view(target_of(camera.now))
+        self._start = _Taken(camera.key, camera.now, frame, pose, target)
+        return True
+
+    def _went_on(self, phase: str) -> _Taken | None:
+        """The camera as it was taken, while it is dragged."""
+        self._held_at = time.monotonic()
+        if (phase == "start" or self._start is None) and not self._take():
+            return None
+        start = self._start
+        if phase == "end":
+            self._start = None
+        return start if phase == "update" else None
+
+    async def _on_camera(self, event: viser.TransformControlsEvent) -> None:
+        start = self._went_on(event.phase)
+        if start is None:
+            return
+        pose, frame = start.pose, start.frame
+        position, wxyz = event.target.position, event.target.wxyz
+        with refusals_told(event.client, then=self._let_go):
+            if self._own_axes():
+                moved = np.concatenate([position, wxyz])
+            else:
+                moved = turned_in_world(pose, position, wxyz)
+            moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
+            self._place(start, moved, start.target - pose[:3])
+
+    async def _on_point(self, event: viser.TransformControlsEvent) -> None:
+        """The eye or the target is moved."""
+        moves_eye, start = event.target is self._eye, self._went_on(event.phase)
+        if start is None:
+            return
+        pose, target = start.pose, start.target
+        before = pose[:3] if moves_eye else target
+        at = np.concatenate([before, UNTURNED]), np.concatenate([event.target.position, UNTURNED])
+        there = snapped(*at, Snap(metres=self._snap().metres), False, start.frame.offset)[:3]
+        eye, target = (there, target) if moves_eye else (pose[:3], there)
+        with refusals_told(event.client, then=self._let_go):
+            self._place(start, looking_at(pose, eye, target), target - eye)
+
+    def _place(self, start: _Taken, pose: Floats, sight: Floats) -> None:
+        moved = start.frame.from_view(start.settings, pose, float(np.linalg.norm(sight)))
+        self._placing.place(start.key, moved, start, math.inf)
+
+    def _let_go(self) -> None:
+        """So that it is put back to where the camera is."""
+        self._start = None
+
+
+def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats) -> None:
+    if not np.allclose(handle.position, position, atol=1e-7):
+        handle.position = position
+    if not np.allclose(handle.wxyz, wxyz, atol=1e-7):
+        handle.wxyz = wxyz
+
+
+WIDEST = math.radians(150)
+"""Of the page's own view: what is wider it cannot draw."""
+BORDER_AT = 0.15
+"""Metres in front of the eye: as near as the page draws, or things would hide it."""
+BORDER_COLOUR = (245, 159, 0)
+UPRIGHT = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass
+class _Looking:
+    key: CameraKey
+    position: Floats
+    look_at: Floats
+    up: Floats
+    fov: float
+    shown: tuple[CameraSettings, bytes] | None = None
+    """The camera, and its place in the view, that the page was last put to."""
+
+
+class LookThrough:
+    def __init__(self, server: viser.ViserServer, placing: Placing) -> None:
+        self._server, self._placing = server, placing
+        self._lock = threading.Lock()
+        self._looking: dict[int, _Looking] = {}
+        self._border = line_set(server, "/studio/border", BORDER_COLOUR, 2.0)
+
+    @property
+    def any(self) -> bool:
+        """Whether a page looks through the chosen camera."""
+        return bool(self._looking)
+
+    def toggle(self, client: viser.ClientHandle | None) -> None:
+        """Go there, or back."""
+        camera = self._placing.camera
+        if client is None:
+            return
+        with self._lock:
+            if client.client_id in self._looking:
+                self._back(client)
+            elif camera is not None:
+                eye = client.camera
+                self._looking[client.client_id] = _Looking(
+                    camera.key, eye.position.copy(), eye.look_at.copy(), eye.up_direction.copy(), eye.fov
+                )
+                self._show(client, camera)
+
+    def draw(self, camera: StudioCamera | None) -> None:
+        """Follow the camera; go back where it is no longer the chosen one."""
+        with self._lock:
+            clients = self._server.get_clients()
+            for number in list(self._looking):
+                client = clients.get(number)
+                if client is None:
+                    del self._looking[number]
+                elif camera is None or camera.key != self._looking[number].key:
+                    self._back(client)
+                else:
+                    self._show(client, camera)
+        self._draw_border(camera if self._looking else None)
+
+    def _draw_border(self, camera: StudioCamera | None) -> None:
+        """A view is wider than the picture; what is inside of this line is in it."""
+        if camera is None or camera.now is None:
+            self._border.draw()
+            return
+        corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_AT)
+        self._border.draw(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+
+    def settings_from(
+        self, client: viser.ClientHandle, settings: CameraSettings, frame: Frame
+    ) -> CameraSettings:
+        """This camera, where the page looks from.
+
+        Raises:
+            ValueError: the page says nothing that is a pose.
+        """
+        return frame.from_view(settings, viewer_pose(client.camera.position, client.camera.wxyz))
+
+    def _show(self, client: viser.ClientHandle, camera: StudioCamera) -> None:
+        looking, now = self._looking[client.client_id], camera.now
+        if now is None:
+            return
+        pose = self._placing.frame(camera).to_view(now)
+        shown = (now, pose.tobytes())
+        if shown == looking.shown:
+            return
+        looking.shown = shown
+        _, left, up = axes_of(pose[3:])
+        # The page's orbit turns about its up: about the camera's own, a drag would tilt a level horizon.
+        level = abs(left[2]) < 1e-3 and up[2] > 0.05
+        eye = client.camera
+        aspect = eye.image_width / eye.image_height if eye.image_height and eye.image_width else USUAL_ASPECT
+        fov = vertical_fov(intrinsic_of(now), now.height)
+        target = self._placing.frame(camera).point_to_view(target_of(now))
+        fov = min(fov_that_shows_all(fov, now.width / now.height, aspect), WIDEST)
+        _stand(client, pose[:3], target, UPRIGHT if level else up, fov)
+
+    def _back(self, client: viser.ClientHandle) -> None:
+        was = self._looking.pop(client.client_id)
+        up = was.up if np.linalg.norm(was.up) > 0.5 else UPRIGHT
+        _stand(client, was.position, was.look_at, up, was.fov)
+
+
+def _stand(client: viser.ClientHandle, position: Floats, look_at: Floats, up: Floats, fov: float) -> None:
+    """Let a page look from there."""
+    with client.atomic():
+        eye = client.camera
+        eye.up_direction, eye.position, eye.look_at, eye.fov = up, position, look_at, fov

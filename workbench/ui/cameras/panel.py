@@ -1,0 +1,314 @@
+"""The Cameras tab: what the selected env's cameras see, and which of them are asked for.
+
+A picture costs 50 to 100 ms on a machine without a GPU, so only what is shown is rendered. viser does
+not say which tab a person looks at; the check boxes do: a camera without a tick is not asked of the
+session. A picture that is replaced before the browser has loaded it is never seen at all (measured:
+at 1,000 a second the page shows one in five seconds), hence the limit on how often they are sent.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
+from workbench.session.cameras.studio import IN_A_QUICK_LOOK
+from workbench.session.live.session import Session
+from workbench.session.live.view import Seen, SessionView
+from workbench.session.protocol.messages import CameraRequest
+from workbench.ui.widgets.images import COLOUR, MODALITIES, DepthRange, depth_span, image_format, in_colours
+from workbench.ui.widgets.parts import Clock, DrawDue
+from workbench.ui.widgets.templates import render
+
+FASTEST = 1 / 15
+"""Seconds between two pictures of one camera."""
+KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
+
+
+class CameraImage:
+    """A picture of a camera in a container, from when there is one on."""
+
+    def __init__(
+        self, server: viser.ViserServer, container: viser.GuiFolderHandle, order: float | None = None
+    ) -> None:
+        self._server, self._container, self._order = server, container, order
+        self._handle: viser.GuiImageHandle | None = None
+
+    @property
+    def visible(self) -> bool:
+        return self._handle is not None and self._handle.visible
+
+    def show(self, shown: bool) -> None:
+        """Show the last picture, if there is one, or hide it."""
+        if self._handle is not None:
+            self._handle.visible = shown
+
+    def draw(self, kind: str, pixels: NDArray[np.uint8]) -> None:
+        if self._handle is None:
+            with self._container:
+                self._handle = self._server.gui.add_image(
+                    pixels, format=image_format(kind), jpeg_quality=80, order=self._order
+                )
+            return
+        self._handle.format, self._handle.image, self._handle.visible = image_format(kind), pixels, True
+
+
+@dataclass
+class _Camera:
+    info: CameraInfo
+    ticks: dict[str, viser.GuiCheckboxHandle]
+    captions: dict[str, viser.GuiHtmlHandle]
+    folder: viser.GuiFolderHandle
+    facts: viser.GuiHtmlHandle
+    images: dict[str, CameraImage]
+    depth_span: DepthRange | None = None
+    drawn: tuple[Picture, tuple[str, ...]] | None = None
+    """What its images show."""
+    stale: bool = False
+    """Whether its pictures are said to be of another moment."""
+
+    def wanted(self) -> tuple[str, ...]:
+        return tuple(modality for modality, tick in self.ticks.items() if tick.value)
+
+
+class CamerasPanel:
+    """
+    Args:
+        ask: Asks for exactly these pictures: a session renders them, a review decodes them.
+        no_camera: What is said where there is none.
+        studio_shows: Which kind of picture of the camera that is being placed is on the page beside its colours.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        ask: Callable[[tuple[CameraRequest, ...]], None],
+        no_camera: str = "This task has no camera.",
+        studio_shows: Callable[[], str] = lambda: COLOUR,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self._no_camera, self._studio_shows = no_camera, studio_shows
+        self._server, self._ask_for = server, ask
+        self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
+        self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
+        self._cameras_serial = -1
+        self._due = DrawDue(FASTEST, clock)
+        self._asked: tuple[CameraRequest, ...] | None = None
+        self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
+        self._frustums = server.gui.add_checkbox(
+            "In the view",
+            True,
+            visible=False,
+            hint="Draw these cameras, with their pictures, in the 3-D view.",
+        )
+        self._folder = server.gui.add_folder(None)
+
+    @property
+    def show_frustums(self) -> bool:
+        return self._frustums.value
+
+    def draw(self, seen: Seen | None) -> None:
+        if seen is None:
+            return
+        if seen.cameras_serial != self._cameras_serial:
+            self._cameras_serial = seen.cameras_serial
+            self._build(seen)
+        self._ask(seen)
+        self._mark_stale(seen)
+        if not self._due.is_due((seen.pictures_serial, seen.env)):
+            return
+        for key, camera in self._cameras.items():
+            picture = seen.pictures.get(key)
+            if picture is None or picture.env != seen.env:
+                continue
+            # Kinds come one after the other, and a picture that is sent again is decoded again.
+            if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != camera.wanted():
+                camera.drawn = (picture, camera.wanted())
+                self._draw_camera(camera, picture, seen)
+
+    def shown_pictures(self, seen: Seen) -> dict[tuple[CameraKind, str], Picture]:
+        """The pictures of cameras with a tick, of the selected env: what the view's frustums wear."""
+        return {
+            key: picture
+            for key, picture in seen.pictures.items()
+            if picture.env == seen.env
+            and key in self._cameras
+            and (key == seen.placed or self._cameras[key].wanted())
+        }
+
+    def _build(self, seen: Seen) -> None:
+        """One folder a camera. One that is still there keeps it, with its ticks and its place on the page."""
+        for key, camera in self._cameras.items():
+            for modality, tick in camera.ticks.items():
+                self._remembered[(*key, modality)] = tick.value
+        before, self._cameras = self._cameras, {}
+        stay = {(c.kind, c.name): modalities_of(c) for c in seen.cameras} if seen.can_render else {}
+        for key in [key for key, camera in before.items() if stay.get(key) != tuple(camera.ticks)]:
+            before.pop(key).folder.remove()
+        if not seen.can_render:
+            note = (
+                "This machine has no render device, so there are no pictures. "
+                "Run workbench doctor to see what is missing."
+            )
+        elif not seen.cameras:
+            note = self._no_camera
+        else:
+            note = ""
+        self._note.content = render("note", text=note)
+        self._note.visible = bool(note)
+        self._frustums.visible = not note
+        if note:
+            return
+        first_of_kind = {}
+        for camera in seen.cameras:
+            first_of_kind.setdefault(camera.kind, camera.name)
+        with self._folder:
+            for order, info in enumerate(seen.cameras):
+                key = (info.kind, info.name)
+                camera = before.get(key)
+                if camera is None:
+                    camera = self._build_camera(info, first_of_kind[info.kind] == info.name)
+                else:
+                    camera.info, camera.depth_span = info, None
+                    camera.facts.content = facts(camera)
+                camera.folder.order = order
+                self._cameras[key] = camera
+
+    def _build_camera(self, info: CameraInfo, first: bool) -> _Camera:
+        gui = self._server.gui
+        folder = gui.add_folder(f"{info.name} · {KIND_NAMES[info.kind]}")
+        ticks, captions, images = {}, {}, {}
+        with folder:
+            about = gui.add_html("", order=1.0)
+            for order, modality in enumerate(modalities_of(info)):
+                on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")
+                ticks[modality] = gui.add_checkbox(modality, on, order=10.0 * order + 10)
+                images[modality] = CameraImage(self._server, folder, order=10.0 * order + 11)
+                captions[modality] = gui.add_html("", order=10.0 * order + 12)
+        camera = _Camera(info, ticks, captions, folder, about, images)
+        about.content = facts(camera)
+        return camera
+
+    def _ask(self, seen: Seen) -> None:
+        wanted = tuple(
+            CameraRequest(camera.info.name, camera.info.kind, modalities)
+            for key, camera in self._cameras.items()
+            if (modalities := self._wanted_of(key, camera, seen))
+        )
+        if wanted != self._asked:
+            self._asked = wanted
+            self._ask_for(wanted)
+        for camera in self._cameras.values():
+            for modality, tick in camera.ticks.items():
+                camera.captions[modality].visible = tick.value
+                camera.images[modality].show(tick.value)
+
+    def _wanted_of(self, key: CameraKey, camera: _Camera, seen: Seen) -> tuple[str, ...]:
+        """Those with a tick; and of a camera that is placed what the Studio shows of it, in its own size."""
+        wanted = camera.wanted()
+        if seen.quick or key != seen.placed:
+            return wanted
+        return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
+
+    def _mark_stale(self, seen: Seen) -> None:
+        """Say of pictures that are on the page, and are not of the moment that is, that they are not."""
+        for key, camera in self._cameras.items():
+            picture = seen.pictures.get(key)
+            here = picture is not None and picture.env == seen.env
+            stale = not here and any(image.visible for image in camera.images.values())
+            if stale != camera.stale:
+                camera.stale = stale
+                camera.facts.content = facts(camera)
+
+    def _draw_camera(self, camera: _Camera, picture: Picture, seen: Seen) -> None:
+        if picture.depth is not None:
+            camera.depth_span = depth_span(camera.depth_span, picture)
+        for modality in camera.wanted():
+            coloured = in_colours(picture, modality, seen.segmentation, camera.depth_span)
+            if coloured is None:
+                continue
+            pixels, caption = coloured
+            if modality == COLOUR:
+                took = "" if seen.milliseconds is None else f"{seen.milliseconds:.0f}"
+                caption = render("rgb_caption", milliseconds=took)
+            camera.images[modality].draw(modality, pixels)
+            camera.captions[modality].content = caption
+
+
+class StudioPicture:
+    """The chosen camera's picture in the present container, above the controls that move it; what lies over it goes into
+    `folder`.
+
+    A camera is placed for what comes out of it, and that is often depth or segmentation: a far plane that is too near, or
+    a gripper that hides the cube, is seen there first. So the picture that follows the hand is any of its kinds.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        self._server, self._session = server, session
+        self._drawn: tuple[CameraKey, Picture, str] | None = None
+        self._clock, self._drawn_at = clock, -math.inf
+        self._span: DepthRange | None = None
+        self._wanted = COLOUR
+        self.kinds: tuple[str, ...] = (COLOUR,)
+        """That the chosen camera gives; `rgb` first."""
+        self.folder = server.gui.add_folder(None)
+        with self.folder:
+            server.gui.add_html(render("studio_picture"))
+        self._picture = CameraImage(server, self.folder)
+        self._caption = server.gui.add_html("", visible=False)
+
+    @property
+    def shows(self) -> str:
+        """Which kind of picture is to be made of the chosen camera."""
+        return self._wanted if self._wanted in self.kinds else COLOUR
+
+    def show_kind(self, kind: str) -> None:
+        self._wanted = kind
+
+    @property
+    def visible(self) -> bool:
+        return self._picture.visible
+
+    def draw(self, view: SessionView) -> None:
+        studio, key = view.studio, view.studio.selected
+        chosen = studio.chosen
+        quick = studio.quick_scale != 1.0
+        gives = (COLOUR,) if chosen is None else modalities_of(chosen.info)
+        self.kinds = tuple(kind for kind in gives if not quick or kind in IN_A_QUICK_LOOK)
+        picture = None if key is None else view.pictures.get(key)
+        if quick:
+            picture = studio.quick
+            self._session.studio.look()
+        # The last one stays while the next is drawn; that of another camera does not.
+        self._picture.show(self._drawn is not None and self._drawn[0] == key)
+        self._caption.visible = self.visible and bool(self._caption.content)
+        kind = self.shows
+        if key is None or picture is None or picture.env != view.selected_env or view.task is None:
+            return
+        if self._drawn is not None and (self._drawn[0], self._drawn[2]) == (key, kind):
+            if self._drawn[1] is picture or self._clock() - self._drawn_at < FASTEST:
+                return
+        self._span = depth_span(self._span if self._drawn and self._drawn[0] == key else None, picture)
+        coloured = in_colours(picture, kind, view.task.segmentation, self._span)
+        if coloured is None:
+            return  # it is not there yet
+        self._drawn, self._drawn_at = (key, picture, kind), self._clock()
+        pixels, self._caption.content = coloured
+        self._picture.draw(kind, pixels)
+
+
+def modalities_of(info: CameraInfo) -> tuple[str, ...]:
+    """Those that can be shown, in the page's order."""
+    return tuple(modality for modality in MODALITIES if modality in info.modalities)
+
+
+def facts(camera: _Camera) -> str:
+    """The line under a camera's name."""
+    fovy = f"{np.degrees(camera.info.fovy):.0f}°"
+    return render("camera_facts", info=camera.info, fovy=fovy, stale=camera.stale)

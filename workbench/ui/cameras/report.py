@@ -1,0 +1,382 @@
+"""Judge a camera: over the envs as they stand, the steps of an episode, or fresh resets; and the pictures of all envs.
+
+The table says of each object in how many envs it is seen, how large, and what is in its way; the bars say how far
+away is what the camera sees, with planes that would fit it. The sheet has the selected camera's picture of every env,
+worst first once it was judged; pressing one selects that env. Over steps each object has a strip besides, of when it
+is seen; pressing a step of it shows that moment.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import viser
+
+from workbench.core.camera_data import Picture
+from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
+from workbench.session.cameras.reports import MOST_SEEDS, MOST_STEPS
+from workbench.session.cameras.view import StudioCamera, StudioView
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.images import data_address
+from workbench.ui.widgets.inputs import Answer
+from workbench.ui.widgets.templates import counted, render
+
+AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"
+OVERS = (AS_THEY_ARE, STEPS, FRESH)
+MOST_PICTURES = 64
+"""On the sheet: the worst of them."""
+THUMBNAIL = 128
+"""Pixels along the longer side of a picture on the sheet."""
+
+
+class CameraVerdict:
+    """The folder in the present container."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
+            self._over = server.gui.add_dropdown(
+                "Over",
+                OVERS,
+                hint="The envs at the moment that is shown; the selected env's episode, step by step; or freshly reset "
+                "envs with other seeds, in a process beside.",
+            )
+            self._steps = server.gui.add_number(
+                "Steps",
+                50,
+                min=1,
+                max=MOST_STEPS,
+                step=1,
+                visible=False,
+                hint="How many of the episode's steps at most, evenly spread: each takes some pictures.",
+            )
+            self._resets = server.gui.add_number(
+                "Resets",
+                32,
+                min=1,
+                max=MOST_SEEDS,
+                step=1,
+                visible=False,
+                hint="How many, each with a seed of its own.",
+            )
+            self._judge = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
+            self._report = Answer(server, session)
+            self._sheet = server.gui.add_button(
+                "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
+            )
+            self._pictures = Answer(server, session)
+            self._presses = Presses(server)
+        self._judge.on_click(lambda _: self._ask())
+        self._sheet.on_click(lambda _: self._ask_for_sheet())
+
+    # --- asked ---------------------------------------------------------------------------------------
+
+    def _ask(self) -> None:
+        self._report.asked(self._session.view().studio.looked.report)
+        over = self._over.value
+        if over == STEPS:
+            self._session.studio.judging.judge_steps(self._steps.value)
+        else:
+            self._session.studio.judging.judge(self._resets.value if over == FRESH else 0)
+
+    def _ask_for_sheet(self) -> None:
+        self._pictures.asked(self._session.view().studio.looked.sheet)
+        self._session.studio.judging.make_sheet()
+
+    def _show_moment(self, position: int) -> None:
+        moments = self._session.view().studio.looked.report_moments
+        if position < len(moments):
+            self._session.show(moments[position].env, moments[position].serial)
+
+    def _use(self, plane: str) -> None:
+        studio = self._session.view().studio
+        camera, report = studio.placeable, studio.looked.report
+        if camera is None or camera.now is None or report is None or studio.looked.report_of != camera.key:
+            return
+        near = report.depth.suggested_near if plane == "near" else camera.now.near
+        far = report.depth.suggested_far if plane == "far" else camera.now.far
+        if near is not None and far is not None and near < far:
+            self._session.studio.place(camera.key, replace(camera.now, near=near, far=far))
+
+    # --- drawn ---------------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        studio = view.studio
+        camera = studio.chosen
+        self._resets.visible = self._over.value == FRESH
+        self._steps.visible = self._over.value == STEPS
+        self._draw_report(studio, camera)
+        self._draw_sheet(view, camera)
+
+    def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
+        looked = studio.looked
+        report = looked.report if camera is not None and looked.report_of == camera.key else None
+
+        def html(new: bool) -> str:
+            assert camera is not None and report is not None, "drawn only then"
+            return self._report_html(studio, camera, report, new)
+
+        told = studio.report_stale, looked.judging, None if camera is None else camera.now
+        self._report.draw(studio.progress, report, told, html)
+
+    def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
+        """The table, the bars and the planes that would fit; `new`: it is to come into sight."""
+        looked, depth, lens = studio.looked, report.depth, camera.now or camera.info
+        moments = [
+            {
+                "words": f"step {moment.step}",
+                "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
+            }
+            for i, moment in enumerate(looked.report_moments)
+        ]
+        planes = []
+        for name, now, better in (
+            ("near", lens.near, depth.suggested_near),
+            ("far", lens.far, depth.suggested_far),
+        ):
+            fits = better is None or abs(better / now - 1) < 0.02
+            press = self._presses.id_of(name, lambda _, plane=name: self._use(plane))
+            planes.append(
+                {
+                    "name": name,
+                    "now": metres(now),
+                    "better": "" if fits or better is None else metres(better),
+                    "press": "" if studio.placeable is None else press,
+                }
+            )
+        count = len(report.envs)
+        over = (
+            counted(count, "fresh reset") if looked.report_seeds else f"{counted(count, 'env')} as they are"
+        )
+        unit = "envs"
+        if moments:
+            span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
+            over, unit = (
+                f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; press a step to go there",
+                "steps",
+            )
+        width, height = report.judged_size
+        return render(
+            "camera_report",
+            stale=studio.report_stale,
+            before=looked.judging,
+            new=new,
+            over=over,
+            how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
+            "without the robot if that is in it, and of each object alone",
+            unit=unit,
+            moments=moments,
+            headline=headline(report, unit),
+            rows=object_rows(report, unit),
+            bars=histogram(depth, lens.near, lens.far),
+            metres=metres,
+            background=percent(float(depth.background.mean())),
+            beyond=percent(float(depth.beyond.mean())),
+            planes=planes,
+        )
+
+    def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
+        looked, env = view.studio.looked, view.selected_env
+        sheet = looked.sheet
+        mine = camera is not None and bool(sheet) and sheet[0].key == camera.key
+        report = None if camera is None else looked.report_over_envs(camera.key)
+        told = id(report), env
+        self._pictures.draw(
+            view.studio.progress,
+            sheet if mine else None,
+            told,
+            lambda new: self._sheet_html(sheet, report, env, new),
+        )
+
+    def _sheet_html(
+        self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int, new: bool
+    ) -> str:
+        places = {} if report is None else {env: i for i, env in enumerate(report.envs)}
+        cells = [
+            {
+                "env": picture.env,
+                "words": ""
+                if report is None or picture.env not in places
+                else env_words(report, places[picture.env]),
+                "picture": data_address(picture.rgb, THUMBNAIL),
+                "selected": picture.env == selected,
+                "press": self._presses.id_of(("env", picture.env), lambda _, env=picture.env: self._go(env)),
+            }
+            for picture in sheet[:MOST_PICTURES]
+            if picture.rgb is not None
+        ]
+        note = ("worst first, " if report is not None else "") + "press one to select its env"
+        if len(sheet) > MOST_PICTURES:
+            note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
+        return render("camera_sheet", cells=cells, note=note, new=new)
+
+    def _go(self, env: int) -> None:
+        task = self._session.view().task
+        if task is not None and env < task.num_envs:  # a version with fewer envs may have been loaded since
+            self._session.change(selected_env=env)
+
+
+# --- a report in words, rows and bars: plain functions of plain data ---------------------------------
+
+# What a person asks first is whether anything is wrong, so the worst is said first: an object that some env's picture
+# lacks comes before one that is only cut, and an env is called by what is worst in it.
+
+MOSTLY_HIDDEN = 0.1
+"""Share of an object behind the robot from which on it is said of an env."""
+SMALL = 30.0
+"""Pixels below which an object is called small."""
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Bars of equal width over depth, which is logarithmic; metres at both ends."""
+
+    bars: tuple[tuple[float, bool], ...]
+    """Height in 0..1 (of the highest), and whether it lies behind everything that counts."""
+    low: float
+    high: float
+    near: float | None
+    """Where the near plane is, in bars from the left; None if it is out of the picture."""
+    far: float | None
+
+
+def percent(share: float) -> str:
+    """A share as a whole number of percent, where only none is 0 and only all is 100."""
+    if math.isnan(share):
+        return "–"
+    whole = round(100 * share)
+    if share > 0 and whole == 0:
+        return "< 1 %"
+    if share < 1 and whole == 100:
+        return "> 99 %"
+    return f"{whole} %"
+
+
+def metres(value: float) -> str:
+    """To three digits."""
+    return f"{value:.3g} m"
+
+
+def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]]:
+    """Objects to be seen, the least seen first; then what the task hides. Scenery is left out.
+
+    ``bad``: which of ``seen cut hidden`` an author should look at. ``moods``: how it is seen in each picture, ``good``,
+    ``warn`` (cut, or much hidden), ``bad`` (not seen), ``none`` (absent).
+
+    Args:
+        unit: what the report is over: envs, steps.
+    """
+    rows: list[dict[str, Any]] = []
+    wanted = report.wanted_objects()
+    for thing in sorted(wanted, key=lambda thing: (thing.summary().seen, thing.name)):
+        found = thing.summary()
+        if not found.present:
+            rows.append({"name": thing.name, "note": f"in none of these {unit}", "seen": ""})
+            continue
+        bad = []
+        if found.seen < 1:
+            bad.append("seen")
+        if found.cut > 0:
+            bad.append("cut")
+        if found.wholly_hidden > 0 or found.hidden > MOSTLY_HIDDEN:
+            bad.append("hidden")
+        notes = []
+        if found.present < len(report.envs):
+            notes.append(f"in {found.present} of {len(report.envs)} {unit}")
+        if found.covered > MOSTLY_HIDDEN:
+            notes.append(f"{percent(found.covered)} behind other things")
+        rows.append(
+            {
+                "name": thing.name,
+                "note": ", ".join(notes),
+                "seen": percent(found.seen),
+                "pixels": f"{found.median_pixels:.0f}",
+                "cut": percent(found.cut),
+                "hidden": percent(found.hidden),
+                "bad": bad,
+                "moods": [_mood(thing, i) for i in range(len(report.envs))],
+            }
+        )
+    hides = "the task hides it from this camera"
+    return rows + [{"name": t.name, "note": hides, "seen": ""} for t in report.objects if t.never_drawn]
+
+
+def headline(report: CameraReport, unit: str = "envs") -> str:
+    """One sentence: is all well; `unit` as in `object_rows`."""
+    wanted = [thing for thing in report.wanted_objects() if thing.present.any()]
+    if not wanted:
+        return f"There is no object to be seen in these {unit}."
+    lacking = {thing.name: int((thing.present & (thing.pixels == 0)).sum()) for thing in wanted}
+    worst = max(lacking, key=lambda name: lacking[name])
+    if lacking[worst]:
+        return f"{worst} is not seen in {lacking[worst]} of {len(report.envs)} {unit}."
+    cut = {thing.name: int((thing.present & thing.cut).sum()) for thing in wanted}
+    worst = max(cut, key=lambda name: cut[name])
+    if cut[worst]:
+        return f"Everything is seen; the border cuts {worst} in {cut[worst]} of {len(report.envs)} {unit}."
+    return "Everything is seen, and nothing is cut."
+
+
+def env_words(report: CameraReport, position: int) -> str:
+    """What is worst in one env of the report, in a few words; empty where nothing is to be seen.
+
+    Args:
+        position: in `CameraReport.envs`.
+    """
+    found = [thing for thing in report.wanted_objects() if thing.present[position]]
+    if not found:
+        return ""
+    thing = min(found, key=lambda thing: float(thing.marks()[position]))
+    hidden = float(thing.hidden_share[position])
+    if thing.pixels[position] == 0:
+        return f"{thing.name} hidden" if thing.alone[position] > 0 else f"no {thing.name}"
+    if hidden > MOSTLY_HIDDEN:
+        return f"{thing.name} {percent(hidden)} hidden"
+    covered = float(thing.covered_share[position])
+    if covered > MOSTLY_HIDDEN:
+        return f"{thing.name} {percent(covered)} behind things"
+    if thing.cut[position]:
+        return f"{thing.name} cut"
+    pixels = f"{thing.name} {thing.pixels[position]:.0f} px"
+    return f"{pixels}, small" if thing.pixels[position] < SMALL else pixels
+
+
+def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
+    """The depths of all envs' pictures together; None where all of them are background.
+
+    Args:
+        near, far: the camera's planes, metres.
+    """
+    counts = depth.counts.sum(axis=0)
+    filled = np.flatnonzero(counts)
+    if not len(filled):
+        return None
+    first, last = max(0, int(filled[0]) - 1), min(len(counts), int(filled[-1]) + 2)
+    ends = depth.farthest_object[np.isfinite(depth.farthest_object)]
+    end = float(ends.max()) if len(ends) else math.inf
+    part, middles = counts[first:last], np.sqrt(DEPTH_EDGES[:-1] * DEPTH_EDGES[1:])
+    bars = tuple(
+        (float(count) / float(part.max()), bool(middles[first + i] >= end)) for i, count in enumerate(part)
+    )
+
+    def place(plane: float) -> float | None:
+        if not DEPTH_EDGES[first] <= plane <= DEPTH_EDGES[last]:
+            return None
+        at = np.interp(math.log(plane), np.log(DEPTH_EDGES), np.arange(len(DEPTH_EDGES)))
+        return float(at) - first
+
+    return Histogram(bars, float(DEPTH_EDGES[first]), float(DEPTH_EDGES[last]), place(near), place(far))
+
+
+def _mood(thing: ObjectSeen, position: int) -> str:
+    if not thing.present[position]:
+        return "none"
+    if thing.pixels[position] == 0:
+        return "bad"
+    hindered = max(float(thing.hidden_share[position]), float(thing.covered_share[position]))
+    return "warn" if thing.cut[position] or hindered > 0.5 else "good"

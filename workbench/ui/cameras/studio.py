@@ -1,0 +1,383 @@
+"""The Studio tab: one camera is chosen, placed, and written into the file.
+
+Only one camera at a time has handles and numbers: with all of them the view would be full of arrows and nobody could
+tell whose numbers they read. It is chosen here or by a press on its frustum. Its picture stands above the controls,
+since it is what every movement is judged by; what one does all the time (look through it, undo) is under it, then
+where it is; the lens, which is set once, is folded.
+
+This module is the tab and who is told of what. What a movement means, and the one way to the session, is in
+`camera_moves`; `camera_gizmo`, `camera_numbers` and `camera_writing` are the parts.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser._messages import HotkeyKey  # the type of add_command's argument (viser 1.1.1)
+
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.core.cameras.conventions import target_of
+from workbench.session.cameras.view import StudioCamera, StudioView
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.cameras.compare import CameraCompare
+from workbench.ui.cameras.export import CameraExport
+from workbench.ui.cameras.fields import CameraNumbers
+from workbench.ui.cameras.frustums import Placed
+from workbench.ui.cameras.gizmo import CameraGizmo, LookThrough
+from workbench.ui.cameras.panel import KIND_NAMES, StudioPicture
+from workbench.ui.cameras.pixel_probe import CameraPick
+from workbench.ui.cameras.pose_math import Floats, Frame, Placing, Snap, nudged, panned
+from workbench.ui.cameras.report import CameraVerdict
+from workbench.ui.cameras.suggest import CameraSuggest
+from workbench.ui.cameras.write_to_file import CameraWriting
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.hotkeys import Command
+from workbench.ui.widgets.inputs import Control, refusals_told
+from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.templates import render, sentence
+
+NOBODY = "none"
+SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
+KINDS = {"rgb": "colour", "segmentation": "bodies"}
+SCALES = {"own size": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
+STEP = 0.01
+"""Metres by which a key moves the camera."""
+TURN = 1.0
+"""Degrees by which a key turns it."""
+PLACE = (
+    "move, turn: its pose. Move it, and what it looks at goes along; or turn it.\n"
+    "eye and target: move the eye, and it goes on looking at its target; or move the target."
+)
+ALONG = "Along which axes it is moved and turned. The camera's own: red is forward, green left, blue up."
+STEPS = "In which it is dragged."
+SIZE = "Of the picture above, for a quick look. The camera keeps its own."
+VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
+IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
+
+
+@dataclass(frozen=True)
+class Toggle:
+    """A row of buttons of which one is on."""
+
+    label: str
+    hint: str
+    choices: dict[str, Any]
+    now: object
+    choose: Callable[[Any], None]
+
+
+class StudioPanel(PagePart[SessionView]):
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        self._server, self._session = server, session
+        self._placing = Placing(session)
+        self._keys: tuple[CameraKey, ...] = ()
+        self._names: dict[str, CameraKey | None] = {NOBODY: None}
+        self._in_its_eye = False
+        self._is_empty = False
+        """All below the choice is hidden, since no camera is chosen."""
+        self._look_at, self._own_axes, self._snap = False, False, Snap()
+        gui = server.gui
+        choices: tuple[str, ...] = (NOBODY,)
+        self._choice: Control[Any, Any] = Control(
+            gui.add_dropdown("Camera", choices, initial_value=NOBODY, visible=False),
+            read=lambda name: self._names.get(name),
+            send=self.select,
+            shown=self._name_of,
+        )
+        self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
+        self._picture = StudioPicture(server, session, clock)
+        self._facts = gui.add_html("", visible=False)
+        self._tools = gui.add_html("", visible=False)
+        self._look = LookThrough(server, self._placing)
+        above = gui.add_folder(None)
+        self._handles = gui.add_html("", visible=False)
+        self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
+        self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer, above)
+        verdict, compare = CameraVerdict(server, session), CameraCompare(server, session)
+        self._suggest = CameraSuggest(server, session)
+        self._folders = verdict, compare, self._suggest, CameraExport(server, session)
+        self._presses = Presses(server)
+        with self._picture.folder:
+            self._pick = CameraPick(server, session, self._presses)
+        self._gizmo = CameraGizmo(
+            server,
+            self._placing,
+            snap=lambda: self._snap,
+            own_axes=lambda: self._own_axes,
+            look_at=lambda: self._look_at,
+        )
+
+    @property
+    def shows(self) -> str:
+        """Which kind of picture is to be made of the chosen camera."""
+        return self._picture.shows
+
+    # --- chosen ------------------------------------------------------------------------------------------
+
+    def select(self, key: CameraKey | None) -> None:
+        self._session.studio.select(key)
+
+    def _name_of(self, key: CameraKey | None) -> str | None:
+        return next((name for name, known in self._names.items() if known == key), NOBODY)
+
+    # --- in the view -------------------------------------------------------------------------------------
+
+    def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, Placed]:
+        """Put the handles where the chosen camera is; return where its frustum is to be drawn.
+
+        That is where it was placed and not where its newest picture was taken, or it would lag behind the hand.
+
+        Args:
+            offset: (3,) where the selected env stands in the view.
+        """
+        self._placing.offset = offset
+        self._suggest.draw_in_view(view, offset)
+        self._pick.draw_in_view(view, offset)
+        chosen = view.studio.placeable
+        camera = chosen if view.timeline.shown is None else None
+        self._look.draw(chosen)
+        eye = None if chosen is None else self._placing.frame(chosen).to_view(_placed(chosen))
+        covered = self._look.any or (eye is not None and self._is_in_eye(eye))
+        self._in_its_eye = covered and not self._look.any
+        self._gizmo.draw(None if covered else camera)
+        if chosen is None or eye is None:
+            return {}
+        return {chosen.key: Placed(eye, _placed(chosen), hidden=covered)}
+
+    def _is_in_eye(self, pose: Floats) -> bool:
+        """Whether a page looks from where the camera stands: its frustum, with its picture, would fill that view."""
+        near = (
+            float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
+        )
+        return min(near, default=1.0) < 0.1
+
+    # --- the tab -----------------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        studio = view.studio
+        self._draw_choice(view)
+        self._writing.draw(studio)
+        chosen, camera = studio.chosen, studio.placeable
+        if chosen is None and self._is_empty:
+            return
+        self._is_empty = chosen is None
+        self._facts.visible = chosen is not None
+        self._tools.visible = camera is not None
+        self._handles.visible = camera is not None
+        self._numbers.draw(camera)
+        self._picture.draw(view)
+        self._pick.draw(view, shown=self._picture.visible)
+        for part in self._folders:
+            # Folders without a subject would be dead controls.
+            part.folder.visible = chosen is not None
+            part.draw(view)
+        if chosen is not None:
+            self._facts.content = self._facts_of(chosen, view)
+        if camera is not None:
+            self._tools.content = self._tools_of(camera, studio)
+            self._handles.content = self._handles_of(studio.quick_scale)
+
+    def _draw_choice(self, view: SessionView) -> None:
+        studio = view.studio
+        keys = tuple(camera.key for camera in studio.cameras)
+        if keys != self._keys:
+            self._keys = keys
+            self._names = {
+                NOBODY: None,
+                **{f"{name} · {KIND_NAMES[kind]}": (kind, name) for kind, name in keys},
+            }
+            self._choice.handle.options = tuple(self._names)
+        self._choice.show(studio.selected)
+        self._choice.handle.visible = bool(keys)
+        if not keys:
+            text = (
+                "This task has no camera."
+                if view.task is not None
+                else "Cameras appear when the task is loaded."
+            )
+        elif studio.selected is None:
+            text = "Choose a camera here, or press its frustum in the view, to place it."
+        else:
+            text = ""
+        self._note.visible = bool(text)
+        if text:
+            self._note.content = render("note", text=text)
+
+    def _facts_of(self, camera: StudioCamera, view: SessionView) -> str:
+        info = camera.info
+        return render(
+            "studio_facts",
+            refused=sentence(camera.refused),
+            moved=camera.moved,
+            file="" if info.site is None else PurePath(info.site.file).name,
+            line=None if info.site is None else info.site.line,
+            mount=info.mount,
+            varies=VARIES if info.varies else "",
+            hint=IN_ITS_EYE if self._in_its_eye else "",
+            problem=view.studio.problem,
+            took=f"{view.picture_milliseconds:.0f}"
+            if view.picture_milliseconds and view.studio.quick_scale == 1.0
+            else "",
+            quick=_quick_words(camera, view.studio.quick_scale),
+        )
+
+    def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
+        actions = self._session.studio
+        looks = self._look.any
+        rows = [
+            [
+                self._tool(
+                    "Back to my view" if looks else "Look through it", "", "look", self._look.toggle, on=looks
+                ),
+                self._tool("Put it where I look", "", "put", self._put),
+            ],
+            [
+                self._tool(
+                    "Undo",
+                    f"Take back: {studio.undo} (Ctrl+Z)" if studio.undo else "There is nothing to take back.",
+                    "undo",
+                    lambda _: actions.undo(),
+                    off=studio.undo is None,
+                ),
+                self._tool(
+                    "Redo",
+                    f"Make again: {studio.redo} (Ctrl+Shift+Z)"
+                    if studio.redo
+                    else "There is nothing to make again.",
+                    "redo",
+                    lambda _: actions.redo(),
+                    off=studio.redo is None,
+                ),
+                self._tool(
+                    "Back to the file",
+                    "Place it as the file says." if camera.moved else "It is as the file says.",
+                    "back",
+                    lambda _: self._back_to_file(),
+                    off=not camera.moved,
+                ),
+            ],
+        ]
+        return render("studio_tools", rows=rows)
+
+    def _handles_of(self, scale: float) -> str:
+        """What is dragged in the view, along which axes, in which steps; and how large the picture above is."""
+
+        def keep(name: str) -> Callable[[Any], None]:
+            return partial(setattr, self, name)
+
+        kinds = {KINDS.get(kind, kind): kind for kind in self._picture.kinds}
+        toggles = (
+            Toggle(
+                "Place", PLACE, {"move, turn": False, "eye and target": True}, self._look_at, keep("_look_at")
+            ),
+            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, keep("_own_axes")),
+            Toggle("Steps", STEPS, SNAPS, self._snap, keep("_snap")),
+            Toggle(
+                "Shows", "What the picture above is of.", kinds, self._picture.shows, self._picture.show_kind
+            ),
+            Toggle("Size", SIZE, SCALES, scale, self._session.studio.set_quick_scale),
+        )
+        rows = [
+            [
+                {"label": one.label, "hint": one.hint},
+                *(
+                    self._tool(
+                        name,
+                        "",
+                        f"{one.label} {name}",
+                        lambda _, one=one, value=value: one.choose(value),
+                        one.now == value,
+                        one.label == "Along" and self._look_at,
+                    )
+                    for name, value in one.choices.items()
+                ),
+            ]
+            for one in toggles
+        ]
+        return render("studio_tools", rows=rows)
+
+    def _tool(
+        self,
+        name: str,
+        hint: str,
+        key: str,
+        pressed: Callable[[viser.ClientHandle | None], None],
+        on: bool = False,
+        off: bool = False,
+    ) -> dict[str, object]:
+        press = self._presses.id_of(key, pressed)
+        return {"name": name, "hint": hint, "on": on, "press": "" if off else press}
+
+    # --- what is pressed ---------------------------------------------------------------------------------
+
+    def _back_to_file(self) -> None:
+        key = self._session.view().studio.selected
+        if key is not None:
+            self._session.studio.back_to_file(key)
+
+    def _put(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        with refusals_told(client):
+            self._placing.change(None, partial(self._look.settings_from, client))
+
+    def _new_from_viewer(self, client: viser.ClientHandle, settings: CameraSettings) -> CameraSettings:
+        return self._look.settings_from(client, settings, Frame(None, self._placing.offset))
+
+    def commands(self) -> list[Command]:
+        """Of the page's keys. The arrows alone are the timeline's."""
+        return [
+            Command("Take back the last change of a camera", self._session.studio.undo, "Z", "cmd/ctrl"),
+            Command("Make it again", self._session.studio.redo, "Z", "cmd/ctrl+shift"),
+            self._moves("to its left", "arrowleft", (0, STEP, 0)),
+            self._moves("to its right", "arrowright", (0, -STEP, 0)),
+            self._moves("up", "arrowup", (0, 0, STEP)),
+            self._moves("down", "arrowdown", (0, 0, -STEP)),
+            self._moves("forward", "pageup", (STEP, 0, 0)),
+            self._moves("back", "pagedown", (-STEP, 0, 0)),
+            self._turns("to the left", "arrowleft", TURN, 0),
+            self._turns("to the right", "arrowright", -TURN, 0),
+            self._turns("up", "arrowup", 0, TURN),
+            self._turns("down", "arrowdown", 0, -TURN),
+        ]
+
+    def _moves(self, name: str, key: HotkeyKey, step: tuple[float, float, float]) -> Command:
+        move = partial(self._by_key, partial(nudged, step=step), "key")
+        return Command(f"Move the chosen camera {name}", move, key, "alt")
+
+    def _turns(self, name: str, key: HotkeyKey, left: float, up: float) -> Command:
+        turn = partial(self._by_key, partial(panned, left=left, up=up), "turning key")
+        return Command(f"Turn the chosen camera {name}", turn, key, "alt+shift")
+
+    def _by_key(self, move: Callable[[Floats], Floats], hand: str) -> None:
+        def change(now: CameraSettings, frame: Frame) -> CameraSettings:
+            moved = frame.from_view(now, move(frame.to_view(now)))
+            keeps_target = self._look_at and moved.position != now.position
+            return frame.turned_to(moved, target_of(now)) if keeps_target else moved
+
+        if self._placing.camera is not None:
+            self._placing.change(hand, change)
+
+
+def _placed(camera: StudioCamera) -> CameraSettings:
+    assert camera.now is not None
+    return camera.now
+
+
+def _quick_words(camera: StudioCamera, scale: float) -> str:
+    if scale == 1.0 or camera.now is None:
+        return ""
+    width, height = round(camera.now.width * scale), round(camera.now.height * scale)
+    return (
+        f"The picture is {width} × {height} for a quick look; the camera stays {camera.now.width} × "
+        f"{camera.now.height}, and only that is written."
+    )

@@ -1,0 +1,356 @@
+"""A camera's way into the author's file: the change is shown as a diff, made, checked, and can be taken back.
+
+The button that makes a change is only beside its diff, and what comes after (the reload, the comparison of the new
+env's camera with what was asked for) is said in the same place. A plan is asked for anew if the camera was moved since.
+Changes are asked for at two places of the tab, so each has a box of its own, which is brought into sight.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import PurePath
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.camera_data import CameraKind, CameraSettings
+from workbench.core.cameras.conventions import axes_of, intrinsic_of, pose_of, vertical_fov
+from workbench.session.cameras.file_edits import MADE
+from workbench.session.cameras.view import StudioView, Wish, Writing
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.cameras.pose_math import Placing, rounded
+from workbench.ui.server.control_values import limit_text
+from workbench.ui.server.viser_private import element_id
+from workbench.ui.widgets.images import data_address
+from workbench.ui.widgets.inputs import Arrival
+from workbench.ui.widgets.templates import render
+
+LEAVE, CLOSE = "Leave the file as it is", "Close"
+MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
+NOTHING = Writing()
+
+
+class CameraChange:
+    """One box in the present container."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        gui = server.gui
+        self.arrival = Arrival()
+        self._text = gui.add_html("", visible=False)
+        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
+        self._undo = gui.add_button(
+            "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+        )
+        self._copy = gui.add_button(
+            "Copy the task into my folder",
+            icon=viser.Icon.COPY,
+            visible=False,
+            hint=f"A file of your own in {session.studio.file.folder}, under a name that is free; the page opens it.",
+        )
+        self._drop = gui.add_button(LEAVE, color="gray", visible=False)
+        self._write.on_click(lambda _: session.studio.file.write())
+        self._undo.on_click(lambda _: session.studio.file.undo_write())
+        self._copy.on_click(lambda _: session.studio.file.copy_task())
+        self._drop.on_click(lambda _: session.studio.file.drop_plan())
+        self._drawn: tuple[Writing, bool, bool] | None = None
+
+    def draw(self, writing: Writing, stale: bool) -> None:
+        """Show how far it is; a `Writing` of no stage and no message empties the box.
+
+        Args:
+            stale: the camera was moved since the plan was made.
+        """
+        stage = writing.stage
+        self._text.visible = stage != "none" or bool(writing.message)
+        self._copy.visible = writing.can_copy
+        self._write.visible = stage == "planned" and not stale
+        self._drop.visible = stage not in ("none", "written")
+        self._undo.visible = stage in MADE
+        name = "" if writing.edit is None else writing.edit.names
+        self._drop.label = LEAVE if stage == "planned" else CLOSE
+        self._write.label = f"Write it to {name}" if name else "Write it"
+        new = self.arrival.just_came(writing if stage != "none" else None)
+        if self._drawn is None or self._drawn[0] is not writing or self._drawn[1:] != (stale, new):
+            self._drawn = writing, stale, new
+            self._text.content = writing_html(writing, stale, element_id(self._drop) if new else "")
+
+
+def writing_html(writing: Writing, stale: bool, scroll_to: str = "") -> str:
+    """How far the change is; every value escaped.
+
+    Args:
+        scroll_to: id of the element that is to come into sight.
+    """
+    edit, planned = writing.edit, writing.stage == "planned"
+    seen = writing.picture.rgb if planned and writing.picture is not None else None
+    files = [] if edit is None or writing.stage == "undone" else edit.changes
+    return render(
+        "camera_writing",
+        message="The camera was moved since: show the change again." if stale else writing.message,
+        mood="warn" if stale else MOODS.get(writing.stage, "plain"),
+        about=writing.wish.about if planned and writing.wish is not None else "",
+        picture="" if seen is None else data_address(seen, PREVIEW),
+        files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
+        folded=writing.stage in MADE,
+        notes=() if edit is None or writing.stage == "undone" else edit.notes,
+        snippet=writing.snippet,
+        scroll_to=scroll_to,
+    )
+
+
+def diff_lines(diff: str) -> list[tuple[str, str]]:
+    """Each line of a unified diff with its kind (``add``, ``del``, ``at``, ``same``), less the names of the files.
+
+    The indentation that all of them have is left out: the panel is narrow.
+    """
+    kinds = {"+": "add", "-": "del", "@": "at"}
+    lines = [(kinds.get(line[:1], "same"), line) for line in diff.splitlines()[2:]]
+    code = [line[1:] for kind, line in lines if kind != "at" and line[1:].strip()]
+    indent = min((len(line) - len(line.lstrip()) for line in code), default=0)
+    return [(kind, line if kind == "at" else line[:1] + " " + line[1 + indent :]) for kind, line in lines]
+
+
+DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
+ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
+WHERE = (
+    "A new sensor looks at the task's objects from the side that you look from; one for people stands where you look "
+    "from. Its picture comes with the change, before anything is written."
+)
+LONGEST_NAME = 64
+NEW = CameraSettings(
+    position=(0.0, 0.0, 0.0),
+    quaternion=(1.0, 0.0, 0.0, 0.0),
+    fov=1.0,
+    intrinsic=None,
+    width=128,
+    height=128,
+    near=0.01,
+    far=100.0,
+    shader_pack="minimal",
+)
+"""A camera that is added to a task that has none of its kind, but for its place: what ManiSkill's own tasks have."""
+NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
+PREVIEW = 256
+"""Pixels of the longer side of the new camera's picture."""
+
+FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
+
+
+class CameraWriting:
+    """The folder that adds, copies, renames and removes, in the present container.
+
+    Args:
+        above: takes what writes where the chosen camera was placed.
+        from_viewer: these settings at the place from which a page's own view looks, in the env's frame.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        placing: Placing,
+        from_viewer: FromViewer,
+        above: viser.GuiFolderHandle,
+    ) -> None:
+        self._session, self._placing, self._from_viewer = session, placing, from_viewer
+        gui = server.gui
+        self._named: Writing | None = None
+        """The last change after which the field for a name was emptied."""
+        with above:
+            # Always there: one that came with the first movement would push what is under it out of the hand.
+            self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
+            self._change = CameraChange(server, session)
+        with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
+            self._name = gui.add_text(
+                "New name",
+                "",
+                hint="Letters, digits, - and _. A camera that is added without one is given one.",
+            )
+            limit_text(self._name, LONGEST_NAME)
+            self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
+            add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
+            self._why_not = gui.add_html("", visible=False)
+            gui.add_html(render("aside", text=WHERE))
+            self._member_change = CameraChange(server, session)
+        self._plan.on_click(lambda _: self._plan_write())
+        self._with_chosen.on_click(self._on_member)
+        add.on_click(self._on_member)
+
+    # --- asked -----------------------------------------------------------------------------------------
+
+    def _plan_write(self) -> None:
+        camera = self._placing.camera
+        if camera is not None:
+            self._ask(Wish("edit", camera.key))
+
+    def _ask(self, wish: Wish) -> None:
+        """Note what is asked for and where, and then ask: the answer may come at once."""
+        self._say("")
+        change = self._change if wish.what == "edit" else self._member_change
+        change.arrival.asked(self._session.view().studio.writing)
+        self._session.studio.file.plan(wish)
+
+    def _on_member(self, event: viser.GuiEvent) -> None:
+        try:
+            self._plan_member(event.target.value, event.client)
+        except ValueError as error:
+            self._say(str(error))
+
+    def _say(self, why_not: str) -> None:
+        """Beside the buttons that were pressed, where one looks."""
+        self._why_not.visible = bool(why_not)
+        self._why_not.content = render("warning", text=why_not) if why_not else ""
+
+    def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
+        view = self._session.view()
+        chosen = view.studio.chosen
+        if what in (ADD_SENSOR, ADD_HUMAN) and client is not None:
+            kind = "sensor" if what == ADD_SENSOR else "human"
+            key = (kind, self._checked_name(view.studio, kind, NEW_NAMES[kind]))
+            settings, words = self._from_viewer(client, lens_of_siblings(view.studio, kind)), ""
+            names, places = objects_in(view)
+            if kind == "sensor":
+                settings, words = first_place(settings, names, places)
+            settings = replace(settings, distance=distance_to(settings, places))
+            self._ask(Wish("add", key, settings, about=words))
+        elif chosen is None:
+            raise ValueError("Choose the camera first.")
+        elif what == REMOVE:
+            self._ask(Wish("remove", chosen.key))
+        elif what in (DUPLICATE, RENAME):
+            name = self._checked_name(view.studio, chosen.key[0], chosen.key[1] if what == DUPLICATE else "")
+            change = "duplicate" if what == DUPLICATE else "rename"
+            self._ask(Wish(change, chosen.key, name=name))
+
+    def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
+        """The name that was typed, or a free one like another; `ValueError` where neither is there."""
+        name = self._name.value.strip()
+        if not name and like:
+            return free_name(view, kind, like)
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
+            raise ValueError(
+                "Type a new name first: letters, digits, - and _."
+                if not name
+                else "A name has letters, digits, - and _."
+            )
+        if any(camera.key == (kind, name) for camera in view.cameras):
+            raise ValueError(f"There is a camera {name} already.")
+        return name
+
+    # --- drawn -----------------------------------------------------------------------------------------
+
+    def draw(self, studio: StudioView) -> None:
+        chosen, writing = studio.chosen, studio.writing
+        stale = is_stale(studio)
+        can_place = chosen is not None and not chosen.refused
+        of_members = writing.what != "edit"
+        # Not at the place of the button that writes: a second press must not write what was not read.
+        can_plan = can_place and (writing.stage != "planned" or stale or of_members)
+        wants_plan = can_plan and chosen is not None and chosen.moved and writing.stage != "written"
+        self._plan.visible = can_plan
+        self._plan.disabled = not wants_plan
+        for change, here in ((self._change, not of_members), (self._member_change, of_members)):
+            change.draw(writing if here else NOTHING, stale and here)
+        if writing.stage == "checked" and of_members and writing is not self._named:
+            self._named = writing
+            self._name.value = ""  # it is taken now
+        self._with_chosen.visible = chosen is not None
+
+
+def is_stale(studio: StudioView) -> bool:
+    """The camera was moved since the plan for it was made."""
+    wish = studio.writing.wish
+    if studio.writing.stage != "planned" or wish is None or wish.what == "add":
+        return False
+    camera = studio.camera(wish.key)
+    return camera is not None and camera.now != wish.settings
+
+
+def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
+    """A camera like the first of its kind that stands still, as the file has it; else as ManiSkill's tasks have them."""
+    for camera in studio.cameras:
+        if camera.key[0] == kind and camera.info.mount is None and camera.info.settings is not None:
+            return camera.info.settings
+    return NEW if kind == "sensor" else replace(NEW, width=512, height=512)
+
+
+def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
+    """`like`, or with a number at its end, that no camera of the kind has."""
+    taken = {camera.key for camera in studio.cameras}
+    names = itertools.chain([like], (f"{like}_{number}" for number in itertools.count(2)))
+    return next(name for name in names if (kind, name) not in taken)
+
+
+# --- where a sensor stands that is added ------------------------------------------------------------
+
+# On the side from which somebody looks, near enough to see the task's objects. Who adds a camera looks at a whole table,
+# or at a grid of sixteen, from metres away, and at that distance a cube is four pixels of a picture of 128. What they have
+# chosen is the side. So the direction of their view is kept, and the eye goes along it to where the objects of all envs
+# fill the picture; if they look from about there, it stands where they look from.
+
+AROUND = 0.1
+"""Metres of room around the middles of the objects."""
+ROOM = 1.25
+"""Times the distance from which they just fill the picture."""
+NEAREST = 0.6
+"""Metres from which a hand that reaches for one small thing is in the picture too."""
+NEAR_ENOUGH = 1.5
+"""Times the distance that is wanted, up to which an eye stays where it is."""
+NEAREST_TARGET = 0.1
+"""Metres."""
+MOST_NAMES = 3
+
+
+def first_place(
+    seen_from: CameraSettings, names: tuple[str, ...], places: NDArray[np.float64]
+) -> tuple[CameraSettings, str]:
+    """A new sensor, and where that is, a sentence.
+
+    Args:
+        seen_from: a camera of the lens that is added, where somebody looks from, in the env's frame.
+        names: of the objects that it is to see.
+        places: (K, 3) where they are in all envs, each in its env's frame.
+    """
+    stays = "It stands where you look from."
+    if not len(places):
+        return seen_from, stays
+    pose = pose_of(seen_from)
+    # One object that fell from the table must not take the camera away from all others.
+    middle = np.median(places, axis=0)
+    reach = float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.9)) + AROUND
+    fov = vertical_fov(intrinsic_of(seen_from), seen_from.height)
+    wanted = max(NEAREST, ROOM * reach / math.sin(fov / 2))
+    away = float(np.linalg.norm(middle - pose[:3]))
+    if away <= NEAR_ENOUGH * wanted:
+        return seen_from, stays
+    x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
+    told = ", ".join(names[:MOST_NAMES]) + (" and others" if len(names) > MOST_NAMES else "")
+    words = f"It looks from your side at {told} from {wanted:.2f} m; you look from {away:.1f} m away."
+    return replace(seen_from, position=(x, y, z)), words
+
+
+def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
+    """Metres along the line of sight to where the middle of some places (K, 3) is nearest; None if that is behind."""
+    if not len(places):
+        return None
+    pose = pose_of(settings)
+    distance = float((np.median(places, axis=0) - pose[:3]) @ axes_of(pose[3:])[0])
+    return None if distance < NEAREST_TARGET else distance
+
+
+def objects_in(view: SessionView) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+    """What a sensor may see of a task's objects, and (K, 3) where it is in all envs at the shown moment."""
+    task, step = view.task, view.step
+    if task is None or step is None or step.poses.shape[1] != len(task.geometry.body_names):
+        return (), np.zeros((0, 3))
+    objects = [thing for thing in task.objects if not (thing.hidden or thing.robot)]
+    bodies = {name for thing in objects for name in (thing.links or (thing.name,))}
+    columns = [i for i, name in enumerate(task.geometry.body_names) if name in bodies]
+    places = step.poses[:, columns, :3].reshape(-1, 3).astype(np.float64)
+    return tuple(thing.name for thing in objects), places[np.isfinite(places).all(axis=1)]

@@ -1,0 +1,180 @@
+"""Tags, notes and deleting in the library: what is asked before, and what is said when it cannot be done.
+
+What is asked is asked in a window over the page, since a form in the scrolled table would be out of sight. It is there
+for all open pages, and keeps what it was asked for, not what is selected by the time of the answer.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+
+import viser
+
+from workbench.recording.episode.row import LONGEST_NOTE, LibraryRow, clean_tags
+from workbench.recording.library.library import Library, LibraryError
+from workbench.ui.library.rows import in_words
+from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.templates import counted, render, size
+
+MOST_NAMES = 6
+
+
+class Question:
+    """One window with a question, open until it is answered or `close`."""
+
+    def __init__(self, server: viser.ViserServer, title: str, closed: Callable[[], None]) -> None:
+        self.modal = server.gui.add_modal(title)
+        self._closed = closed
+        self._lock = threading.Lock()
+
+    def close(self) -> bool:
+        """Close it; False if it was closed already: of two answers only one counts."""
+        with self._lock:
+            if self.modal.closed:
+                return False
+            self.modal.close()
+        self._closed()
+        return True
+
+
+MOST_KNOWN = 12
+"""Tags in use that are named."""
+
+
+class LibraryEdits:
+    """One question at a time.
+
+    Args:
+        asking: is told when a window with a question comes and when it goes.
+    """
+
+    def __init__(self, server: viser.ViserServer, library: Library, asking: Callable[[bool], None]) -> None:
+        self._server, self._library, self._asking = server, library, asking
+        self._lock = threading.RLock()
+        self._question: Question | None = None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        with self._lock:
+            if self._question is not None:
+                self._question.close()
+
+    def ask_tags(self, ids: tuple[str, ...]) -> None:
+        rows = self._rows(ids)
+        if not rows:
+            return
+        shared = [tag for tag in rows[0].tags if all(tag in row.tags for row in rows)]
+
+        def answered(typed: str) -> None:
+            tags = clean_tags(typed.split(","))
+            removed = [tag for tag in shared if tag not in tags]
+            self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
+
+        known = sorted({tag for row in self._library.rows() for tag in row.tags})
+        explained = "Words, with commas between them."
+        if len(rows) > 1:
+            explained += " Those that all of them have stand here; others that they have stay."
+        if known:
+            explained += f" In use: {', '.join(known[:MOST_KNOWN])}."
+        self._ask("Tags", "", rows, explained, "Save", answered, ", ".join(shared))
+
+    def ask_note(self, ids: tuple[str, ...]) -> None:
+        rows = self._rows(ids)
+        if not rows:
+            return
+        notes = {row.note for row in rows}
+        explained = "" if len(notes) == 1 else "They have different notes; this one takes their place."
+
+        def answered(typed: str) -> None:
+            self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
+
+        self._ask("Note", "", rows, explained, "Save", answered, notes.pop() if len(notes) == 1 else "")
+
+    def ask_delete(self, ids: tuple[str, ...]) -> None:
+        rows = self._rows(ids)
+        if not rows or not self._do(lambda: self._library.may_delete(ids)):
+            return
+        self._ask(
+            "Delete recordings",
+            f"Delete {in_words(rows)}?",
+            rows,
+            "All their files go to the folder .trash in the library, and can be taken back from there.",
+            "Delete",
+            lambda _: self._do(lambda: self._library.delete(ids)),
+        )
+
+    def ask_empty(self) -> None:
+        trash = self._library.view().trash
+        self._ask(
+            "Empty the trash",
+            f"Delete {counted(trash.files, 'file')} ({size(trash.size)}) for good?",
+            [],
+            "This cannot be undone.",
+            "Delete for good",
+            lambda _: self._do(self._library.empty_trash),
+        )
+
+    def undo_delete(self) -> None:
+        self._do(self._library.undo_delete)
+
+    def _ask(
+        self,
+        title: str,
+        asked: str,
+        rows: Sequence[LibraryRow],
+        explained: str,
+        do: str,
+        answered: Callable[[str], object],
+        value: str | None = None,
+    ) -> None:
+        """
+        Args:
+            do: the button that is a yes.
+            answered: gets what was typed, as the page sent it, on a thread of viser's.
+            value: what stands in a field for a line of text, in which Enter is a yes too. None asks for none: what is
+                done then takes something away.
+        """
+        gui, names = self._server.gui, [row.name for row in rows]
+        shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
+        with self._lock:
+            self.close()
+            self._asking(True)
+            self._question = question = Question(self._server, title, lambda: self._asking(False))
+        with question.modal:
+            more = len(names) - len(shown)
+            gui.add_html(render("library_question", question=asked, names=shown, more=more, answer=explained))
+            form = None if value is None else gui.add_form(None)
+            if form is None:
+                yes = gui.add_button(do, color="red", icon=viser.Icon.TRASH)
+            else:
+                with form:
+                    field = gui.add_text("", value or "")
+                yes = gui.add_button(do, icon=viser.Icon.CHECK)
+            cancel = gui.add_button("Cancel", color="gray")
+
+        def answer(_event: object) -> None:
+            typed = "" if form is None else field.value
+            if question.close():
+                answered(typed)
+
+        def give_up(_event: object) -> None:
+            question.close()
+
+        if form is not None:
+            form.on_submit(answer)
+        yes.on_click(answer)
+        cancel.on_click(give_up)
+
+    def _rows(self, ids: Sequence[str]) -> list[LibraryRow]:
+        rows = (self._library.row(id) for id in ids)
+        return [row for row in rows if row is not None]
+
+    def _do(self, work: Callable[[], object]) -> bool:
+        """Whether it could be done; if not, it is said why."""
+        try:
+            work()
+        except LibraryError as error:
+            tell_all(self._server, "Not possible", str(error), seconds=8.0)
+            return False
+        return True

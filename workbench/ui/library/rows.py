@@ -1,0 +1,190 @@
+"""What the rows of the library say, which of them are shown, and in which order.
+
+Pure functions of rows, so that what a person reads can be checked without a browser. Rows without a value in a column
+come last whichever way it is sorted, and ties keep the newest first, which is the order that the table begins with.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+from workbench.machine.text import number_text
+from workbench.recording.episode.row import LibraryRow
+from workbench.ui.widgets.templates import counted, size
+
+Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
+COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success")
+"""Of a row's first line."""
+SECOND_LINE: tuple[Column, ...] = ("name", "version", "tags", "note")
+HINTS: dict[Column, str] = {
+    "task": "Env id of the task",
+    "date": "When it was recorded",
+    "seed": "Seed of the reset that began it",
+    "steps": "Control steps",
+    "return": "Sum of the rewards",
+    "success": "At the last step; 'once' if only at a step before",
+    "version": "Hash of the task's source; orange where it is not that of the newest recording of the task",
+    "tags": "Tags",
+    "note": "Note",
+    "name": "Name of its files",
+}
+Outcome = Literal["all", "success", "failed", "broken"]
+MEANS: dict[Outcome, str] = {
+    "all": "Every recording",
+    "success": "Success at the last step",
+    "failed": "No success at the last step",
+    "broken": "Something is wrong with the files",
+}
+HASH = 7
+"""Characters of a source hash that are shown."""
+_DESCENDING_FIRST: tuple[Column, ...] = ("date", "steps", "return", "success")
+
+
+def newest_sources(rows: Iterable[LibraryRow]) -> dict[str, str]:
+    """Source hash of the newest recording of each task that has one."""
+    newest: dict[str, tuple[float, str]] = {}
+    for row in rows:
+        if row.source_hash and row.written is not None:
+            newest[row.task] = max(newest.get(row.task, (-1.0, "")), (row.written, row.source_hash))
+    return {task: source for task, (_, source) in newest.items()}
+
+
+def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
+    if outcome == "success":
+        return row.success is True
+    if outcome == "failed":
+        return row.success is False
+    if outcome == "broken":
+        return row.problem is not None
+    return True
+
+
+def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
+    """Whether each of these lower-case words is somewhere in its task, tags, note, name, source hash or what chose its
+    actions; ``seed:3`` means that seed."""
+    said = "\n".join(
+        (row.task, *row.tags, row.note, row.name, row.source_hash, row.acted_by, row.problem or "")
+    ).lower()
+    return all(
+        row.seed is not None and word == f"seed:{row.seed}" if word.startswith("seed:") else word in said
+        for word in words
+    )
+
+
+def chosen(
+    rows: Iterable[LibraryRow], words: str = "", outcome: Outcome = "all", task: str | None = None
+) -> list[LibraryRow]:
+    """The rows that a filter lets through.
+
+    Args:
+        words: parted by spaces; each must be found.
+        task: None for all.
+    """
+    wanted = words.lower().split()
+    return [
+        row
+        for row in rows
+        if (task is None or row.task == task) and has_outcome(row, outcome) and has_words(row, wanted)
+    ]
+
+
+def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
+    """What is said where a filter lets nothing through."""
+    wanted = f" of {task}" if task is not None else ""
+    kind = {"all": "recording", "success": "successful recording", "failed": "failed recording"}.get(
+        outcome, f"{outcome} recording"
+    )
+    words = words.strip()
+    return f"No {kind}{wanted} has \u201c{words}\u201d." if words else f"There is no {kind}{wanted}."
+
+
+def begins_descending(column: Column) -> bool:
+    """Whether the first press on a column puts the largest first."""
+    return column in _DESCENDING_FIRST
+
+
+def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> list[LibraryRow]:
+    newest_first = sorted(rows, key=lambda row: (-(row.written or 0.0), row.name))
+    known = [row for row in newest_first if _key(row, column) is not None]
+    unknown = [row for row in newest_first if _key(row, column) is None]
+    known.sort(key=lambda row: _key(row, column), reverse=descending)  # type: ignore[arg-type,return-value]
+    return known + unknown
+
+
+def _key(row: LibraryRow, column: Column) -> float | str | None:
+    """What a row is sorted by; None for no value."""
+    if column == "date":
+        return row.written
+    if column == "seed":
+        return row.seed
+    if column == "steps":
+        return row.length
+    if column == "return":
+        known = row.total_reward
+        return known if known is not None and math.isfinite(known) else None
+    if column == "success":
+        return {"success": 3.0, "once": 2.0, "no": 1.0, "fail": 0.0}.get(_outcome(row))
+    texts = {"task": row.task, "version": row.source_hash, "note": row.note, "name": row.name}
+    text = " ".join(sorted(row.tags)) if column == "tags" else texts[column]
+    return text.lower() or None
+
+
+def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> dict[str, Any]:
+    """What is said of a row besides what stands in it.
+
+    Args:
+        newest: of `newest_sources`.
+        now: with the zone that dates are shown in.
+    """
+    when = None if row.date is None else row.date.astimezone(now.tzinfo)
+    env = "" if row.env_index is None else f"env {row.env_index}"
+    actions = f"actions: {row.acted_by}" if row.acted_by else ""
+    about = (row.name, env, size(row.size), row.control_mode, actions)
+    return {
+        "task": row.task or ("?" if row.problem else ""),
+        "date": "" if when is None else _short_date(when, now),
+        "when": "" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
+        "total": "" if row.total_reward is None else number_text(row.total_reward),
+        "outcome": _outcome(row),
+        "version": row.source_hash[:HASH],
+        "other_version": bool(row.source_hash) and newest.get(row.task, row.source_hash) != row.source_hash,
+        "about": ", ".join(part for part in about if part),
+        "remark": _remark(row),
+    }
+
+
+def _remark(row: LibraryRow) -> str:
+    if row.recovered:
+        return "cut short"
+    if row.kind == "workbench" or row.problem:
+        return ""
+    return {"maniskill": "ManiSkill", "rrd only": ".rrd only", "lerobot": "LeRobot"}.get(row.kind, row.kind)
+
+
+def _outcome(row: LibraryRow) -> str:
+    if row.success:
+        return "success"
+    if row.fail:
+        return "fail"
+    if row.success is None:
+        return ""
+    return "once" if row.success_once else "no"
+
+
+def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:
+    if when.date() == now.date():
+        return f"{when:%H:%M:%S}"
+    if when.year == now.year:
+        return f"{when.day} {when:%b %H:%M}"
+    return f"{when.day} {when:%b %Y}"
+
+
+def in_words(rows: Sequence[LibraryRow]) -> str:
+    """``3 recordings (9 files, 1.2 MB)``."""
+    files = {path for row in rows for path in row.paths}
+    by_files = {row.paths: row.size for row in rows}
+    what, of = counted(len(rows), "recording"), counted(len(files), "file")
+    return f"{what} ({of}, {size(sum(by_files.values()))})"

@@ -1,0 +1,328 @@
+"""The batch, one row an env: sort it, filter it, press a row to select that env and go to its moment.
+
+At most `MOST_ROWS` rows are drawn. Sorting and filter belong to the page's server, like the selected env, so two open
+pages show the same. Ties keep the order of the envs, or rows would jump about while nothing changes; an env without a
+value in a column comes last whichever way it is sorted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.machine.text import number_text
+from workbench.session.history.env_table import EnvRows, Outcome
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.live.timeline import polylines
+from workbench.ui.widgets.click_targets import Paged, Presses
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import render
+
+Filter = Literal["all", "failed", "running", "flagged"]
+FILTERS: dict[Filter, tuple[str, str, str]] = {
+    "all": ("all", "Every env", "There is no env."),
+    "failed": (
+        "last failed",
+        "The last episode that came to an end ended without success: by fail, or at the time limit",
+        "In no env did the last episode fail.",
+    ),
+    "running": (
+        "running",
+        "The episode under way has not come to its first end",
+        "No env is running.",
+    ),
+    "flagged": (
+        "flagged",
+        "Something odd in the episode under way, or in the one before",
+        "No env is flagged.",
+    ),
+}
+"""What a pill says (an env that runs may have failed before, so "failed 16" beside "running 16" puzzles), what it means,
+and what is said where there is none."""
+MOST_ENTRIES = 6
+"""Columns of bool entries; a row of more is wider than the view."""
+POINTS = 40
+"""Of a row's small curve: it is 60 pixels wide."""
+CURVE_WIDTH, CURVE_HEIGHT = 60, 14
+_GRAVITY = np.array([2, 3, 0, 1])
+"""Of an `Outcome` when sorted by: failed first, then cut off, then running, then solved."""
+
+
+def entry_names(rows: EnvRows) -> tuple[str, ...]:
+    """The bool entries that get a column: ``success`` and ``fail`` first."""
+    names = sorted(rows.first_true, key=lambda name: (name != "success", name != "fail", name))
+    return tuple(names[:MOST_ENTRIES])
+
+
+def columns(rows: EnvRows) -> tuple[str, ...]:
+    """Names by which rows can be sorted, as they stand in the table."""
+    return (
+        "env",
+        "state",
+        "steps",
+        "return",
+        "last",
+        "flags",
+        *(f"first {name}" for name in entry_names(rows)),
+    )
+
+
+def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
+    """(N,) the envs that a filter lets through.
+
+    ``failed``: the present episode ended without success or, while it runs, the one before did.
+    ``flagged``: outliers in the present episode or the one before.
+    """
+    everyone = np.ones(rows.num_envs, bool)
+    if wanted == "failed":
+        running = rows.outcome == Outcome.RUNNING
+        bad = (Outcome.FAIL, Outcome.TRUNCATED)
+        return np.where(running, np.isin(rows.last.outcome, bad), np.isin(rows.outcome, bad))
+    if wanted == "running":
+        return rows.outcome == Outcome.RUNNING
+    if wanted == "flagged":
+        return np.isin(np.arange(rows.num_envs), [*rows.outliers, *rows.last.outliers])
+    return everyone
+
+
+def first_flagged(rows: EnvRows) -> int | None:
+    """The first env with something odd: in the episode under way, or else in the one before; None for none."""
+    return min(rows.outliers, default=None) if rows.outliers else min(rows.last.outliers, default=None)
+
+
+def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
+    """The envs that a filter lets through, sorted by a column; envs without a value last."""
+    envs = np.flatnonzero(mask(rows, wanted))
+    keys = _keys(rows, column)[envs]
+    keys = np.where(np.isnan(keys), np.inf, -keys if descending else keys)
+    return envs[np.argsort(keys, kind="stable")]
+
+
+def moment_of(rows: EnvRows, env: int) -> int | None:
+    """The step of its present episode that an env's row is about: its first outlier, else its end, else none."""
+    if env in rows.outliers:
+        return rows.outliers[env][0].step
+    return int(rows.end[env]) if rows.end[env] >= 0 else None
+
+
+def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """The cells of these envs. A curve is ``points`` of SVG polylines; reasons of flags are the oldest first."""
+    names = entry_names(rows)
+    curves = _curves(rows.rewards, envs)
+    made = []
+    for env, curve in zip(envs.tolist(), curves, strict=True):
+        state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
+        had_one = rows.last.steps[env] >= 0
+        before = [
+            f"{outlier.reason} (episode before, step {outlier.step})"
+            for outlier in rows.last.outliers.get(env, ())
+        ]
+        now = [f"{outlier.reason} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
+        made.append(
+            {
+                "env": env,
+                "state": state,
+                "total": number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
+                "steps": str(int(rows.steps[env])),
+                "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
+                "curve": curve,
+                "last": f"{'cut short' if last == 'running' else last} {rows.last.steps[env]}"
+                if had_one
+                else "",
+                "last_state": last,
+                "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
+                "flags": tuple(now + before),
+            }
+        )
+    return made
+
+
+def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
+    """(N,) NaN for no value."""
+    if column == "state":
+        return _GRAVITY[rows.outcome].astype(np.float64)
+    if column == "steps":
+        return rows.steps.astype(np.float64)
+    if column == "return":
+        return rows.total.astype(np.float64)
+    if column == "last":
+        return np.where(rows.last.steps < 0, np.nan, _GRAVITY[rows.last.outcome])
+    if column == "flags":
+        keys = np.full(rows.num_envs, np.nan)
+        keys[list(rows.last.outliers)] = 1.0
+        keys[list(rows.outliers)] = 0.0
+        return keys
+    if column.startswith("first "):
+        steps = rows.first_true.get(column.removeprefix("first "))
+        if steps is not None:
+            return np.where(steps < 0, np.nan, steps)
+    return np.arange(rows.num_envs, dtype=np.float64)
+
+
+def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[str]]:
+    """SVG points of each env's rewards, all on one scale: rows are there to be compared."""
+    chosen = rewards[envs].astype(np.float64)
+    finite = np.isfinite(chosen)
+    if not finite.any():
+        return [[] for _ in envs]
+    # As wide as the longest episode shown.
+    chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
+    every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
+    # A single step without a number is seen too.
+    finite = np.logical_and.reduceat(np.isfinite(chosen), every, axis=1)
+    chosen = chosen[:, every]
+    if not finite.any():
+        return [[] for _ in envs]
+    low, high = chosen[finite].min(), chosen[finite].max()
+    span = high - low if high > low else 1.0
+    x = np.round(np.linspace(0, CURVE_WIDTH, chosen.shape[1]), 1)
+    y = np.round(CURVE_HEIGHT - 1 - (CURVE_HEIGHT - 2) * (np.where(finite, chosen, low) - low) / span, 1)
+    return [
+        polylines([f"{a:g},{b:g}" if there else None for a, b, there in zip(x, heights, ok, strict=True)])
+        for heights, ok in zip(y, finite, strict=True)
+    ]
+
+
+def _step(step: int) -> str:
+    return "" if step < 0 else str(step)
+
+
+MOST_ROWS = 64
+"""On one page of the table."""
+HINTS = {
+    "env": "Press a column to sort by it, again to turn it round",
+    "state": "Of the episode under way: running until its first end",
+    "steps": "Control steps of the episode",
+    "return": "Sum of the rewards of the episode so far",
+    "last": "How the episode before ended, and at which step",
+    "flags": "What is odd: NaN or infinite, too fast, fallen, reward out of range",
+}
+
+
+class EnvPanel(PagePart[SessionView]):
+    """The table of envs in the present container."""
+
+    every = 0.3
+    """Faster, numbers of many rows cannot be read."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._handle = server.gui.add_html("")
+        self._presses = Presses(server)
+        self._column, self._descending = "env", False
+        self._filter: Filter = "all"
+        self._pages = Paged(MOST_ROWS)
+        self._pressed = 0
+        """How often something was that changes the table."""
+
+    def key(self, view: SessionView) -> object:
+        return view.task_serial, view.step_serial
+
+    def urgent(self, view: SessionView) -> object:
+        return view.selected_env, self._pressed
+
+    def draw(self, view: SessionView) -> None:
+        rows = self._session.env_rows()
+        content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
+        self._handle.content = content
+
+    def _html(self, rows: EnvRows, selected: int) -> str:
+        if self._column not in columns(rows):
+            self._column, self._descending = "env", False
+        envs = order(rows, self._column, self._descending, self._filter)
+        places = self._pages.places(len(envs))
+        shown = envs[places.start : places.stop]
+        return render(
+            "envs",
+            none_so=FILTERS[self._filter][2],
+            pills=[
+                {
+                    "name": shown_as,
+                    "hint": means,
+                    "count": int(np.count_nonzero(mask(rows, name))),
+                    "on": name == self._filter,
+                    "press": self._press(("filter", name), lambda name=name: self._choose_filter(name)),
+                }
+                for name, (shown_as, means, _) in FILTERS.items()
+            ],
+            pages=self._pages.shown(self._press),
+            head=self._head(rows),
+            rows=[
+                {
+                    "cells": row,
+                    "selected": row["env"] == selected,
+                    "press": self._press(("env", row["env"]), partial(self._choose_env, row["env"])),
+                }
+                for row in make_rows(rows, shown)
+            ],
+        )
+
+    def _head(self, rows: EnvRows) -> list[dict[str, str]]:
+        def sortable(name: str, column: str, hint: str) -> dict[str, str]:
+            arrow = "" if column != self._column else " ↓" if self._descending else " ↑"
+            press = self._press(("sort", column), lambda: self._choose_column(column))
+            return {"name": name, "arrow": arrow, "press": press, "hint": hint}
+
+        entries = [
+            sortable(name, f"first {name}", f"The first step at which {name} was true")
+            for name in entry_names(rows)
+        ]
+        plain = {
+            "name": "reward",
+            "arrow": "",
+            "press": "",
+            "hint": "Over the episode; all rows on one scale",
+        }
+        start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
+        return [*start, plain, *entries, *(sortable(name, name, HINTS[name]) for name in ("last", "flags"))]
+
+    # --- what is pressed ---------------------------------------------------------------------------
+
+    def _press(self, key: Hashable, do: Callable[[], None]) -> str:
+        def pressed(client: viser.ClientHandle | None) -> None:
+            do()
+            self._pressed += 1
+
+        return self._presses.id_of(key, pressed)
+
+    def _choose_env(self, env: int) -> None:
+        rows = self._session.env_rows()
+        if rows is None or env >= rows.num_envs:
+            return  # a version with fewer envs was loaded since the table was drawn
+        self._pressed += 1
+        self._session.change(selected_env=env)
+        step = moment_of(rows, env)
+        if step is not None:
+            self._session.past.seek_step(env, step)
+
+    def _choose_column(self, column: str) -> None:
+        self._descending = not self._descending if column == self._column else False
+        self._column = column
+        self._pages.go_to(0)
+
+    def _choose_filter(self, wanted: Filter) -> None:
+        self._filter = wanted
+        self._pages.go_to(0)
+
+    def select_first_flagged(self) -> None:
+        """The first env with something odd, at the step at which that began."""
+        rows = self._session.env_rows()
+        env = None if rows is None else first_flagged(rows)
+        if env is not None:
+            self._choose_env(env)
+
+    def select_next(self, wanted: Filter) -> None:
+        """The next env, by number and round the end, that a filter lets through; none if there is none."""
+        rows = self._session.env_rows()
+        if rows is None:
+            return
+        envs = np.flatnonzero(mask(rows, wanted))
+        if len(envs):
+            later = envs[envs > self._session.view().selected_env]
+            self._choose_env(int(later[0] if len(later) else envs[0]))

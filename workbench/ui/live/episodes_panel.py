@@ -1,0 +1,154 @@
+"""The Episodes tab: record, keep what was just seen, and how both stand.
+
+Three wishes, three buttons: *record from now on* (a fresh episode is begun, since one without its reset could not be
+made again), *record the next episode* and disturb nothing, and *keep what I just saw*, which makes a recording of the
+past. Each can be stopped where it was begun, and what each is doing stands under them in words.
+"""
+
+from __future__ import annotations
+
+import shlex
+
+import viser
+
+from workbench.recording.reader.reading import recovered_in_words
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.record.status import RecordingStatus
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import counted, render
+
+THIS_ENV, ALL_ENVS = "the selected env", "all envs"
+RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
+KEEP_BEFORE = "Keep the episode before"
+STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
+
+
+class RecordPanel(PagePart[SessionView]):
+    every = 0.2
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
+        self._button = server.gui.add_button(
+            RECORD,
+            icon=viser.Icon.PLAYER_RECORD,
+            color="red",
+            hint="Reset and record every episode until it is stopped (C)",
+        )
+        self._next = server.gui.add_button(
+            NEXT,
+            icon=viser.Icon.PLAYER_TRACK_NEXT,
+            hint="Wait for the next reset and record that one episode",
+        )
+        self._keep = server.gui.add_button(
+            KEEP,
+            icon=viser.Icon.HISTORY,
+            hint="Record after the fact: the episode at the moment that is shown (shift+C)",
+        )
+        self._before = server.gui.add_button(
+            KEEP_BEFORE,
+            icon=viser.Icon.PLAYER_TRACK_PREV,
+            color="gray",
+            visible=False,
+            hint="The episode that ended before the one that is shown",
+        )
+        self._about = server.gui.add_html("")
+        self._status = server.gui.add_html("")
+        self._button.on_click(lambda _: self.toggle())
+        self._next.on_click(lambda _: session.start_recording(self._envs, next_episode=True))
+        self._keep.on_click(lambda _: self.keep())
+        self._before.on_click(lambda _: session.keep_past(self._envs, before=True))
+
+    @property
+    def _envs(self) -> tuple[int, ...] | None:
+        return None if self._which.value == ALL_ENVS else (self._session.view().selected_env,)
+
+    def toggle(self) -> None:
+        """Start if nothing is recorded, stop if something is."""
+        if self._session.view().recording.active:
+            self._session.stop_recording()
+        else:
+            self._session.start_recording(self._envs)
+
+    def keep(self) -> None:
+        """Keep what was just seen, or give that up."""
+        if self._session.view().recording.keeping.progress is not None:
+            self._session.keeper.stop()
+        else:
+            self._session.keep_past(self._envs)
+
+    def key(self, view: SessionView) -> object:
+        return view.recording, view.timeline, view.step_serial
+
+    def urgent(self, view: SessionView) -> object:
+        recording = view.recording
+        shown = view.task_serial, view.state, view.selected_env, view.timeline.shown, self._which.value
+        stand = recording.active, recording.waiting, recording.keeping.progress is None
+        return *shown, *stand, view.timeline.moments == 0
+
+    def draw(self, view: SessionView) -> None:
+        recording, keeping = view.recording, view.recording.keeping.progress is not None
+        waits = recording.active and recording.waiting == len(recording.env_idx)
+        self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
+        self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
+        self._keep.label = STOP_KEEPING if keeping else KEEP
+        self._keep.icon = viser.Icon.PLAYER_STOP if keeping else viser.Icon.HISTORY
+        can_record = view.task is not None and view.state != "stopped"
+        self._button.disabled = not can_record and not recording.active
+        # Hidden, the next button would move under the pointer.
+        self._next.disabled = not can_record or recording.active
+        self._keep.disabled = view.timeline.moments == 0 and not keeping
+        self._which.disabled = not can_record
+        self._which.visible = view.task is None or view.task.num_envs > 1
+        about = what_keeping_means(view, self._which.value == ALL_ENVS)
+        self._about.content = render("note", text=about) if about and not keeping else ""
+        self._before.visible = has_one_before(view) and not keeping
+        self._status.content = recording_html(recording)
+
+
+def runs_since(view: SessionView) -> int | None:
+    """Steps of the selected env's episode up to what is shown, if that has not ended there; else None."""
+    step, env = view.step, view.selected_env
+    if step is None or view.timeline.moments == 0 or env >= len(step.elapsed_steps):
+        return None
+    if step.terminated[env] or step.truncated[env] or not step.elapsed_steps[env]:
+        return None
+    return int(step.elapsed_steps[env])
+
+
+def has_one_before(view: SessionView) -> bool:
+    """Whether there are moments before an episode that has not ended."""
+    steps, past = runs_since(view), view.timeline
+    at = past.last if past.shown is None else past.shown
+    return steps is not None and at - past.first > steps
+
+
+def what_keeping_means(view: SessionView, all_envs: bool) -> str:
+    """Which episode *Keep what I just saw* takes, where that is one that has not ended."""
+    steps = runs_since(view)
+    if steps is None or view.task is None:
+        return ""
+    if view.timeline.shown is not None:
+        return f"{KEEP} takes the whole episode round the moment that is shown."
+    count = f"{counted(steps, 'step')} so far"
+    if all_envs and view.task.num_envs > 1:
+        return f"{KEEP} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
+    which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
+    return f"{KEEP} takes the {which} that runs: {count}, and not ended."
+
+
+def recording_html(recording: RecordingStatus) -> str:
+    return render(
+        "recording",
+        recording=recording,
+        envs=_envs_in_words(recording.env_idx),
+        recovered=recovered_in_words(recording.recovered),
+        command=recording.last_file and f"workbench view {shlex.quote(recording.last_file)}",
+    )
+
+
+def _envs_in_words(env_idx: tuple[int, ...]) -> str:
+    numbers = ", ".join(str(env) for env in env_idx[:6])
+    more = f" and {len(env_idx) - 6} more" if len(env_idx) > 6 else ""
+    return f"env{'s' if len(env_idx) != 1 else ''} {numbers}{more}"

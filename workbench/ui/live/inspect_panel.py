@@ -1,0 +1,334 @@
+"""The Inspect tab: one env from inside, read from the worker only while somebody wants it.
+
+viser does not say which tab is looked at, so what is read is what is chosen here. The next reading is asked for when
+the last has come, five times a second at most: a worker that is busy is not sent a queue. A number counts as changed
+when it differs from the reading before of the same env, however little.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.capture.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
+from workbench.machine.text import number_text
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.scene.env_grid import InView
+from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
+from workbench.ui.widgets.templates import render
+
+NEAR_A_LIMIT = 0.02
+"""Part of a joint's range."""
+
+Row = dict[str, Any]
+"""As the template ``inspect`` reads it."""
+
+
+def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Row]:
+    """One row an array.
+
+    Args:
+        before: the reading before, of the same env; None marks nothing.
+    """
+    known = {leaf.name: leaf.values for leaf in before or ()}
+    rows = []
+    for leaf in leaves:
+        old = known.get(leaf.name)
+        if old is None or old.shape != leaf.values.shape:
+            changed = np.zeros(leaf.values.shape, bool)
+        else:
+            # NaN differs from itself, and an entry that stays NaN has not changed.
+            changed = (old != leaf.values) & ~((old != old) & (leaf.values != leaf.values))
+        count = math.prod(leaf.shape)
+        whole = len(leaf.values) == count
+        rows.append(
+            {
+                "name": leaf.name,
+                "kind": f"{leaf.dtype} {leaf.shape}" if leaf.shape else leaf.dtype,
+                "numbers": tuple(
+                    {"text": number(value), "changed": bool(new)}
+                    for value, new in zip(leaf.values.tolist(), changed.tolist(), strict=True)
+                )
+                if whole
+                else (),
+                "note": "" if whole else f"{count} numbers from {number(leaf.low)} to {number(leaf.high)}",
+            }
+        )
+    return rows
+
+
+def joint_rows(joints: JointReadings) -> list[Row]:
+    rows = []
+    for i, name in enumerate(joints.names):
+        low, high = float(joints.low[i]), float(joints.high[i])
+        unit = "m" if joints.kinds[i] == "prismatic" else "rad"
+        bounded = math.isfinite(low) and math.isfinite(high) and high > low
+        place = _place(float(joints.position[i]), low, high) if bounded else None
+        target = float(joints.target[i])
+        rows.append(
+            {
+                "name": name,
+                "position": number(float(joints.position[i])),
+                "target": "" if math.isnan(target) else number(target),
+                "velocity": number(float(joints.velocity[i])),
+                "limits": f"{number(low)} to {number(high)} {unit}" if bounded else f"no limits, {unit}",
+                "place": place,
+                "target_place": None if place is None or math.isnan(target) else _place(target, low, high),
+                "at_limit": place is not None and not 100 * NEAR_A_LIMIT < place < 100 * (1 - NEAR_A_LIMIT),
+            }
+        )
+    return rows
+
+
+def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
+    """Of the bodies that an env has; `poses` is (B, 7), p and q (wxyz), NaN where it has none."""
+    rows = []
+    for name, pose in zip(names, poses, strict=True):
+        if np.isfinite(pose).all():
+            p, q = pose[:3], pose[3:]
+            code = f"sapien.Pose(p={_code(p)}, q={_code(q)})"
+            rows.append({"name": name, "p": vector(p), "q": vector(q), "code": code})
+    return rows
+
+
+def number(value: object) -> str:
+    """Short, with a width that does not jump about while it changes."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return str(value)
+    if not isinstance(value, float):
+        return str(value)
+    if not math.isfinite(value):
+        return number_text(value)
+    if value and not 1e-3 <= abs(value) < 1e4:
+        return "0.000" if abs(value) < 1e-6 else f"{value:.1e}"
+    return f"{value:.3f}"
+
+
+def vector(values: NDArray) -> str:
+    return ", ".join(number(float(value)) for value in values)
+
+
+def _place(value: float, low: float, high: float) -> float:
+    return round(100 * min(max((value - low) / (high - low), 0.0), 1.0), 1)
+
+
+def strength(values: NDArray) -> str:
+    """Of a force or an impulse (3,)."""
+    return number_text(float(np.linalg.norm(values)), ".3g")
+
+
+def _code(values: NDArray[np.float32]) -> str:
+    # Six decimals: a micrometre, and what float32 has.
+    return "[" + ", ".join(f"{float(value):.6f}".rstrip("0").rstrip(".") or "0" for value in values) + "]"
+
+
+READ_EVERY = 0.2
+"""Seconds."""
+PATIENCE = 2.0
+"""Seconds after which an answer that has not come is asked for again: the worker may be another by then."""
+NOTHING, POSES = "nothing", "poses"
+CHOICES: dict[str, Section | None] = {
+    NOTHING: None,
+    "joints": "joints",
+    "contacts": "contacts",
+    POSES: None,
+    "observation": "observation",
+    "state": "state",
+}
+
+
+class InspectPanel(PagePart[SessionView]):
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        self._session, self._clock = session, clock
+        self._show = server.gui.add_dropdown(
+            "Show",
+            tuple(CHOICES),
+            initial_value=NOTHING,
+            hint="Read of the selected env, five times a second.",
+        )
+        self._forces = server.gui.add_checkbox(
+            "Force arrows",
+            False,
+            hint="Draw the contact forces of the selected env as arrows in the 3-D view.",
+        )
+        self._handle = server.gui.add_html("")
+        self._asked: tuple[object, ...] | None = None
+        self._asked_at = -math.inf
+        self._had: Inspection | None = None
+        self._now: Inspection | None = None
+        self._before: Inspection | None = None
+        self._due = DrawDue(READ_EVERY, clock)
+
+    def draw(self, view: SessionView) -> None:
+        choice = self._show.value
+        self._ask(view, choice)
+        self._take(view)
+        no_step = self._no_step_yet(view)
+        wanted = (choice, view.task_serial, view.selected_env, id(self._now), no_step)
+        if choice == POSES:
+            wanted = (*wanted, view.step_serial)
+        if not self._due.is_due(wanted, urgent=choice):
+            return
+        self._handle.content = inspect_html(choice, view, self._now, self._before, no_step)
+
+    def forces(self, view: SessionView) -> Inspection | None:
+        """The reading whose contacts are to be drawn in the view; None draws none: they are of what is live."""
+        here = self._now is not None and self._now.env == view.selected_env
+        known = view.timeline.shown is None and not self._no_step_yet(view)
+        shown = self._forces.value and here and known
+        return self._now if shown else None
+
+    def _no_step_yet(self, view: SessionView) -> bool:
+        """Whether the selected env was built, reset or put back and has made no step since. PhysX finds contacts
+        while it steps: until then its list is empty, or that of the state before."""
+        if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
+            return True
+        lived = self._session.past.stretch() if view.timeline.shown is None else None
+        return lived is not None and lived[0] == lived[1]
+
+    def _ask(self, view: SessionView, choice: str) -> None:
+        chosen: tuple[Section | None, ...] = (
+            CHOICES[choice],
+            "contacts" if self._forces.value else None,
+        )
+        sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in chosen)
+        wanted = (view.task_serial, view.step_serial, view.selected_env, sections)
+        if not sections or view.task is None or wanted == self._asked:
+            return
+        waited = self._clock() - self._asked_at
+        answered = self._asked is None or view.inspection is not self._had
+        if waited >= (READ_EVERY if answered else PATIENCE):
+            self._asked, self._asked_at, self._had = wanted, self._clock(), view.inspection
+            self._session.inspect(sections)
+
+    def _take(self, view: SessionView) -> None:
+        new = view.inspection
+        if new is self._now:
+            return
+        old = self._now
+        if new is None or old is None or old.env != new.env:
+            self._before = None
+        elif old.elapsed_steps != new.elapsed_steps:
+            self._before = old
+        self._now = new
+
+
+def inspect_html(
+    choice: str,
+    view: SessionView,
+    now: Inspection | None,
+    before: Inspection | None,
+    no_step_yet: bool = False,
+) -> str:
+    """What the tab shows under its controls; no contacts of an env that made no step since it was set."""
+    leaves, articulations, contacts, poses = [], [], (), []
+    note = ""
+    env, section = view.selected_env, CHOICES[choice]
+    if view.task is None or view.step is None:
+        note = "There is something to inspect when the task is loaded."
+    elif choice == NOTHING:
+        note = (
+            "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "
+            "or the simulation state. Nothing is read until then."
+        )
+    elif choice == POSES:
+        names = view.task.geometry.body_names
+        if view.step.poses.shape[:2] == (view.task.num_envs, len(names)):
+            poses = pose_rows(names, view.step.poses[env])
+        note = f"env {env}: metres, quaternions w x y z, in the env's own frame"
+    elif now is None or now.env != env or _reading(now, section) is None:
+        refused = dict(now.refused) if now is not None and now.env == env else {}
+        note = refused.get(section, f"Reading env {env} ...") if section else ""
+    else:
+        note = f"env {env} at step {now.elapsed_steps} of its episode"
+        if section == "joints":
+            articulations = [{"name": a.articulation, "joints": joint_rows(a)} for a in now.joints or ()]
+            note += "; bars show the position between the limits, and the target in orange"
+        elif section == "contacts":
+            contacts = () if no_step_yet else now.contacts or ()
+            if no_step_yet:
+                note += ": what touches what is not known before the next step"
+            elif not contacts:
+                note += ": nothing touches anything"
+        elif section == "observation":
+            leaves = leaf_rows(now.observation or (), before.observation if before else None)
+        elif section == "state":
+            leaves = leaf_rows(now.state or (), before.state if before else None)
+        if view.timeline.shown is not None:
+            note += "; this is live, since of the past only the poses are kept"
+        if section in ("observation", "state"):
+            note += "; numbers that changed since the reading before are blue"
+    return render(
+        "inspect",
+        note=note,
+        leaves=leaves,
+        articulations=articulations,
+        contacts=contacts,
+        poses=poses,
+        vector=vector,
+        strength=strength,
+    )
+
+
+def _reading(now: Inspection, section: Section | None) -> object:
+    return None if section is None else getattr(now, section)
+
+
+FORCE_COLOUR = (255, 0, 200)
+"""Magenta: wood, steel, goals and cubes are not."""
+METRES_AT_ONE_NEWTON = 0.07
+LONGEST = 0.3
+SHAFT, HEAD, HEAD_LENGTH = 0.005, 0.012, 0.028
+"""Metres; an arrow shorter than its head would be drawn as something else."""
+WEAKEST = 1e-3
+"""Newtons; weaker is drawn by nobody's wish."""
+
+
+class ForceArrows:
+    """Contact forces of one env as arrows in the 3-D view.
+
+    One arrow a contact point, from the point in the direction of the force on the first body of the pair. Forces span
+    five decades (a cube's weight on four corners, a hand that is pressed into a table), so the length grows with the
+    cube root of the force and is bounded: it says "much" or "little", the numbers are in the Inspect tab.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        look = {"shaft_radius": SHAFT, "head_radius": HEAD, "head_length": HEAD_LENGTH}
+        add = partial(server.scene.add_arrows, "/forces", colors=FORCE_COLOUR, **look)
+        self._arrows = InView(add, "points")
+
+    def draw(self, inspection: Inspection | None, offset: NDArray[np.float32]) -> None:
+        """Show the contacts of this reading, or nothing.
+
+        Args:
+            offset: (3,) where the env stands in the view.
+        """
+        arrows = () if inspection is None else arrows_of(inspection)
+        if len(arrows):
+            self._arrows.draw(arrows + offset)
+        else:
+            self._arrows.draw()
+
+
+def arrows_of(inspection: Inspection) -> NDArray[np.float32]:
+    """(A, 2, 3) start and end of each arrow, metres, in the env's own frame."""
+    pairs = inspection.contacts or ()
+    if not pairs:
+        return np.zeros((0, 2, 3), np.float32)
+    points = np.concatenate([pair.points for pair in pairs])
+    forces = np.concatenate([pair.forces for pair in pairs])
+    size = np.linalg.norm(forces, axis=1)
+    shown = np.isfinite(size) & (size > WEAKEST)
+    points, forces, size = points[shown], forces[shown], size[shown]
+    length = np.minimum(METRES_AT_ONE_NEWTON * np.cbrt(size), LONGEST)
+    return np.stack([points, points + forces / size[:, None] * length[:, None]], axis=1).astype(np.float32)

@@ -1,0 +1,149 @@
+"""The past judged again: a line above the curves, and under them the new curve over the old and what differs.
+
+Nothing is here before there is something to say. A row of the list selects its env and goes to the moment where it
+differs. On a small screen all that lies below the edge, so the line above says what came of it and scrolls there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.jobs.verdict import Verdict, in_order
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore.background import JudgedView
+from workbench.session.rescore.past import JudgedCurve, PastRun
+from workbench.ui.widgets.line_chart import part_round
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.rescored import JudgedPanel
+from workbench.ui.widgets.templates import render
+
+TITLE = "The past, judged again"
+
+
+class JudgementPanel(JudgedPanel[SessionView, PastRun]):
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        super().__init__(server, "env")
+        self._session = session
+        self._add_status("Stop judging", session.judge.stop)
+        names: tuple[str, ...] = ("reward",)
+        self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
+            "Curve",
+            names,
+            visible=False,
+            hint="Which number is drawn, as recorded and as the new code has it",
+        )
+        self._add_chart()
+        self._add_list()
+        self._verdicts: Sequence[Verdict[PastRun]] = ()
+        self._shown: tuple[int, int | None] = 0, None
+        """Env and moment on the page."""
+        self._first = 0
+
+    def key(self, view: SessionView) -> object:
+        past = view.timeline
+        chosen = self._name.value, self._pages.first
+        return view.judgement.serial, view.selected_env, past.shown, past.first, *chosen
+
+    def draw(self, view: SessionView) -> None:
+        judged = view.judgement
+        self._shown, self._first = (view.selected_env, view.timeline.shown), view.timeline.first
+        if judged.state == "none":
+            self._pages.go_to(0)
+        self._draw_status(judged, TITLE)
+        if judged.verdicts is not self._verdicts:
+            self._verdicts = judged.verdicts
+            self._listed = in_order([verdict for verdict in judged.verdicts if verdict.differs])
+        self._draw_list(self._listed)
+        self._draw_curve(judged, view)
+
+    def _draw_curve(self, judged: JudgedView, view: SessionView) -> None:
+        names, env = judged.names, view.selected_env
+        if names and self._name.options != names:
+            self._name.options = names
+        name = self._name.value
+        differs = bool(self._listed or judged.differing_names)
+        curve = self._session.judge.curve(name, env) if differs else None
+        self._name.visible = curve is not None
+        if curve is None:
+            self._chart.hide()
+        else:
+            self._draw_chart(f"{name} of env {env}, before and now", *chart_data(curve, view.timeline.shown))
+
+    # --- the list ------------------------------------------------------------------------------------
+
+    def _of_row(self, verdict: Verdict[PastRun]) -> dict[str, Any]:
+        env, at = place = _place(verdict)
+        kept = at >= self._first
+        return {
+            "name": str(env),
+            "hint": "Show this moment" if kept else "This moment is no longer in the history",
+            "selected": self._shown == place,
+        }
+
+    def _show(self, verdict: Verdict[PastRun]) -> None:
+        env, at = _place(verdict)
+        if at >= self._session.view().timeline.first:
+            self._session.show(env, at)
+        else:
+            self._session.change(selected_env=env)
+
+    def go_to_difference(self, by: int) -> None:
+        """Show the next (1) or last (-1) moment of the list, from the one that is shown; round the end."""
+        listed = self._listed
+        if not listed:
+            return
+        view = self._session.view()
+        shown = view.selected_env, view.timeline.shown
+        here = next((k for k, one in enumerate(listed) if _place(one) == shown), -1 if by > 0 else 0)
+        place = (here + by) % len(listed)
+        self._pages.go_to(place)
+        self._show(listed[place])
+
+
+def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
+    """Env, and serial of the moment to look at."""
+    assert verdict.look_at is not None
+    return verdict.of.env, verdict.of.at(verdict.look_at)
+
+
+def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
+    """As uPlot wants it: x, the record, what is said now, and a point at the moment that is shown, if one is.
+
+    Of a long record the newest part, or the part round the moment that is shown.
+    """
+    place = None if shown is None else int(np.searchsorted(curve.serial, shown))
+    part = part_round(len(curve.tick), place)
+    x, old, new = (v[part] for v in (curve.tick, curve.old, curve.new))
+    if shown is None or shown not in curve.serial[part]:
+        return x, old, new
+    return x, old, new, np.where(curve.serial[part] == shown, np.where(np.isnan(new), old, new), np.nan)
+
+
+def in_a_line(judged: JudgedView) -> str:
+    """For who does not see the rest; empty while there is nothing to say."""
+    if judged.state == "loading":
+        return "The past is judged again: loading the new code"
+    if judged.state == "judging":
+        # In tenths, or a page that is played on would be written to at every look.
+        return f"The past is judged again: {10 * int(10 * judged.done / max(1, judged.total))} %"
+    if judged.state == "done":
+        return f"{TITLE}: {words.headline(judged.verdicts, others=judged.differing_names)}"
+    return f"{TITLE}: {judged.why}" if judged.why else ""
+
+
+class JudgedAbove(PagePart[SessionView]):
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._line = server.gui.add_html("", visible=False)
+
+    def draw(self, view: SessionView) -> None:
+        says = in_a_line(view.judgement)
+        self._line.visible = bool(says)
+        if says:
+            self._line.content = render("judged_above", says=says)

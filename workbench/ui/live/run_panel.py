@@ -1,0 +1,267 @@
+"""The Run tab: play, step, reset, speed, seed, env, what happens at an episode's end, and actions with their sliders.
+
+Nothing here touches an env. Every input asks the session and shows what the session says (see `controls`), so a key, a
+second page and this panel cannot disagree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import viser
+
+from workbench.jobs.task import ActionDimension, ActionSource
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.session.protocol.messages import EpisodeEnd
+from workbench.ui.server.control_values import limit_text
+from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.parts import PagePart
+
+UNBOUNDED = 1.0
+"""A dimension without bounds gets a slider from -1 to 1."""
+
+
+class ActionSliders:
+    """A folder with one slider a dimension; there only while the source is ``sliders``."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server = server
+        self._session = session
+        self._dimensions: tuple[ActionDimension, ...] = ()
+        self._controls: list[Control[viser.GuiSliderHandle, float]] = []
+        self._folder = server.gui.add_folder(None, visible=False)
+        with self._folder:
+            self._centre = server.gui.add_button("Centre all", color="gray")
+        self._centre.on_click(lambda _: self._send_centre())
+
+    def build(self, dimensions: tuple[ActionDimension, ...], values: tuple[float, ...]) -> None:
+        """Sliders of this action space, unless they are there already (a reload keeps them)."""
+        if dimensions == self._dimensions:
+            return
+        for control in self._controls:
+            control.handle.remove()
+        self._dimensions, self._controls = dimensions, []
+        with self._folder:
+            for number, dimension in enumerate(dimensions):
+                low, high = slider_bounds(dimension)
+                start = values[number] if number < len(values) else (low + high) / 2
+                self._controls.append(
+                    Control(
+                        self._server.gui.add_slider(
+                            dimension.name,
+                            min=low,
+                            max=high,
+                            step=(high - low) / 200,
+                            initial_value=min(max(start, low), high),
+                        ),
+                        send=lambda _: self._send(),
+                    )
+                )
+
+    def draw(self, shown: bool, values: tuple[float, ...]) -> None:
+        self._folder.visible = shown
+        if shown and len(values) == len(self._controls):
+            for control, value in zip(self._controls, self._in_bounds(values), strict=True):
+                control.show(value)
+
+    def _send(self) -> None:
+        # All of them at their newest: two sliders moved at once arrive in any order.
+        self._session.change(sliders=tuple(self._in_bounds(c.handle.value for c in self._controls)))
+
+    def _in_bounds(self, values: Iterable[float]) -> Iterator[float]:
+        """A browser adds steps up to a little more than the end; a policy may give more than a slider has."""
+        for dimension, value in zip(self._dimensions, values, strict=True):
+            low, high = slider_bounds(dimension)
+            yield min(max(value, low), high)
+
+    def _send_centre(self) -> None:
+        self._session.change(sliders=tuple(sum(slider_bounds(d)) / 2 for d in self._dimensions))
+
+
+def slider_bounds(dimension: ActionDimension) -> tuple[float, float]:
+    low = dimension.low if math.isfinite(dimension.low) else -UNBOUNDED
+    high = dimension.high if math.isfinite(dimension.high) else UNBOUNDED
+    return (low, high) if low < high else (low, low + 1e-6)
+
+
+SPEEDS: dict[str, float] = {
+    "0.1 ×": 0.1,
+    "0.25 ×": 0.25,
+    "0.5 ×": 0.5,
+    "1 ×": 1.0,
+    "2 ×": 2.0,
+    "4 ×": 4.0,
+    "8 ×": 8.0,
+    "as fast as it can": math.inf,
+}
+EPISODE_ENDS: dict[str, EpisodeEnd] = {
+    "reset that env": "reset",
+    "let it run on": "continue",
+    "pause": "pause",
+}
+SOURCES: dict[str, ActionSource] = {
+    "hold still": "hold",
+    "zero": "zero",
+    "random": "random",
+    "sliders": "sliders",
+    "policy": "policy",
+}
+STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
+PREVIOUS, NEXT = "‹ previous", "next ›"
+LARGEST_SEED = 2**31 - 1
+
+
+class RunPanel(PagePart[SessionView]):
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        gui = server.gui
+
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        self._play.on_click(lambda _: self.toggle_play())
+        self._transport = gui.add_button_group("", (STEP, RESET_ALL, RESET_THIS))
+        self._transport.on_click(self._on_transport)
+
+        self._env_folder = gui.add_folder("Environment", visible=False)
+        with self._env_folder:
+            self._env = Control(
+                gui.add_slider("Selected", min=0, max=1, step=1, initial_value=0),
+                send=lambda env: session.change(selected_env=env),
+            )
+            self._neighbours = gui.add_button_group("", (PREVIOUS, NEXT))
+            self._neighbours.on_click(
+                lambda event: self.select_neighbour(-1 if event.target.value == PREVIOUS else 1)
+            )
+
+        with gui.add_folder("Episode"):
+            self._speed = Control(
+                gui.add_dropdown(
+                    "Speed", tuple(SPEEDS), initial_value="1 ×", hint="Simulated seconds in one second."
+                ),
+                read=lambda value: SPEEDS[value],
+                send=lambda speed: session.change(speed=speed),
+                shown=self._speed_shown,
+            )
+            self._seed = Control(
+                gui.add_number(
+                    "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
+                ),
+                send=session.set_seed,
+                settle=0.6,
+            )
+            self._end = Control(
+                gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
+                read=lambda value: EPISODE_ENDS[value],
+                send=lambda rule: session.change(episode_end=rule),
+                shown=lambda rule: _name_of(EPISODE_ENDS, rule),
+            )
+
+        with gui.add_folder("Actions"):
+            self._source = Control(
+                gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
+                read=lambda value: SOURCES[value],
+                send=self._choose_source,
+                shown=lambda source: _name_of(SOURCES, source),
+            )
+            self._policy = Control(
+                gui.add_text(
+                    "Policy", "", hint="module:function or file.py:function, given obs, returns the action."
+                ),
+                read=self._read_policy,
+                send=lambda policy: session.change(action_source="policy", policy=policy or None),
+                settle=0.8,
+            )
+            limit_text(self._policy.handle, 500)
+            self._policy_hint = gui.add_html(
+                '<div class="wb-note">Type <code>module:function</code> or <code>file.py:function</code>. '
+                "It is called with the observation and returns the action.</div>"
+            )
+            self._sliders = ActionSliders(server, session)
+
+    # --- what keys and buttons do ----------------------------------------------------------------
+
+    def toggle_play(self) -> None:
+        if self._session.view().playing:
+            self._session.pause()
+        else:
+            self._session.play()
+
+    def reset_this(self) -> None:
+        self._session.reset((self._session.view().selected_env,))
+
+    def select_neighbour(self, step: int) -> None:
+        """The next (1) or previous (-1) env, round the end."""
+        count = self._num_envs()
+        self._session.change(selected_env=(self._session.view().selected_env + step) % count)
+
+    def _on_transport(self, event: viser.GuiEvent) -> None:
+        actions = {
+            STEP: self._session.step,
+            RESET_ALL: self._session.reset,
+            RESET_THIS: self.reset_this,
+        }
+        action = actions.get(event.target.value)
+        if action is not None:
+            action()
+
+    # --- drawing ---------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        can_act = view.task is not None and view.state != "stopped"
+        if view.task is not None:
+            several = view.task.num_envs > 1
+            self._env_folder.visible = several
+            self._env.handle.max = max(1, view.task.num_envs - 1)
+            self._sliders.build(view.task.actions, view.settings.sliders)
+        self._draw_play(view.playing, can_act)
+        # viser cannot grey out a group of buttons; one that does nothing must not be there.
+        self._transport.visible = can_act
+        for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
+            control.enable(can_act)
+        self._env.show(view.selected_env)
+        self._speed.show(view.settings.speed)
+        self._seed.show(view.seed)
+        self._end.show(view.settings.episode_end)
+        self._source.show(view.settings.action_source)
+        self._policy.show(view.settings.policy or "")
+        policy_wanted = view.settings.action_source == "policy"
+        self._policy.handle.visible = policy_wanted
+        self._policy_hint.visible = policy_wanted and not view.settings.policy
+        self._sliders.draw(view.settings.action_source == "sliders", view.settings.sliders)
+
+    def _draw_play(self, playing: bool, can_act: bool) -> None:
+        self._play.label = "Pause" if playing else "Play"
+        self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+        self._play.disabled = not can_act
+
+    # --- values ----------------------------------------------------------------------------------
+
+    def _num_envs(self) -> int:
+        task = self._session.view().task
+        return 1 if task is None else task.num_envs
+
+    def _speed_shown(self, speed: float) -> str:
+        name = _name_of(SPEEDS, speed)
+        if name is None:
+            # A speed that came from the command line and is none of ours.
+            name = f"{speed:g} ×"
+            SPEEDS[name] = speed
+        if name not in self._speed.handle.options:
+            self._speed.handle.options = tuple(SPEEDS)
+        return name
+
+    def _choose_source(self, source: ActionSource) -> None:
+        # A policy that is not named yet is a source all the same: a step says what is missing.
+        policy = self._policy.handle.value.strip() if source == "policy" else ""
+        self._session.change(action_source=source, policy=policy or None)
+
+    def _read_policy(self, value: str) -> str:
+        text = value.strip()
+        if text and ":" not in text:
+            raise ValueError("A policy is written module:function or file.py:function.")
+        return text
+
+
+def _name_of(names, value):
+    return next((name for name, known in names.items() if known == value), None)

@@ -1,0 +1,200 @@
+"""The line above the tabs: what runs, on what, how fast, and whether all is well; and the mark of broken rules."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+import viser
+
+from workbench.core.rules import RULES
+from workbench.session.history.env_table import EnvRows
+from workbench.session.live.view import SessionView
+from workbench.session.process.heartbeat import Busy
+from workbench.session.protocol.messages import RulesBroken
+from workbench.ui.live.env_panel import first_flagged, mask
+from workbench.ui.live.timeline import step_in_words
+from workbench.ui.live.version_panel import took
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.templates import place, render
+
+NEWS = 6.0
+"""Seconds for which a new version is announced."""
+
+WORDS = {
+    "starting": "starting",
+    "loading": "loading",
+    "running": "running",
+    "paused": "paused",
+    "error": "error",
+    "stopped": "worker stopped",
+    "busy": "busy",
+    "held": "held",
+    "awaited": "waiting",
+}
+
+
+class StatusLine(PagePart[SessionView]):
+    """
+    Args:
+        env_rows: The envs as they stand; None before there is a task.
+        on_flagged: Called when the mark of flagged envs is pressed.
+    """
+
+    every = 0.25
+    """Rates that change faster cannot be read."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        env_rows: Callable[[], EnvRows | None],
+        on_flagged: Callable[[], None],
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self._env_rows, self._on_flagged = env_rows, on_flagged
+        self._handle = server.gui.add_html("")
+        # On its own: the line above is made anew four times a second, under the finger that presses.
+        self._standing = server.gui.add_html("", visible=False)
+        # At the end of the panel, behind the tabs: all that comes after it is hidden.
+        self._presses = Presses(server)
+        self._clock = clock
+        self._task_serial = 0
+        self._loaded_at = -math.inf
+
+    def urgent(self, view: SessionView) -> object:
+        busy = view.busy and (view.busy.doing, f"{view.busy.seconds:.0f}")
+        at = view.task_serial, view.problem_serial, view.timeline.shown is None
+        return busy, view.state, view.stale, view.activity, self._is_fresh(view), *at
+
+    def _is_fresh(self, view: SessionView) -> bool:
+        """Whether a new version came in a moment ago."""
+        if view.task_serial != self._task_serial:
+            # The first version is no news.
+            self._loaded_at = self._clock() if self._task_serial else -math.inf
+            self._task_serial = view.task_serial
+        return self._clock() - self._loaded_at < NEWS
+
+    def draw(self, view: SessionView) -> None:
+        rows = self._env_rows()
+        flagged = None if rows is None else flagged_text(rows)
+        self._handle.content = render(
+            "status_line", **status_values(view, self._is_fresh(view), marked=flagged is not None)
+        )
+        self._standing.visible = flagged is not None
+        if flagged is not None:
+            text, hint = flagged
+            press = self._presses.id_of("flagged", lambda _: self._on_flagged())
+            self._standing.content = render("standing_mark", text=text, hint=hint, press_id=press)
+
+
+def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
+    """How many envs are flagged and what is odd in the first of them, in short and in full; None where none is."""
+    count = int(np.count_nonzero(mask(rows, "flagged")))
+    env = first_flagged(rows)
+    if env is None:
+        return None
+    outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
+    when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the episode before")
+    envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
+    press = "Press to see it" if env in rows.outliers else "Press to choose it"
+    hint = f"In env {env}, {when}: {outlier.reason}. {press}; the table of envs (B) has them all."
+    return f"⚑ {envs}flagged: {outlier.reason}", hint
+
+
+def status_values(view: SessionView, fresh: bool = False, marked: bool = False) -> dict[str, object]:
+    """What the template is given.
+
+    Args:
+        fresh: a new version of the file has just come in.
+        marked: something stands below the line that is not as it should be.
+    """
+    task = view.task
+    # While the renderer is at work, what the session says of it is more than that it is busy.
+    busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
+    moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
+    slow = view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
+    return {
+        "view": view,
+        "state": view.state if busy is None else "loading",
+        "word": WORDS[_state(view, busy)],
+        "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
+        "activity": view.activity if busy is None else _doing(busy),
+        "news": _news(view) if fresh else "",
+        "at": step_in_words(view),
+        "moving": moving,
+        "behind": moving and slow,
+        "marked": marked,
+    }
+
+
+def _state(view: SessionView, busy: Busy | None) -> str:
+    if busy is None:
+        return view.state
+    if busy.held:
+        return "awaited" if busy.awaited else "held"
+    return view.state if busy.getting_ready else "busy"
+
+
+def _doing(busy: Busy) -> str:
+    if busy.awaited:
+        return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
+    if busy.held:
+        at = f" at {place(busy)}" if busy.file else ""
+        return f"by a debugger{at} for {busy.seconds:.0f} s; it goes on from there, not from this page"
+    if busy.getting_ready:
+        return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
+    return f"{busy.doing} for {busy.seconds:.0f} s"
+
+
+def _news(view: SessionView) -> str:
+    report, seconds = view.reload, took(view.load_milliseconds)
+    if report is None:
+        return f"new version in {seconds}"
+    return f"{report.level} in {seconds}" + (f": {report.reason}" if report.reason else "")
+
+
+class RulesMark(PagePart[SessionView]):
+    """The standing mark below the status line: what the task breaks of the rules of GPU simulation, a press from the list.
+
+    A rule that only warns stops nothing, so whatever tells of it must not pass: the mark stays until the file is mended.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._html = server.gui.add_html("", visible=False)
+        # Not in a folder with it: viser draws one without a label as if its parts stood in the container itself, and
+        # all that comes after the mark of the hidden buttons, the tabs too, would be hidden.
+        self._press = Presses(server).id_of("open", lambda _: self.toggle())
+        self._open = False
+
+    def draw(self, view: SessionView) -> None:
+        if view.rules is None:
+            self._open = False
+            self._html.visible = False
+            return
+        # What is the same is not sent: a list that somebody reads keeps its place.
+        self._html.content = rules_html(view.rules, self._open, self._press)
+        self._html.visible = True
+
+    def toggle(self) -> None:
+        """Open or close the list."""
+        self._open = not self._open
+
+
+def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:
+    """The mark, and the list where it is open; every value escaped."""
+    newest = next((place(row) for row in rules.rows if row.file), "")
+    if newest and len(rules.rows) > 1:
+        newest += f" and {len(rules.rows) - 1} more"
+    known = {"RULES": RULES, "times": times}
+    return render("rules", open=open, press_id=press_id, newest=newest, rules=rules, **known)
+
+
+def times(count: int) -> str:
+    """``once``, ``7 times``, ``300 times and more``: of large numbers the first digit, or the list would change at each step."""
+    if count < 10:
+        return "once" if count == 1 else f"{count} times"
+    scale = 10 ** (len(str(count)) - 1)
+    return f"{count // scale * scale:,} times and more".replace(",", " ")

@@ -1,0 +1,366 @@
+"""The timeline: one slider over the past, under the view, with what happened to the selected env on it.
+
+It counts backwards from now: 0 is live and -37 is 37 steps ago. So the slider rests at its right end while the
+simulation runs, and nothing has to be sent to keep it there. The strip under it is drawn by the server as one
+small SVG, a few times a second at most: the reward of the selected env, its episodes as bands, its events as
+marks, and an arc where it went back.
+
+Dragging asks the session for another moment, which it has in memory; only when somebody has stood still at a
+moment for a while are its pictures asked of the worker, where there are none.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from itertools import groupby
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.session.history.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.live.session import Session
+from workbench.session.live.timeline import Scope, Strip
+from workbench.session.live.view import SessionView
+from workbench.ui.server.control_values import name_control
+from workbench.ui.widgets.hotkeys import Command
+from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
+from workbench.ui.widgets.templates import render
+
+GAP = 12
+"""Pixels between what lies over the view and its edges; as ``view_width.js`` has it."""
+WIDEST = 760
+HEIGHT = 205
+"""Pixels of the view that it lies over, for whoever frames a scene."""
+REDRAW_EVERY = 0.2
+RANGE_EVERY = 0.5
+"""Seconds. A slider whose ends move at every step cannot be held."""
+STANDS_STILL = 0.35
+"""Seconds at one moment after which its pictures are drawn: less, and every drag would draw some."""
+LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "step ›", "event ›", "now"
+EPISODE, EVERYTHING = "zoom to episode", "zoom out"
+SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
+GO_ON = "Go on from here"
+UNDO = "undo"
+"""How the button begins that takes back a jump; what and of how many envs follows."""
+WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
+View = TypeVar("View", contravariant=True)
+
+
+class Seeks(Protocol):
+    """What is moved through time; its own module says what a place in time is."""
+
+    def seek(self, place: Any, /) -> None: ...
+    def seek_by(self, steps: int, /) -> None: ...
+    def seek_event(self, direction: int, /) -> None: ...
+
+
+class TimeBar(PagePart[View]):
+    """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
+
+    Args:
+        seeks: What slider, buttons and arrow keys move.
+        name: Of the slider.
+        does: What further buttons do, by how they begin.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        seeks: Seeks,
+        name: str,
+        does: dict[str, Callable[[], None]],
+        clock: Clock,
+    ) -> None:
+        self._seeks = seeks
+        steps = {LAST_STEP: -1, NEXT_STEP: 1}
+        events = {LAST_EVENT: -1, NEXT_EVENT: 1}
+        self._does = {
+            **{label: partial(seeks.seek_by, by) for label, by in steps.items()},
+            **{label: partial(seeks.seek_event, by) for label, by in events.items()},
+            **does,
+        }
+        gui = server.gui
+        self._panel = gui.add_panel(visible=False, order=10.0)
+        with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
+            self._slider: Control[viser.GuiSliderHandle[int], int] = Control(
+                gui.add_slider("", min=-1, max=0, step=1, initial_value=0), self._on_slider, clock=clock
+            )
+            name_control(self._slider.handle, name)
+            self._strip = gui.add_html("")
+            self._add_rows(gui)
+            self._walk: viser.GuiButtonGroupHandle = gui.add_button_group("", tuple(self._does))
+            name_control(self._walk, "step to take")
+        self._walk.on_click(lambda event: self._on_walk(event.target.value))
+        # Across the bottom of the view: viser docks panels at the sides only.
+        self._panel.float(x=GAP, y=-GAP, width=WIDEST)
+        self._shown: int | None = None
+        self._before_slider: int | None = None
+        """What was shown before the slider was last moved."""
+
+    def _add_rows(self, gui: viser.GuiApi) -> None:
+        """Between the strip and the buttons."""
+
+    def commands(self) -> list[Command]:
+        """Of the arrow keys."""
+        return [
+            Command("A step back in time", lambda: self._step_by(-1), "arrowleft"),
+            Command("A step on in time", lambda: self._step_by(1), "arrowright"),
+            Command("To the event before", lambda: self._to_event(-1), "arrowleft", "shift"),
+            Command("To the next event", lambda: self._to_event(1), "arrowright", "shift"),
+        ]
+
+    def _step_by(self, steps: int) -> None:
+        """An arrow key."""
+        if not Control.took_the_key():
+            self._seeks.seek_by(steps)
+
+    def _to_event(self, direction: int) -> None:
+        """An arrow key with shift; what a slider that has the focus made of it is taken back."""
+        if Control.took_the_key():
+            self._seeks.seek(self._before_slider)
+        self._seeks.seek_event(direction)
+
+    def _on_slider(self, value: int) -> None:
+        self._before_slider = self._shown
+        self._seeks.seek(self._place_of(value))
+
+    def _place_of(self, value: int) -> int | None:
+        return value
+
+    def _on_walk(self, name: str) -> None:
+        next(does for label, does in self._does.items() if name.startswith(label))()
+
+    def _draw_panel(self, there: bool, shown: int | None) -> bool:
+        self._panel.visible = there
+        self._shown = shown
+        return there
+
+    def _set_ends(self, low: int, high: int) -> None:
+        handle = self._slider.handle
+        # Never an empty range, which the browser divides by.
+        handle.min, handle.max, handle.visible = min(low, high - 1), high, low < high
+
+
+class TimelinePanel(TimeBar[SessionView]):
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        zooms = {EPISODE: partial(self._zoom, True), EVERYTHING: partial(self._zoom, False)}
+        does = {NOW: self.go_live, **zooms, UNDO: session.past.undo}
+        super().__init__(server, session.past, "step of the past", does, clock)
+        self._session, self._clock = session, clock
+        self._travel.on_click(lambda event: self._on_travel(event.target.value))
+        self._episode_only = False
+        self._range = (0, 0)
+        """Serials of the slider's ends."""
+        self._newest = 0
+        """The serial that the page last took for 0."""
+        self._range_at = -math.inf
+        self._strip_due = DrawDue(REDRAW_EVERY, clock)
+        self._stood: tuple[object, float] = (None, 0.0)
+
+    def _add_rows(self, gui: viser.GuiApi) -> None:
+        # One of these two is there, and they are equally high: a panel that grows is moved up only a moment later, its
+        # last row is cut off until then, and a second press on "step" would meet another button.
+        self._hint = gui.add_html("")
+        self._travel = gui.add_button_group("", (GO_ON,), visible=False)
+        name_control(self._travel, "way to go on")
+
+    # --- what buttons and keys do ------------------------------------------------------------------
+
+    def go_live(self) -> None:
+        self._session.past.seek(None)
+
+    def go_to_the_first(self) -> None:
+        """To the left end of the slider, which may have the focus and go there as well."""
+        self._session.past.seek(self._range[0] if self._episode_only else 0)
+
+    def go_on(self) -> None:
+        self._session.past.go_on("this")
+
+    def _place_of(self, value: int) -> int | None:
+        return None if value == 0 else self._newest + value
+
+    def _zoom(self, episode_only: bool) -> None:
+        self._episode_only, self._range_at = episode_only, -math.inf
+
+    def _on_travel(self, name: str) -> None:
+        for scope, label in zip(SCOPES, self._travel.options, strict=False):
+            if label == name:
+                self._session.past.go_on(scope)
+
+    # --- drawing -----------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        there = view.task is not None and view.timeline.moments > 0
+        if self._draw_panel(there, view.timeline.shown):
+            self._draw_slider(view)
+            self._draw_buttons(view)
+            self._draw_strip(view)
+            self._ask_for_pictures(view)
+
+    def _draw_slider(self, view: SessionView) -> None:
+        past, now = view.timeline, self._clock()
+        moved = past.shown is not None and not self._range[0] <= past.shown <= self._range[1]
+        if now - self._range_at >= RANGE_EVERY or moved:
+            self._range_at = now
+            stretch = self._session.past.stretch() if self._episode_only else None
+            self._range = (past.first, past.last) if stretch is None else stretch
+            self._newest = past.last
+            self._set_ends(*(serial - self._newest for serial in self._range))
+        self._slider.show(0 if past.shown is None else past.shown - self._newest)
+
+    def _draw_buttons(self, view: SessionView) -> None:
+        past = view.timeline
+        # A group of buttons cannot be greyed, so what would do nothing is left out.
+        undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
+        self._walk.options = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
+        travel = go_on_labels(view) if past.can_go_on else ()
+        if travel:
+            self._travel.options = travel
+        not_carried = "; ".join(past.not_carried)
+        hint = render("timeline_hint", live=past.shown is None, not_carried=not_carried, arrived=past.arrived)
+        self._hint.content = hint
+        self._travel.visible, self._hint.visible = bool(travel), not travel
+
+    def _draw_strip(self, view: SessionView) -> None:
+        past = view.timeline
+        wanted = (past.first, past.last, past.shown, view.selected_env, self._range, view.playing)
+        if not self._strip_due.is_due(wanted):
+            return
+        low, high = self._range
+        strip = self._session.past.strip(low, high)
+        if strip is not None:
+            self._strip.content = strip_html(strip, view)
+
+    def _ask_for_pictures(self, view: SessionView) -> None:
+        at = (view.timeline.shown, view.selected_env)
+        if at != self._stood[0]:
+            self._stood = (at, self._clock())
+        elif view.timeline.wants_pictures and self._clock() - self._stood[1] > STANDS_STILL:
+            self._session.past.draw()
+
+
+def go_on_labels(view: SessionView) -> tuple[str, ...]:
+    """Of the buttons that go back, in the order of `SCOPES`."""
+    if view.task is None or view.task.num_envs == 1:
+        return (GO_ON,)
+    env = f"env {view.selected_env}"
+    return (f"{GO_ON}: {env}", "all envs", f"{env} into all envs")
+
+
+POINTS = 240
+"""Of the reward's line, each the least and the greatest of its steps: a spike of one step stays visible."""
+LINE_HEIGHT = 30.0
+"""Units of the picture's height that the line has; the marks are above."""
+FLAGS = {
+    NOT_A_NUMBER: "odd",
+    FAIL: "fail",
+    SUCCESS: "success",
+    TRUNCATED: "limit",
+    WENT_BACK: "back",
+    RESET: "reset",
+}
+"""The style of a mark; of several that happened at once the first is drawn."""
+NAMES = {
+    "odd": "reward is NaN or infinite",
+    "fail": "fail",
+    "success": "success",
+    "limit": "time limit",
+    "back": "went back",
+    "reset": "reset",
+    "other": "other event",
+}
+"""Of the styles, as the legend says them."""
+MOST_MARKS = 150
+
+
+def strip_values(
+    low: int, high: int, reward: NDArray[np.float32], styles: Collection[str]
+) -> dict[str, object]:
+    """What the templates of both timelines are given.
+
+    Args:
+        low: Where the strip begins.
+        high: Where it ends.
+        reward: (high - low + 1,) NaN where there is none.
+        styles: Of the marks that are on it.
+    """
+
+    def place(at: float) -> float:
+        """Per cent of the strip's width; at its ends for what is beyond them."""
+        return round(100 * (min(max(at, low), high) - low) / max(high - low, 1), 3)
+
+    kinds = [(style, name) for style, name in NAMES.items() if style in styles]
+    return {"place": place, "lines": reward_lines(reward), "kinds": kinds}
+
+
+def strip_html(strip: Strip, view: SessionView) -> str:
+    """The past of one env, and which moment of it is shown."""
+    marks = [
+        (serial, next(style for flag, style in FLAGS.items() if flags & flag))
+        for serial, flags in strip.events[-MOST_MARKS:]
+    ]
+    return render(
+        "timeline",
+        strip=strip,
+        past=view.timeline,
+        marks=marks,
+        origins=dict(strip.branches),
+        names=NAMES,
+        where=where(view),
+        megabytes=megabytes,
+        **strip_values(strip.low, strip.high, strip.reward, {style for _, style in marks}),
+    )
+
+
+def step_in_words(view: SessionView) -> str:
+    """How far the selected env is into its episode: a single step is too small to be seen in the view."""
+    task, step = view.task, view.step
+    if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
+        return ""
+    limit = f" / {task.max_episode_steps}" if task.max_episode_steps else ""
+    env = "" if task.num_envs == 1 else f"env {view.selected_env}: "
+    return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"
+
+
+def where(view: SessionView) -> str:
+    """Env, step of its episode and simulated time of what is shown."""
+    words = step_in_words(view)
+    if not words or view.task is None or view.step is None:
+        return words
+    return f"{words}, {view.step.elapsed_steps[view.selected_env] * view.task.control_dt:.2f} s"
+
+
+def reward_lines(reward: NDArray[np.float32]) -> list[str]:
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT`, greatest on top, with a gap where there
+    is none; no line without two different ones."""
+    finite = reward[np.isfinite(reward)]
+    if not len(finite) or finite.min() == finite.max():
+        return []
+    low, high = float(finite.min()), float(finite.max())
+    known = np.where(np.isfinite(reward), reward, np.nan)
+    if len(known) <= POINTS:
+        places, values = np.arange(len(known)), known
+    else:
+        edges = np.linspace(0, len(known), POINTS // 2 + 1).astype(int)[:-1]
+        values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
+        places = np.repeat(edges, 2)
+    x = 100 * places / (len(known) - 1)
+    y = LINE_HEIGHT * (1 - (values - low) / (high - low))
+    return polylines([None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)])
+
+
+def polylines(points: Sequence[str | None]) -> list[str]:
+    """What SVG's polylines are given for these points, with a gap at each None."""
+    runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
+    # A line of one point is not drawn; one of length zero with round ends is a dot.
+    return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
+
+
+def megabytes(size: int) -> str:
+    return f"{size / 1024**2:.0f}" if size >= 10 * 1024**2 else f"{size / 1024**2:.1f}"

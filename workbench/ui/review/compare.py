@@ -1,0 +1,137 @@
+"""The Compare tab: where the first recording and another one part, entry by entry, and the lines that changed.
+
+A row is pressed to go there: both recordings then show the first state at which that entry differs.
+"""
+
+from __future__ import annotations
+
+import viser
+
+from workbench.machine.text import length
+from workbench.session.history.curves import PREFIX
+from workbench.session.review.compare import TOLERANCES, USUAL_TOLERANCE, Difference, Parting, difference
+from workbench.session.review.review import Review
+from workbench.session.review.view import Opened, ReviewView
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import letter, render
+
+TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
+MOST_ROWS = 30
+
+
+class ReviewComparePanel(PagePart[ReviewView]):
+    def __init__(self, server: viser.ViserServer, review: Review) -> None:
+        self._review = review
+        gui = server.gui
+        self._other: viser.GuiDropdownHandle = gui.add_dropdown(
+            "A against", ("B",), initial_value="B", visible=False
+        )
+        self._swap = gui.add_button(
+            "Swap",
+            icon=viser.Icon.ARROWS_EXCHANGE,
+            color="gray",
+            visible=False,
+            hint="A becomes the other one",
+        )
+        self._swap.on_click(lambda _: self._change_places())
+        self._tolerance = gui.add_dropdown(
+            "Moved from",
+            tuple(TOLERANCE_NAMES),
+            initial_value=length(USUAL_TOLERANCE),
+            visible=False,
+            hint="How far a body must be away to count as elsewhere.",
+        )
+        self._html = gui.add_html("")
+        self._presses = Presses(server)
+        self._differing: list[Parting] = []
+        """By the rows of the table, of which each goes to its position."""
+
+    def key(self, view: ReviewView) -> object:
+        return view.opened_serial, len(view.opened), view.anchors, self._other.value, self._tolerance.value
+
+    def draw(self, view: ReviewView) -> None:
+        several = len(view.opened) > 1
+        letters = tuple(letter(index) for index in range(1, len(view.opened)))
+        if several and self._other.options != letters:
+            self._other.options = letters
+        self._other.visible = len(letters) > 1
+        self._tolerance.visible = several
+        self._swap.visible = several
+        label = f"Swap A and {self._other.value}" if len(letters) > 1 else "Swap A and B"
+        self._swap.label = label
+        if not several:
+            self._html.content = render("note", text="Open two recordings, and this says where they part.")
+            return
+        other = 1 + letters.index(self._other.value)
+        tolerance = TOLERANCE_NAMES[self._tolerance.value]
+        a, b = view.opened[0], view.opened[other]
+        found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), tolerance)
+        self._html.content = self._content(a, b, other, found, view)
+
+    def _content(self, a: Opened, b: Opened, other: int, found: Difference, view: ReviewView) -> str:
+        partings = [*([found.bodies] if found.bodies else []), *found.numbers]
+        self._differing = [p for p in partings if p.position is not None]
+        presses = [
+            self._presses.id_of(number, lambda _, number=number: self._go(number))
+            for number in range(len(self._differing[:MOST_ROWS]))
+        ]
+        one_sided = [f"{p.name} ({p.first})" for p in partings if p.position is None and p.first]
+        return render(
+            "review_compare",
+            a=a,
+            b=b,
+            other=other,
+            view=view,
+            found=found,
+            headline=headline(found),
+            notes=notes(a, b, found),
+            totals=next((p.whole for p in found.numbers if p.name == "reward"), ""),
+            rows=list(zip(self._differing, presses, strict=False)),
+            more=len(self._differing) - len(presses),
+            same=", ".join(
+                p.name.removeprefix(PREFIX) for p in partings if p.position is None and not p.first
+            ),
+            one_sided=", ".join((*one_sided, *found.not_in_both)),
+            prefix=PREFIX,
+        )
+
+    def _change_places(self) -> None:
+        count = len(self._review.view().opened)
+        letters = [letter(index) for index in range(count)]
+        if self._other.value in letters[1:]:
+            self._review.exchange(0, letters.index(self._other.value))
+
+    def _go(self, number: int) -> None:
+        place = self._differing[number].position if number < len(self._differing) else None
+        if place is not None:
+            self._review.seek(place)
+
+
+def headline(found: Difference) -> str:
+    if not found.compared:
+        return "As they are aligned, the two have no state at the same place."
+    if found.bodies is None:
+        return "One of them has no scene, so only numbers are compared."
+    if found.bodies.position is None:
+        apart = "" if found.bodies.most == "0" else f", {found.bodies.most} apart at most"
+        return f"All bodies stay together{apart}."
+    return (
+        f"They part at step {found.bodies.position}: {found.bodies.first} apart. At most {found.bodies.most}."
+    )
+
+
+def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
+    said = []
+    if a.episode.info.task != b.episode.info.task:
+        said.append("They are of different tasks.")
+    elif not found.same_seed:
+        said.append("They are of different seeds, so they differ from the start.")
+    if a.length != b.length:
+        said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
+    of_batch = dict.fromkeys(name for each in (a, b) for name in (*each.episode.batch, *each.episode.texts))
+    if of_batch:
+        said.append(f"Not compared, since they are not numbers of this env alone: {', '.join(of_batch)}.")
+    if abs(a.episode.info.control_dt - b.episode.info.control_dt) > 1e-9:
+        said.append("A step is not the same time in both.")
+    return said

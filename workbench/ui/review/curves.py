@@ -1,0 +1,215 @@
+"""The Curves tab of a review: the selected recording's numbers, and curves of all that are compared.
+
+One chart holds one entry with a line for each recording, over each other as they are aligned; the reward always, and
+one that is chosen. An action or the terms of a reward have many lines of their own, so those are drawn of the
+selected recording alone. A line at the position would have to be sent with every frame; a dot on the first line is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.env.step_result import StepResult
+from workbench.recording.episode.episode import Episode
+from workbench.session.review.events import ACTION, REWARD, TERMS, curves
+from workbench.session.review.view import ReviewView, column_at
+from workbench.ui.live.reward import COLOURS as LINE_COLOURS
+from workbench.ui.live.reward import NumberRow, number_rows
+from workbench.ui.review.scene import shown_together
+from workbench.ui.widgets.line_chart import LONGEST, Line, LineChart, span_of
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import colour, letter, render
+
+CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
+"""Their heights, from the top."""
+Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
+
+
+class ReviewNumbers(PagePart[ReviewView]):
+    every = 0.09
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._html = server.gui.add_html("")
+
+    def key(self, view: ReviewView) -> object:
+        return view.opened_serial, view.selected, view.position, view.anchors
+
+    def draw(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        if chosen is None:
+            self._html.content = render("note", text="Numbers and curves appear when a recording is open.")
+            return
+        own = number_rows(step_of(chosen.episode, view.states[view.selected]), 0, chosen.length)
+        beside = [(own, view.states[view.selected])]
+        together = shown_together(view)
+        if len(together) > 1:
+            steps = [(step_of(view.opened[i].episode, view.states[i]), view.states[i]) for i in together]
+            beside = [(number_rows(step, 0, None), state) for step, state in steps]
+        self._html.content = render("review_numbers", rows=compared(own, beside), of=together)
+
+
+class ReviewCurves(PagePart[ReviewView]):
+    every = 0.15
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        folder = server.gui.add_folder(None)
+        self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
+            "Also", ("-",), initial_value="-", visible=False
+        )
+        self._entry.on_update(lambda _: self._choose())
+        self._charts = {
+            name: LineChart(server, folder, height, order)
+            for order, (name, height) in enumerate(CHARTS.items(), start=1)
+        }
+        self._lines_drawn: object = None
+        self._found: dict[str, dict[str, Lines]] = {}
+        self._offered: dict[str, tuple[str, str]] = {}
+        """What is in the list, to the entry and which of its lines; empty where it has one."""
+        self._wish = ""
+        """The entry that was last chosen, kept while recordings without it are open."""
+
+    def key(self, view: ReviewView) -> object:
+        which = view.opened_serial, len(view.opened), view.selected
+        return *which, view.position, view.anchors, self._wish
+
+    def draw(self, view: ReviewView) -> None:
+        # By the recording's id: what gets its scene later is the same recording.
+        self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
+        shown = shown_together(view)
+        self._offer(view, shown)
+        self._draw_entry("reward", REWARD, view, shown)
+        self._draw_entry("also", self._entry.value if self._entry.visible else "", view, shown)
+        lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
+        if lines != self._lines_drawn:
+            # They do not follow the position, and a chart that is sent anew is drawn anew.
+            self._lines_drawn = lines
+            self._draw_lines("terms", TERMS, view)
+            self._draw_lines("action", ACTION, view)
+
+    # --- charts --------------------------------------------------------------------------------------
+
+    def _choose(self) -> None:
+        self._wish = self._entry.value
+
+    def _offer(self, view: ReviewView, shown: Sequence[int]) -> None:
+        found = [self._found[view.opened[index].id] for index in shown]
+        self._offered = {
+            name if len(lines) == 1 else f"{name}: {line}": (name, "" if len(lines) == 1 else line)
+            for entries in found
+            for name, lines in entries.items()
+            if name not in (REWARD, TERMS, ACTION)
+            for line in lines
+        }
+        for entries in found:
+            for group in (TERMS, ACTION):
+                self._offered |= {f"{group}: {line}": (group, line) for line in entries.get(group, {})}
+        options = tuple(self._offered)
+        self._entry.visible = bool(options)
+        if options and options != self._entry.options:
+            wish = self._wish if self._wish in options else "success" if "success" in options else options[0]
+            self._entry.options = options
+            self._entry.value = wish
+
+    def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
+        """One entry of all that are compared."""
+        group, line = self._offered.get(entry, (entry, ""))
+        drawn: list[Line] = []
+        cursor = 0
+        for index in shown:
+            one = view.opened[index]
+            lines = self._found[one.id].get(group)
+            if not lines or (line and line not in lines):
+                continue
+            if index == view.selected:
+                cursor = len(drawn)
+            states, values = lines[line] if line else next(iter(lines.values()))
+            name = letter(index) if len(view.opened) > 1 else entry
+            over = column_at(states, values, view.anchors[index], axis_of(view))
+            drawn.append(Line(name, over, colour(index), 1.7))
+        self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
+
+    def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
+        """An entry with several lines, of the selected recording."""
+        chosen, axis = view.chosen, axis_of(view)
+        lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
+        drawn = [
+            Line(name, column_at(states, values, view.anchors[view.selected], axis), tone, 1.7)
+            for (name, (states, values)), tone in zip(lines.items(), LINE_COLOURS, strict=False)
+        ]
+        whose = f", {letter(view.selected)}" if len(view.opened) > 1 else ""
+        self._put(chart, f"{entry}{whose}", view, drawn)
+
+    def _put(
+        self, chart: str, title: str, view: ReviewView, drawn: list[Line], dotted: Line | None = None
+    ) -> None:
+        """Every so-many-th position, and the dot of one line at the position that is shown."""
+        axis = axis_of(view)
+        every = slice(None, None, max(1, -(-len(axis) // LONGEST)))
+        x, lines = axis[every], [replace(line, values=line.values[every]) for line in drawn]
+        dot = None
+        if dotted is not None:
+            at = view.position - view.first
+            dot = np.full(len(x), np.nan)
+            dot[min(round(at / every.step), len(x) - 1)] = dotted.values[at]
+        self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
+
+
+def step_of(episode: Episode, state: int) -> StepResult:
+    """One state of a recording as a batch of one env."""
+    before = state - 1
+    return StepResult(
+        elapsed_steps=np.array([state], np.int32),
+        reward=np.asarray(episode.reward[before : before + 1] if state else [0.0], np.float32),
+        terminated=np.asarray(episode.terminated[before : before + 1] if state else [False], bool),
+        truncated=np.asarray(episode.truncated[before : before + 1] if state else [False], bool),
+        evaluate={name: values[state : state + 1] for name, values in episode.evaluate.items()},
+        poses=np.zeros((1, 0, 7), np.float32) if episode.poses is None else episode.poses[state : state + 1],
+        action=episode.action[before : before + 1] if state else None,
+        others=episode.others_at(state),
+    )
+
+
+def known(number: str, state: int) -> str:
+    """A number as it is said in the table: what the first state lacks, of which no step came before, is kept as NaN.
+
+    Later a NaN is what the task returned, and what somebody looks for.
+    """
+    return "—" if number == "NaN" and state == 0 else number
+
+
+def compared(
+    rows: Sequence[NumberRow], beside: Sequence[tuple[Sequence[NumberRow], int]]
+) -> list[dict[str, Any]]:
+    """Rows of the table: those of the selected recording, then what only others have.
+
+    Args:
+        beside: of each recording that has a column, its rows and which state they are of.
+    """
+    moods = {row.name: row.mood for row in rows}
+    for others, _ in beside:
+        for row in others:
+            moods.setdefault(row.name, "")
+    columns = [
+        {row.name: known(row.whole or row.selected, state) for row in others} for others, state in beside
+    ]
+    hints = {row.name: row.hint for others, _ in reversed(beside) for row in others if row.whole}
+    return [
+        {
+            "name": name,
+            "mood": mood,
+            "whole": name in hints,
+            "hint": hints.get(name, ""),
+            "values": [column.get(name, "—") for column in columns],
+        }
+        for name, mood in moods.items()
+    ]
+
+
+def axis_of(view: ReviewView) -> NDArray[np.int64]:
+    return np.arange(view.first, view.last + 1)

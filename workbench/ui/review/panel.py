@@ -1,0 +1,188 @@
+"""The Review tab: play, which recordings are open, how they lie to each other, and what is known of the selected one.
+
+Play, speed and loop are at the top as on the live page. With one recording there is nothing to compare, and the
+controls for that are not there.
+"""
+
+from __future__ import annotations
+
+import datetime
+import shlex
+from collections.abc import Callable
+
+import viser
+
+from workbench.jobs.from_recording import ChangesOnDisk, version_of
+from workbench.recording.episode.episode import acted_by_in_words
+from workbench.session.review.events import success_words
+from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
+from workbench.session.review.view import Opened, ReviewView
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import letter, render
+
+SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
+GHOSTS, GRID = "over each other", "side by side"
+GO_LIVE, STAY = "Go on live from here", "Stay here"
+
+
+class ReviewPanel(PagePart[ReviewView]):
+    """
+    Args:
+        server: The page.
+        review: What is shown and asked.
+        on_step_back: Called with the id of the selected recording and the state that is shown, when a person wants to
+            go on from there live, and again when they would rather stay.
+        going: What is waited for on the way to the live env.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        review: Review,
+        on_step_back: Callable[[str, int], None],
+        going: Callable[[], str],
+    ) -> None:
+        self._review, self._on_step_back, self._going = review, on_step_back, going
+        gui = server.gui
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, visible=False)
+        self._play.on_click(lambda _: review.toggle_play())
+        self._live = gui.add_button(
+            GO_LIVE,
+            icon=viser.Icon.PLAYER_TRACK_NEXT,
+            color="gray",
+            visible=False,
+            hint="Restores the state that is shown in the live env, with today's code (G).",
+        )
+        self._live.on_click(lambda _: self.step_back())
+        self._speed = Control(
+            gui.add_dropdown("Speed", tuple(SPEED_NAMES), initial_value="1 ×", visible=False),
+            read=lambda value: SPEED_NAMES[value],
+            send=review.set_speed,
+            shown=lambda speed: next((n for n, known in SPEED_NAMES.items() if known == speed), "1 ×"),
+        )
+        self._loop = Control(
+            gui.add_checkbox("Loop", False, visible=False),
+            send=review.set_loop,
+        )
+        self._problems = gui.add_html("")
+        self._list = gui.add_html("")
+        self._arrange = gui.add_dropdown(
+            "Draw them", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key changes it."
+        )
+        align: viser.GuiDropdownHandle = gui.add_dropdown(
+            "Align at", ("start",), initial_value="start", visible=False
+        )
+        self._align = Control(align, send=review.align)
+        self._never = gui.add_html("")
+        self._facts = gui.add_html("")
+        self._changes = ChangesOnDisk()
+        self._presses = Presses(server)
+        self._listed: object = None
+        """What the list was made of."""
+        self._told: tuple[Opened, str] | None = None
+        """What the facts are of."""
+
+    @property
+    def ghosts(self) -> bool:
+        """Whether the recordings are drawn over each other, as far as there are few enough of them."""
+        return self._arrange.value == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
+
+    def toggle_arrangement(self) -> None:
+        self._arrange.value = GRID if self._arrange.value == GHOSTS else GHOSTS
+
+    def lay_side_by_side(self) -> None:
+        self._arrange.value = GRID
+
+    def step_back(self) -> None:
+        view = self._review.view()
+        if view.chosen is not None:
+            self._on_step_back(view.chosen.id, view.states[view.selected])
+
+    def select_neighbour(self, step: int) -> None:
+        """The next (1) or previous (-1) opened recording, round the end."""
+        view = self._review.view()
+        if view.opened:
+            self._review.select((view.selected + step) % len(view.opened))
+
+    def draw(self, view: ReviewView) -> None:
+        there = bool(view.opened)
+        for handle in (self._play, self._live, self._speed.handle, self._loop.handle):
+            handle.visible = there
+        live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
+        live = STAY if self._going() else live
+        self._live.label = live
+        label = "Pause" if view.playing else "Play"
+        self._play.label = label
+        self._play.icon = viser.Icon.PLAYER_PAUSE if view.playing else viser.Icon.PLAYER_PLAY
+        self._speed.show(view.speed)
+        self._loop.show(view.loop)
+        self._problems.content = render("review_problems", problems=view.problems, loading=view.loading)
+        listed = (view.opened, view.selected, bool(view.loading))
+        if self._listed != listed:
+            # Not at every position: with many recordings it would be most of what a frame costs.
+            self._listed = listed
+            self._list.content = self._list_html(view)
+        self._arrange.visible = 1 < len(view.opened) <= MOST_COMPARED
+        self._align.handle.visible = len(view.opened) > 1 and len(view.alignments) > 1
+        if self._align.handle.options != view.alignments:
+            self._align.handle.options = view.alignments
+        self._align.show(view.align)
+        self._never.content = render("note", text=never_words(view)) if never_words(view) else ""
+        told = view.chosen and (view.chosen, self._changes.of(view.chosen.episode.info))
+        if self._told != told:
+            self._told = told
+            self._facts.content = facts_html(*told) if told else ""
+
+    def _list_html(self, view: ReviewView) -> str:
+        if not view.opened and view.loading:
+            return ""
+        presses = [
+            (
+                self._presses.id_of(("select", index), lambda _, index=index: self._review.select(index)),
+                self._presses.id_of(("close", index), lambda _, index=index: self._review.close_one(index)),
+            )
+            for index in range(len(view.opened))
+        ]
+        return render("review_opened", view=view, presses=presses, success_words=success_words)
+
+
+def never_words(view: ReviewView) -> str:
+    """Which recordings have no moment to be aligned at."""
+    name = view.align.removeprefix("first ")
+    without = [letter(i) for i, one in enumerate(view.opened) if one.first(name) is None]
+    if view.align == "start" or not without:
+        return ""
+    verb = "has" if len(without) == 1 else "have"
+    return f"{', '.join(without)} {verb} no {name}, and {'is' if len(without) == 1 else 'are'} aligned at the start."
+
+
+def facts_html(chosen: Opened, changed: str) -> str:
+    """What is known of a recording.
+
+    Args:
+        changed: what of its task is another now.
+    """
+    info = chosen.episode.info
+    return render(
+        "review_facts",
+        of=chosen,
+        info=info,
+        version=version_of(info) or info.source_hash,
+        changed=changed,
+        acted_by=acted_by_in_words(info.acted_by),
+        assignments=assignments,
+        local_time=local_time,
+    )
+
+
+def assignments(values: dict[str, object]) -> str:
+    return ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items())
+
+
+def local_time(written: str) -> str:
+    try:
+        return datetime.datetime.fromisoformat(written).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    except ValueError:
+        return written

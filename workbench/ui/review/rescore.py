@@ -1,0 +1,250 @@
+"""The Judge tab of the review: recorded episodes run again, with today's code or another, and what is judged otherwise.
+
+A row of the list opens its episode at the first state that differs, with its reward as recorded and as it is now. Which
+code judges is chosen among what the server knows of, by name, and never by a path from a page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from workbench.authoring.loading.reference import RecordedTask, named_file
+from workbench.jobs.from_recording import class_in, reference_of, version_of
+from workbench.jobs.verdict import Verdict, in_order
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.source import Source
+from workbench.recording.library.library import Library
+from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore.background import RUNNING
+from workbench.session.rescore.recordings import Rescorer
+from workbench.session.review.review import Review
+from workbench.session.review.view import ReviewView
+from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.line_chart import part_round
+from workbench.ui.widgets.rescored import JudgedPanel
+from workbench.ui.widgets.templates import counted, render
+
+TODAYS, RECORDED = "today's", "as recorded"
+MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Code:
+    """One choice; what it is called does not make it another."""
+
+    label: str = field(compare=False)
+    told: str = field(compare=False)
+    """What is opened, in words."""
+    file: Path | None = None
+    """Asked before the files that the recordings name."""
+    recorded: bool = False
+
+
+def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code, ...]:
+    """The choices for these recordings; today's code and the recorded text are always the first two.
+
+    Args:
+        infos: Of the recordings that are open; of others nothing is known before they are judged.
+        known: Task files besides those that the recordings name.
+    """
+    named = list({str(reference): reference for reference in map(reference_of, infos)}.values())
+    own = {file for file in map(named_file, named) if file is not None}
+    codes = [Code(TODAYS, _todays(infos, named)), Code(RECORDED, _recorded(infos), recorded=True)]
+    for file in dict.fromkeys(known):
+        # Of recordings that are not open it is not known whether it has their task; those of another are left alone.
+        if file not in own and (not infos or any(class_in(file, info.task) for info in infos)):
+            taken = {code.label for code in codes}
+            label = file.name if file.name not in taken else str(Path(file.parent.name, file.name))
+            if label not in taken:
+                codes.append(Code(label, f"With {file} as it is now.", file))
+    return tuple(codes)
+
+
+def _todays(infos: Sequence[EpisodeInfo], named: Sequence[RecordedTask]) -> str:
+    if not infos:
+        return "Each recording with the file that it names, as that is now."
+    told = [_in_words(reference) for reference in named[:MOST_NAMED]]
+    more = f", and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+    return f"With {', '.join(told)}{more}."
+
+
+def _in_words(reference: RecordedTask) -> str:
+    file = named_file(reference)
+    return f"{reference} as it is installed" if file is None else f"{file} as it is now"
+
+
+def _recorded(infos: Sequence[EpisodeInfo]) -> str:
+    hashes = list(dict.fromkeys(version for info in infos if (version := version_of(info))))
+    version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
+    return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."
+
+
+IDLE = (
+    "Runs today's reward and evaluate over recorded episodes, from their seeds and with their actions, and lists what is "
+    "judged otherwise now. Select recordings in the Library and press Judge again there, or judge what is open."
+)
+
+
+@dataclass
+class RescoreChoices:
+    """How it is judged; outlives the page, which goes and comes."""
+
+    code: Code = Code(TODAYS, "")
+    use_env_states: bool = False
+
+
+def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
+    """Where these recordings are; those that are gone, or cannot be read, are left out."""
+    rows = {row.id: row for row in library.rows()}
+    return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
+
+
+class RescorePanel(JudgedPanel[ReviewView, Source]):
+    """The panel in the present container.
+
+    Args:
+        server: The page.
+        rescorer: What judges.
+        review: Shows the episode of a row, and says what is open.
+        library: Of the recordings that may be judged.
+        choices: What was chosen before.
+        known: Task files that the server knows of besides those that recordings name.
+    """
+
+    advice = words.PUT_IN
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        rescorer: Rescorer,
+        review: Review,
+        library: Library,
+        choices: RescoreChoices,
+        known: Callable[[], Sequence[Path]] = tuple,
+    ) -> None:
+        super().__init__(server, "episode")
+        self._rescorer, self._review = rescorer, review
+        self._library, self._choices, self._known = library, choices, known
+        gui = server.gui
+        self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
+        self._begin.on_click(lambda _: self.judge([one.id for one in review.view().opened]))
+        self._codes = codes_for((), ())
+        self._codes_of: object = None
+        labels = tuple(code.label for code in self._codes)
+        self._code: viser.GuiDropdownHandle = gui.add_dropdown(
+            "Code",
+            labels,
+            initial_value=RECORDED if choices.code.recorded else TODAYS,
+            hint="Today's code of the task, the text that the recording was made with, or a task file that is open here",
+        )
+        self._code.on_update(lambda _: self._chosen())
+        self._told = gui.add_html("")
+        self._states = gui.add_checkbox(
+            "Recorded states",
+            choices.use_env_states,
+            hint="Put the recorded state in after every step, so that nothing drifts from the record",
+        )
+        self._states.on_update(lambda _: self._chosen())
+        self._add_status("Stop", rescorer.judging.stop)
+        self._add_list()
+        self._add_chart()
+        self._selected: str | None = None
+
+    def judge_and_tell(self, ids: Sequence[str]) -> None:
+        """As `judge`, for a press from where the tab is not seen."""
+        if not ids:
+            tell_all(self._server, "Nothing to judge", "No recording is selected or open.")
+            return
+        self.judge(ids)
+        title = f"Judging {counted(len(ids), 'recording')} again"
+        tell_all(self._server, title, "What is otherwise now is listed under Judge.", None, 4.0)
+
+    def judge(self, ids: Sequence[str]) -> None:
+        """Begin with these recordings of the library."""
+        files = episode_files(self._library, ids)
+        self._selected = None
+        self._pages.go_to(0)
+        self._rescorer.start(
+            files,
+            file=self._choices.code.file,
+            recorded_source=self._choices.code.recorded,
+            use_env_states=self._choices.use_env_states,
+        )
+
+    def _chosen(self) -> None:
+        self._choices.code = next(code for code in self._codes if code.label == self._code.value)
+        self._choices.use_env_states = self._states.value
+
+    # --- drawing -----------------------------------------------------------------------------------
+
+    def key(self, view: ReviewView) -> object:
+        at = self._rescorer.judging.view.serial, view.opened_serial, view.selected
+        return *at, self._pages.first, self._selected, self._codes_are_of(view)
+
+    def _codes_are_of(self, view: ReviewView) -> object:
+        """What decides which code there is to choose from."""
+        return tuple(one.id for one in view.opened), tuple(self._known()), self._choices.code
+
+    def draw(self, view: ReviewView) -> None:
+        self._draw_codes(view)
+        told = self._rescorer.judging.view
+        self._begin.visible = bool(view.opened) and told.state not in RUNNING
+        self._draw_status(told, idle=IDLE)
+        self._draw_list(in_order(told.verdicts))
+        self._draw_curve()
+
+    def _draw_codes(self, view: ReviewView) -> None:
+        if self._codes_of == (wanted := self._codes_are_of(view)):
+            return
+        self._codes_of = wanted
+        self._codes = codes_for([one.episode.info for one in view.opened], self._known())
+        # What is not among the choices any more is not judged with, unseen.
+        chosen = next((code for code in self._codes if code == self._choices.code), self._codes[0])
+        self._choices.code = chosen
+        labels = tuple(code.label for code in self._codes)
+        if self._code.options != labels:
+            self._code.options = labels
+        self._code.value = chosen.label
+        self._told.content = render("note", text=chosen.told)
+
+    def _of_row(self, verdict: Verdict[Source]) -> dict[str, Any]:
+        at = verdict.first_difference
+        opened = [one.id for one in self._review.view().opened]
+        return {
+            # As it is drawn with, if it is one of several that are open.
+            "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
+            "name": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.of.name[-24:],
+            "hint": f"{verdict.of.name}. Press to open it"
+            + (f" at step {at}, the first that differs" if at is not None else ""),
+            "selected": verdict.of.id == self._selected,
+        }
+
+    def _show(self, verdict: Verdict[Source]) -> None:
+        self._selected = verdict.of.id
+        view = self._review.view()
+        opened = next((k for k, one in enumerate(view.opened) if one.id == verdict.of.id), None)
+        if opened is None:
+            self._review.open((verdict.of.id,), verdict.first_difference)
+            return
+        self._review.select(opened)
+        if verdict.first_difference is not None:
+            self._review.seek(verdict.first_difference - view.anchors[opened])
+
+    def _draw_curve(self) -> None:
+        chosen = next((v for v in self._listed if v.of.id == self._selected), None)
+        if chosen is None:
+            self._chart.hide()
+            return
+        part = part_round(chosen.length, chosen.first_difference)
+        steps = np.arange(1, chosen.length + 1)
+        name = f"seed {chosen.seed}" if chosen.seed >= 0 else chosen.of.name
+        self._draw_chart(
+            f"reward of {name}, then and now",
+            *(values[part] for values in (steps, chosen.old_reward, chosen.new_reward)),
+        )

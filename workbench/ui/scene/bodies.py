@@ -1,0 +1,149 @@
+"""The bodies of the envs in the page: built once a scene, moved once a frame.
+
+One viser node a body is unusable in a browser from a hundred bodies on (measured: 1 frame a second
+at 3,840), one batched node a shape is not (30 a second). So the scene is a handful of batched nodes,
+and a frame is two arrays a node: world positions and quaternions, each env's own pose plus its place
+in the grid. World poses and not parent frames, because viser's batches bypass its scene graph and a
+parent that moves in the same frame makes them shake.
+
+Showing one env alone really sends one env: the arrays of a batch may change their length, the
+browser then keeps that many instances. Bodies that an env lacks (NaN) are left out the same way.
+What a browser can draw is limited by triangles, so the fewer envs are shown the finer they are.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.scene.shapes import SceneGeometry, fingerprint
+from workbench.core.scene.simplify import reduce_mesh
+from workbench.ui.scene.env_grid import EnvLayout, InView, place_of_plane, plane_normal
+from workbench.ui.scene.glb import WornTogether, as_glb, face_limit, group_by_wearers
+
+NAMES = ("/envs", "/floor")
+"""Below which all of it is in viser's tree."""
+
+
+class SceneView:
+    """The batched nodes of one scene under ``/envs``."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._drawn: dict[tuple[str, int, int], _DrawnGroup] = {}
+        self._number = 0
+        look = {"cell_size": 0.5, "section_size": 1.0}
+        colours = {"cell_color": (150, 150, 150), "section_color": (120, 120, 120)}
+        add = partial(server.scene.add_grid, "/floor", **look, **colours)
+        self._grid = InView(add, "width", "height", "position")
+
+    def build(
+        self,
+        geometry: SceneGeometry,
+        layout: EnvLayout,
+        poses: NDArray[np.float32],
+        only_env: int | None = None,
+        triangles: int = 200_000,
+    ) -> None:
+        """Replace whatever was shown by this scene; what looks as before stays and is not sent again.
+
+        Args:
+            geometry: What it looks like.
+            layout: Where each env stands.
+            poses: (N, B, 7) in env frames.
+            only_env: Show this env alone; None shows all.
+            triangles: About how many may be drawn; richer shapes are simplified to fit.
+        """
+        shown_envs = geometry.num_envs if only_env is None else 1
+        limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, triangles)
+        before, self._drawn = self._drawn, {}
+        for group in group_by_wearers(geometry):
+            looks = fingerprint(group.visuals)
+            key = (looks, limit, sum(looks == known for known, _, _ in self._drawn))
+            first = group.visuals[0]
+            normals = [plane_normal(visual, geometry, poses) for visual in group.visuals]
+            once = None if normals[0] is None else place_of_plane(normals[0], first, poses, layout)
+            if any(normal is None for normal in normals):
+                once = None
+            drawn = before.pop(key, None)
+            if drawn is None:
+                self._number += 1
+                drawn = _DrawnGroup(self._server, self._number, group, limit)
+            drawn.wear(group, once)
+            self._drawn[key] = drawn
+        for drawn in before.values():
+            drawn.handle.remove()
+        if layout.has_floor:
+            self._grid.draw()
+        else:
+            low, high = layout.box_of_all()
+            wide, deep = float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 4.0
+            self._grid.draw(wide, deep, (0.0, 0.0, layout.floor_height))
+        self.move(poses, layout, only_env)
+
+    def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
+        """Put every body where it is now.
+
+        Args:
+            poses: (N, B, 7) in env frames.
+            layout: Where each env stands.
+            only_env: Show this env alone, at the origin; None shows all, on the grid.
+        """
+        for group in self._drawn.values():
+            group.move(poses, layout, only_env)
+
+    def clear(self) -> None:
+        for group in self._drawn.values():
+            group.handle.remove()
+        self._drawn.clear()
+        self._grid.draw()
+
+    @property
+    def handles(self) -> tuple[viser.BatchedGlbHandle, ...]:
+        return tuple(group.handle for group in self._drawn.values())
+
+
+class _DrawnGroup:
+    def __init__(self, server: viser.ViserServer, number: int, group: WornTogether, limit: int) -> None:
+        glb = as_glb([(reduce_mesh(visual.mesh, limit), visual.material) for visual in group.visuals])
+        # One instance far below the ground; the first move follows in the same batch.
+        self.handle = server.scene.add_batched_glb(
+            f"/envs/{number:03d} {group.name.replace('/', ' ')}",
+            glb,
+            batched_wxyzs=np.array([[1, 0, 0, 0]], np.float32),
+            batched_positions=np.array([[0, 0, -1000]], np.float32),
+            # viser's levels of detail leave holes in open meshes and pop while one looks.
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self.wear(group, None)
+
+    def wear(self, group: WornTogether, once: NDArray[np.float32] | None) -> None:
+        """From now on these (env, body) pairs wear it; a floor or wall is drawn `once`, moved by that."""
+        self._group, self._once = group, once
+
+    def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
+        envs, bodies = self._group.envs, self._group.bodies
+        if self._once is not None:
+            envs, bodies = envs[:1], bodies[:1]
+            worn = poses[envs, bodies]
+            positions = worn[:, :3] + (self._once if only_env is None else 0)
+        elif only_env is None:
+            worn = poses[envs, bodies]
+            positions = worn[:, :3] + layout.offsets[envs]
+        else:
+            mine = envs == only_env
+            worn = poses[envs[mine], bodies[mine]]
+            positions = worn[:, :3]
+        there = np.isfinite(worn).all(axis=1)
+        if not there.all():
+            worn, positions = worn[there], positions[there]
+        self.handle.visible = bool(len(positions))
+        if len(positions):
+            # Equal arrays are not sent again (viser compares), so what rests costs no bytes.
+            self.handle.batched_positions = np.ascontiguousarray(positions)
+            self.handle.batched_wxyzs = np.ascontiguousarray(worn[:, 3:])

@@ -1,0 +1,155 @@
+"""Shapes of the scene as GLB, the one mesh format that a browser shows with its true material.
+
+viser draws either bare triangles in one colour or a GLB with textures, metal and roughness. Bare
+triangles also lose the normals, so a box with shared corners is shaded like a ball. Hence GLB for
+everything. Visuals that the same bodies wear (the parts of one link) go into one file with one
+material a part: a frame then costs two messages a link and not two a part, and viser tears a frame
+that needs more than 128.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
+
+LARGEST_TEXTURE = 1024
+"""Pixels. A page is sent every texture before it shows anything; 4k scans are megabytes each."""
+
+
+LAYER = 4e-4
+"""Metres between painted layers; two steps of a 24 bit depth buffer at ten metres."""
+
+
+@dataclass(frozen=True)
+class WornTogether:
+    """Visuals with exactly the same wearers, drawn as one node."""
+
+    name: str
+    visuals: tuple[Visual, ...]
+    envs: NDArray[np.int32]
+    """(K,)"""
+    bodies: NDArray[np.int32]
+    """(K,)"""
+
+
+def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
+    """The visuals of a scene, those that the same (env, body) pairs wear put together."""
+    groups: dict[tuple[bytes, bytes], list[Visual]] = {}
+    for visual in geometry.visuals:
+        if len(visual.mesh.faces):
+            key = (visual.envs.tobytes(), visual.bodies.tobytes())
+            groups.setdefault(key, []).append(visual)
+    return tuple(
+        WornTogether(name=group[0].name, visuals=tuple(group), envs=group[0].envs, bodies=group[0].bodies)
+        for group in groups.values()
+    )
+
+
+def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budget: int) -> int:
+    """The most triangles a visual may have so that all instances together stay within the budget.
+
+    Simple shapes keep all of theirs; only the rich ones give way, down to a few hundred.
+    """
+    faces = np.array([len(visual.mesh.faces) for visual in visuals], np.int64)
+    shown = np.array([len(visual.envs) for visual in visuals], np.int64) * shown_envs / num_envs
+    fewest, most = 200, int(max(faces.max(initial=0), 200))
+    while fewest < most:
+        limit = (fewest + most + 1) // 2
+        if (np.minimum(faces, limit) * shown).sum() <= budget:
+            fewest = limit
+        else:
+            most = limit - 1
+    return fewest
+
+
+def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
+    """One GLB of these parts, all in the frame of the body that wears them.
+
+    The browser merges the parts into one buffer and refuses those that differ in which attributes
+    they have, so normals are always written, and texture coordinates as soon as one part has some.
+    """
+    textured = any(mesh.uvs is not None for mesh, _ in parts)
+    parts = list(zip(lift_painted_layers([mesh for mesh, _ in parts]), [m for _, m in parts], strict=True))
+    scene = trimesh.Scene()
+    for number, (mesh, material) in enumerate(parts):
+        solid = trimesh.Trimesh(
+            mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False, validate=False
+        )
+        if mesh.normals is None:
+            # Asking for them puts them in the cache, and only cached normals are exported.
+            _ = solid.vertex_normals
+        uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs.copy()
+        # trimesh counts v from the bottom of the picture and turns it round when it writes glTF, which
+        # counts from the top, as SAPIEN does: unturned, every texture would stand on its head.
+        uvs[:, 1] = 1.0 - uvs[:, 1]
+        solid.visual = TextureVisuals(uv=uvs if textured else None, material=_pbr(material, number))
+        scene.add_geometry(solid, geom_name=str(number))
+    glb = scene.export(file_type="glb", include_normals=True)
+    assert isinstance(glb, bytes)
+    return glb
+
+
+def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:
+    """Thin layers of one body that lie on each other, pulled apart as far as a browser can tell.
+
+    ManiSkill paints its targets as discs that rise by a hundredth of a millimetre each. SAPIEN's float
+    depth keeps them apart; a browser's 24 bits do not, and the rings turn into noise. Layers (thinner
+    than a millimetre, crossing each other's outline) are scaled along their thin axis so that each is
+    `LAYER` beyond the one before; what has any thickness stays as it is.
+    """
+    layers: dict[int, list[int]] = {}
+    for number, mesh in enumerate(meshes):
+        if len(mesh.vertices):
+            extent = np.ptp(mesh.vertices, axis=0)
+            if extent.min() < 1e-3 and extent.max() > 20 * extent.min():
+                layers.setdefault(int(extent.argmin()), []).append(number)
+    lifted = list(meshes)
+    for axis, numbers in layers.items():
+        if len(numbers) < 2:
+            continue
+        numbers = sorted(numbers, key=lambda n: np.abs(meshes[n].vertices[:, axis]).max())
+        for rank, number in enumerate(numbers):
+            mesh = meshes[number]
+            vertices = mesh.vertices.copy()
+            vertices[:, axis] += np.sign(vertices[:, axis]) * rank * LAYER
+            lifted[number] = replace(mesh, vertices=vertices)
+    return lifted
+
+
+def _pbr(material: Material, number: int) -> PBRMaterial:
+    red, green, blue, alpha = (float(np.clip(c, 0.0, 1.0)) for c in material.base_color)
+    texture = None if material.texture is None else _texture(material.texture)
+    see_through = alpha < 0.999 or (texture is not None and texture.mode == "RGBA")
+    return PBRMaterial(
+        name=f"part {number}",
+        baseColorFactor=[red, green, blue, alpha],
+        baseColorTexture=texture,
+        # Bare metal shows nothing but what it reflects, and there are no surroundings to reflect.
+        metallicFactor=float(np.clip(material.metallic, 0.0, 0.4)),
+        roughnessFactor=float(np.clip(material.roughness, 0.0, 1.0)),
+        alphaMode="BLEND" if see_through else "OPAQUE",
+        # Meshes of robots are often open shells with mixed winding; seen from behind they would
+        # have holes.
+        doubleSided=True,
+    )
+
+
+def _texture(pixels: NDArray[np.uint8]) -> Image.Image:
+    image = Image.fromarray(pixels[..., :3])
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
+        image = Image.fromarray(pixels)
+    if max(image.size) > LARGEST_TEXTURE:
+        image.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE), Image.Resampling.LANCZOS)
+    if image.mode == "RGB":
+        # trimesh writes an image as JPEG only if it says it is one; a PNG of a photograph is five
+        # times the size.
+        image.format = "JPEG"
+    return image

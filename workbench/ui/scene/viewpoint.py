@@ -1,0 +1,289 @@
+"""Where the page looks from when it first shows a scene; after that the view belongs to the person.
+
+It frames the whole grid (or the one env) by itself, and again only for a scene of another size or a choice that
+changes what is shown. A page's panels take their places some moments after it has come, much later on a busy machine,
+and a person opens more: while nobody has moved the view it is framed for the shape that it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser.transforms import SO3
+
+from workbench.core.camera_data import Picture
+from workbench.session.live.view import SessionView
+from workbench.ui.scene.bodies import NAMES as BODIES
+from workbench.ui.scene.bodies import SceneView
+from workbench.ui.scene.env_grid import EnvLayout, box_corners
+from workbench.ui.server.viser_private import remove_nodes_but
+from workbench.ui.widgets.parts import PagePart
+
+FOV = 0.75
+"""Vertical, radians. viser's own 75 degrees bends what stands at the edge of a grid."""
+USUAL_ASPECT = 1.25
+"""Of the view beside the panel in a 1280 x 720 window, before a page has said its own."""
+USUAL_HEIGHT = 720.0
+"""Pixels."""
+MOST_COVERED = 0.45
+FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
+"""ManiSkill's robots look along +x, so their front is seen from there; a little from the side."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera in the page: metres, z up, always upright."""
+
+    position: NDArray[np.float64]
+    look_at: NDArray[np.float64]
+
+
+def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+    """The nearest upright view from the front and above that has the whole box in it, above what is covered.
+
+    Let the camera stand at ``target - d * forward - k * up``. A corner c, as seen from the target, is inside the
+    picture when ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between
+    ``-(1 - 2 * covered)`` and 1 times ``tan(fov_y / 2) * (d + forward . c)``. So d is the largest of the bounds that
+    the corners and the pairs of corners give, and k the middle of what is left to it.
+
+    Args:
+        covered: Part of the picture's height that something lies over, from below (the timeline).
+    """
+    target = (np.asarray(low, np.float64) + high) / 2
+    forward = -FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    corners = box_corners(low, high) - target
+    tall = np.tan(FOV / 2)
+    wide = tall * float(np.clip(aspect, 0.3, 4.0))
+    below = tall * (1 - 2 * float(np.clip(covered, 0.0, MOST_COVERED)))
+    ahead, height = corners @ forward, corners @ up
+    pairs = height[:, None] - height - tall * ahead[:, None] - below * ahead
+    distance = 1.04 * max(
+        float((np.abs(corners @ right) / wide - ahead).max()),
+        float(pairs.max()) / (tall + below),
+        0.3,
+    )
+    least = float((-below * (distance + ahead) - height).max())
+    most = float((tall * (distance + ahead) - height).min())
+    look_at = target - up * (least + most) / 2
+    return Viewpoint(position=look_at - forward * distance, look_at=look_at)
+
+
+def frame_all(layout: EnvLayout, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+    return frame_box(*layout.box_of_all(), aspect, covered)
+
+
+def frame_one(
+    layout: EnvLayout,
+    picture: Picture | None,
+    aspect: float = USUAL_ASPECT,
+    covered: float = 0.0,
+    fovy: float = FOV,
+    acting: tuple[NDArray, NDArray] | None = None,
+) -> Viewpoint:
+    """The view of one env at the origin, above what is covered.
+
+    It is what the task's own human camera sees, where there is one: from its direction, as far away as makes its
+    picture as high (and wide) as what is left of the view, and so that the middle of the picture is in the middle of that.
+
+    Args:
+        picture: Of the human camera; only its pose is looked at.
+        covered: As of `frame_box`.
+        fovy: The human camera's vertical field of view, radians.
+        acting: Box of what is to be seen where there is no human camera; None takes all that stands in the env.
+    """
+    if picture is None:
+        low, high = (layout.low, layout.high) if acting is None else acting
+        return frame_box(low, high, aspect, covered)
+    covered = float(np.clip(covered, 0.0, MOST_COVERED))
+    position = picture.pose[:3].astype(np.float64)
+    forward = SO3(picture.pose[3:].astype(np.float64)).apply(np.array([1.0, 0.0, 0.0]))
+    centre = (layout.low + layout.high) / 2
+    # The page turns about what it looks at, so that has to be at the depth of the env.
+    depth = max(float((centre - position) @ forward), 0.2)
+    tall = float(np.tan(FOV / 2))
+    left = min(1 - covered, float(np.clip(aspect, 0.3, 4.0)))
+    away = depth * float(np.tan(fovy / 2)) / (tall * left)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(right))
+    up = np.cross(right / length, forward) if length > 1e-6 else np.zeros(3)
+    look_at = position + forward * depth - up * covered * tall * away
+    return Viewpoint(position=look_at - forward * away, look_at=look_at)
+
+
+Frame = Callable[[float, float], Viewpoint]
+"""Gives the viewpoint for a view of this aspect (width over height) and height in pixels."""
+
+
+class Framing:
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._pointed: dict[int, tuple[np.ndarray, float]] = {}
+        self._framed: object = None
+
+    def is_new(self, what: object) -> bool:
+        """Whether this is something else than was asked about last: then it is to be framed anew."""
+        new, self._framed = what != self._framed, what
+        return new
+
+    def follow(self) -> int:
+        """Forget the pages that have gone; returns how many are open."""
+        clients = self._server.get_clients()
+        for number in self._pointed.keys() - clients.keys():
+            del self._pointed[number]
+        return len(clients)
+
+    @property
+    def pointed(self) -> frozenset[int]:
+        """The open pages that were pointed at something."""
+        return frozenset(self._pointed)
+
+    def frame(self, frame: Frame, untouched_only: bool = False) -> None:
+        """Point every open page (or those whose view nobody has moved), and those to come."""
+        usual = frame(USUAL_ASPECT, USUAL_HEIGHT)
+        self._server.initial_camera.position = usual.position
+        self._server.initial_camera.look_at = usual.look_at
+        for client in self._server.get_clients().values():
+            if not untouched_only or self._is_untouched(client):
+                self._point(client, frame)
+
+    def frame_untouched(self, frame: Frame) -> None:
+        """Frame anew each page that nobody has moved and that looks, or is shaped, otherwise than it was framed."""
+        for number, client in self._server.get_clients().items():
+            position, aspect = self._pointed.get(number, (self._server.initial_camera.position, USUAL_ASPECT))
+            as_framed = _is_at(client, position) and abs(aspect_of(client) / aspect - 1) <= 0.05
+            # If it looks from somewhere else, it lost its connection and came back, or the person was quicker.
+            if not as_framed and self._is_untouched(client):
+                self._point(client, frame)
+
+    def _is_untouched(self, client: viser.ClientHandle) -> bool:
+        """True while the page looks from where it was last pointed, or from where every page begins.
+
+        What a page that is just coming is told may reach it before where pages begin, which then is where it looks from.
+        """
+        position, _ = self._pointed.get(client.client_id, (None, None))
+        begins = self._server.initial_camera.position
+        return _is_at(client, begins) or (position is not None and _is_at(client, position))
+
+    def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
+        viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
+        client.camera.position = viewpoint.position
+        client.camera.look_at = viewpoint.look_at
+        # After it is: who waits for it may close the page, and viser warns of what is written to a page that has gone.
+        self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
+
+
+def _is_at(client: viser.ClientHandle, position: NDArray[np.float64]) -> bool:
+    return np.allclose(client.camera.position, position, atol=0.02)
+
+
+def aspect_of(client: viser.ClientHandle) -> float:
+    """Width over height of the view in this page."""
+    camera = client.camera
+    if not camera.image_height or not camera.image_width:
+        return USUAL_ASPECT
+    return camera.image_width / camera.image_height
+
+
+def light(server: viser.ViserServer) -> None:
+    """Put the lights into the scene; once a server."""
+    server.scene.configure_default_lights(enabled=False, cast_shadow=False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_hemisphere(
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(125, 125, 135), intensity=1.5
+    )
+    server.scene.add_light_directional(
+        "/lights/lamp", color=(255, 251, 244), intensity=1.5, position=(3.0, -2.0, 5.0), cast_shadow=False
+    )
+
+
+class Stage:
+    """Bodies, light and viewpoint on this server: what outlives the pages that draw into it.
+
+    The bodies stay in the browser while one page takes the other's place, so what looks as before is not sent again and
+    the view is never empty in between. Labels, frustums, marks and handles go with their page. viser's own lights burn
+    white plastic and textures out; an environment map or shadows would make a browser without a graphics card pay for
+    each pixel.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        server.scene.set_up_direction("+z")
+        light(server)
+        server.initial_camera.fov = FOV
+        # Depth is 24 bit: with viser's near plane of a centimetre a goal that is painted a millimetre
+        # above a table flickers from a few metres on.
+        server.initial_camera.near = 0.05
+        server.initial_camera.far = 300.0
+        self.scene = SceneView(server)
+        self.framing = Framing(server)
+
+    def clear(self) -> None:
+        """Take away what a page has put up besides the bodies."""
+        # Callbacks first: a click that comes now is nobody's.
+        self._server.scene.remove_click_callback("all")
+        remove_nodes_but(self._server, (*BODIES, "/lights"))
+
+
+# --- How the page shows what it shows: all envs or one, dark or light -------------------------
+
+
+DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
+"""Triangles in the view. A browser without a graphics card wants the fewest."""
+ALL, ONE = "all envs", "the selected env"
+DARK, LIGHT = "dark", "light"
+BRAND = (28, 112, 190)
+
+
+class ViewPanel(PagePart[SessionView]):
+    def __init__(self, server: viser.ViserServer, dark: bool = True) -> None:
+        self._server = server
+        with server.gui.add_folder("View"):
+            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=ALL, visible=False)
+            self._detail = server.gui.add_dropdown(
+                "Detail",
+                tuple(DETAILS),
+                initial_value="normal",
+                hint="How finely shapes are drawn. Choose coarse if the view is slow.",
+            )
+            self._theme = server.gui.add_dropdown(
+                "Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT
+            )
+        self._theme.on_update(lambda _: self._apply_theme())
+        self._apply_theme()
+
+    @property
+    def only_selected(self) -> bool:
+        return self._show.value == ONE
+
+    @property
+    def dark(self) -> bool:
+        return self._theme.value != LIGHT
+
+    @property
+    def triangles(self) -> int:
+        return DETAILS[self._detail.value]
+
+    def toggle_only_selected(self) -> None:
+        self._show.value = ALL if self.only_selected else ONE
+
+    def toggle_dark(self) -> None:
+        self._theme.value = LIGHT if self._theme.value == DARK else DARK
+
+    def draw(self, view: SessionView) -> None:
+        several = view.task is not None and view.task.num_envs > 1
+        self._show.visible = several
+
+    def _apply_theme(self) -> None:
+        self._server.gui.configure_theme(
+            dark_mode=self.dark,
+            show_logo=False,
+            show_share_button=False,
+            brand_color=BRAND,
+        )

@@ -1,0 +1,189 @@
+"""Reads what a page sends into typed messages: one structure for each kind that a page has to say.
+
+A frame is decoded straight into its structure. What does not fit is refused at the first byte that does not, so
+that eight megabytes of nested lists never become millions of Python objects on the event loop. A value for a
+control is left undecoded (`GuiUpdateMessage.updates`), since what it may be depends on the control; see
+`workbench.ui.server.control_values`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+
+T = TypeVar("T")
+
+MAX_BYTES = 256 * 1024
+"""The largest thing that a page sends is a text that was pasted. viser's pictures of a view are never asked for."""
+FARTHEST = 1e12
+"""Largest number of a camera, a ray or a gizmo, in whatever unit."""
+LARGEST_PICTURE = 100_000
+"""Pixels along one side of a page."""
+
+Name = Annotated[str, msgspec.Meta(max_length=1024)]
+Uuid = Annotated[str, msgspec.Meta(max_length=64)]
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+Quadruple = tuple[float, float, float, float]
+Modifier = Literal[
+    "cmd/ctrl", "alt", "shift", "cmd/ctrl+alt", "cmd/ctrl+shift", "alt+shift", "cmd/ctrl+alt+shift"
+]
+
+
+class MalformedMessage(ValueError):
+    """No page of ours sends such a frame; its connection is closed."""
+
+
+class ImpossibleValue(ValueError):
+    """A number that cannot be meant, in a message that is well formed; the message is dropped."""
+
+
+class ClientMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
+    """One of the kinds below; each has the fields of viser's message of that name."""
+
+    def check(self) -> None:
+        """
+        Raises:
+            ImpossibleValue: A number is not finite, or out of all bounds.
+        """
+
+
+class CommandTriggerMessage(ClientMessage):
+    uuid: Uuid
+
+
+class GuiFormDirtyMessage(ClientMessage):
+    uuid: Uuid
+
+
+class GuiFormSubmitMessage(ClientMessage):
+    uuid: Uuid
+
+
+class GuiUpdateMessage(ClientMessage):
+    uuid: Uuid
+    updates: Annotated[dict[str, msgspec.Raw], msgspec.Meta(max_length=16)]
+
+
+class ScenePointerMessage(ClientMessage):
+    event_type: Literal["click"]
+    ray_origin: Triple
+    ray_direction: Triple
+    screen_pos: tuple[Pair]
+    modifier: Modifier | None
+
+    def check(self) -> None:
+        _check_numbers(*self.ray_origin, *self.ray_direction, *self.screen_pos[0])
+
+
+class TransformControlsDragEndMessage(ClientMessage):
+    name: Name
+    owner: Name = ""
+
+
+class TransformControlsDragStartMessage(ClientMessage):
+    name: Name
+    owner: Name = ""
+
+
+class TransformControlsUpdateMessage(ClientMessage):
+    name: Name
+    wxyz: Quadruple
+    position: Triple
+    owner: Name = ""
+
+    def check(self) -> None:
+        _check_numbers(*self.position)
+        _check_rotation(self.wxyz)
+
+
+class ViewerCameraMessage(ClientMessage):
+    wxyz: Quadruple
+    position: Triple
+    fov: float
+    near: float
+    far: float
+    # Some browsers have half pixels.
+    image_height: float
+    image_width: float
+    look_at: Triple
+    up_direction: Triple
+
+    def check(self) -> None:
+        _check_rotation(self.wxyz)
+        _check_numbers(*self.position, *self.look_at, *self.up_direction, self.near, self.far)
+        if not 0 < self.fov < math.pi:
+            raise ImpossibleValue("a field of view that no camera has")
+        # 0 by 0 is a page whose view is folded away.
+        if not (0 <= self.image_height <= LARGEST_PICTURE and 0 <= self.image_width <= LARGEST_PICTURE):
+            raise ImpossibleValue("a size that no page has")
+
+
+Value = bool | int | float | str | list[bool | int | float | str]
+"""What any control may hold, as it comes."""
+
+KINDS: dict[str, type[ClientMessage]] = {kind.__name__: kind for kind in ClientMessage.__subclasses__()}
+
+
+class _Any(msgspec.Struct):
+    type: str
+
+
+_kind_decoder = msgspec.msgpack.Decoder(_Any)
+_decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in KINDS.items()}
+_value_decoder = msgspec.msgpack.Decoder(Value)
+
+
+def _decoded(decoder: msgspec.msgpack.Decoder[T], raw: bytes | msgspec.Raw, problem: ValueError) -> T:
+    try:
+        return decoder.decode(raw)
+    # A ValidationError is a DecodeError; the others are nesting without end and text that is not UTF-8.
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError):
+        raise problem from None
+
+
+def kind_of(raw: object) -> str:
+    """The ``type`` of a frame; the rest is skipped over.
+
+    Raises:
+        MalformedMessage: A text frame, too long, not msgpack, or without a type.
+    """
+    if not isinstance(raw, bytes):
+        raise MalformedMessage("a text frame")
+    if len(raw) > MAX_BYTES:
+        raise MalformedMessage("a message that is too long")
+    return _decoded(_kind_decoder, raw, MalformedMessage("what is not a message")).type
+
+
+def read_message(raw: bytes, kind: str) -> ClientMessage:
+    """The message in `raw`, which is of this kind.
+
+    Raises:
+        MalformedMessage: Fields are missing, surplus, of another type or of another length.
+        ImpossibleValue: A number in it is not finite, or cannot be meant.
+    """
+    message = _decoded(_decoders[kind], raw, MalformedMessage(f"wrong fields in {kind}"))
+    message.check()
+    return message
+
+
+def read_value(raw: msgspec.Raw) -> Value:
+    """What a page claims that a control holds.
+
+    Raises:
+        ValueError: It is nested, bytes, or of a kind that no control holds.
+    """
+    return _decoded(_value_decoder, raw, ValueError("No control holds that."))
+
+
+def _check_numbers(*numbers: float) -> None:
+    # Written so that NaN, of which every comparison is false, is caught as well.
+    if not all(abs(number) <= FARTHEST for number in numbers):
+        raise ImpossibleValue("a number that is not finite, or too large")
+
+
+def _check_rotation(wxyz: Quadruple) -> None:
+    if not 0.5 <= math.hypot(*wxyz) <= 2.0:
+        raise ImpossibleValue("a rotation that is none")

@@ -1,0 +1,155 @@
+"""Decides for each message of a page whether it goes on to viser, and how fast a page may speak.
+
+What no page of ours sends ends its connection. A value that a control cannot hold is dropped: viser does not store
+it, no other page hears of it, and the page that sent it is told and shown the true value again once its hand is off
+the control. That is no attack: the ends of a slider or a list of options may have changed between the click and its
+arrival. (What is typed into a number field is looked at in the page first, ``web_assets/typed_numbers.js``.) A page that speaks faster than a page can is slowed down, so that the
+others keep their share of the event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Any, Protocol
+
+from workbench.ui.server.client_messages import (
+    KINDS,
+    ClientMessage,
+    GuiFormDirtyMessage,
+    GuiFormSubmitMessage,
+    GuiUpdateMessage,
+    ImpossibleValue,
+    MalformedMessage,
+    kind_of,
+    read_message,
+    read_value,
+)
+from workbench.ui.server.control_values import check_value
+from workbench.ui.server.strangers import ToldRarely
+
+HANDS_OFF = 1.2
+"""Seconds without another value after which a control shows the true one again: a hand may still be on it."""
+RATE = 200.0
+"""Messages in a second that a page may send for long; a drag sends about twenty."""
+BURST = 400.0
+BYTES_EACH = 2048
+"""A message of so many bytes counts as one, of twice as many as two."""
+PATIENCE = 5.0
+"""Seconds for which a page may be slowed down in one go; then its connection ends, and what waits in it goes unread."""
+TURN = 16
+"""Messages after which the other pages have their turn."""
+
+
+class ServedPage(Protocol):
+    """What viser has for one connection; see `workbench.ui.server.viser_private`."""
+
+    def control(self, uuid: str) -> Any | None:
+        """The input with this id, of all pages or of this one alone."""
+
+    def has_form(self, uuid: str) -> bool:
+        """Whether a form has this id."""
+        ...
+
+    def is_from_server(self, kind: str) -> bool:
+        """Whether it is a kind of message that viser knows."""
+        ...
+
+    def show_again(self, control: Any) -> None:
+        """Send this page alone what the control holds."""
+
+    def tell(self, sentence: str) -> None:
+        """Show this page a notification."""
+
+
+class PageGuard:
+    """Of one connection, on its event loop."""
+
+    def __init__(self, page: ServedPage, told: ToldRarely) -> None:
+        self._page, self._told = page, told
+        self._level, self._at = BURST, time.monotonic()
+        self._slowed, self._turns = 0.0, 0
+        self._corrections: dict[str, asyncio.TimerHandle] = {}
+
+    async def wait_turn(self, size: int) -> None:
+        """Wait until the page may speak again, after a message of `size` bytes.
+
+        Raises:
+            MalformedMessage: It does not stop; the connection is to be closed.
+        """
+        now = time.monotonic()
+        self._level = min(BURST, self._level + (now - self._at) * RATE) - 1 - size // BYTES_EACH
+        self._at, self._turns = now, self._turns + 1
+        if self._level >= BURST / 2:
+            self._slowed = 0.0
+        if self._level < 0:
+            self._slowed -= self._level / RATE
+            if self._slowed > PATIENCE:
+                raise MalformedMessage("more messages than a page has to say")
+            await asyncio.sleep(-self._level / RATE)
+        elif self._turns % TURN == 0:
+            await asyncio.sleep(0)
+
+    def admits(self, raw: object) -> bool:
+        """Whether a frame goes on to viser; False drops it.
+
+        Raises:
+            MalformedMessage: The connection is to be closed.
+        """
+        kind = kind_of(raw)
+        if kind not in KINDS:
+            if not self._page.is_from_server(kind):
+                raise MalformedMessage("an unknown type")
+            self._told.happened(kind, f"Dropped a message from a page: {kind} is not for pages to send.")
+            return False
+        assert isinstance(raw, bytes)
+        try:
+            message = read_message(raw, kind)
+        except ImpossibleValue as error:
+            self._told.happened(kind, f"Dropped a message from a page: {error}, in {kind}.")
+            return False
+        return self._admits_message(message)
+
+    def close(self) -> None:
+        for correction in self._corrections.values():
+            correction.cancel()
+        self._corrections.clear()
+
+    def _admits_message(self, message: ClientMessage) -> bool:
+        if isinstance(message, GuiUpdateMessage):
+            return self._admits_update(message)
+        if isinstance(message, (GuiFormDirtyMessage, GuiFormSubmitMessage)):
+            # viser sends it on to all pages and keeps it for later ones, whatever the id.
+            return self._page.has_form(message.uuid)
+        return True
+
+    def _admits_update(self, message: GuiUpdateMessage) -> bool:
+        control = self._page.control(message.uuid)
+        # Of a control that went a moment ago. viser would set any attribute that it has, ``removed`` too.
+        if control is None or set(message.updates) != {"value"}:
+            return False
+        try:
+            check_value(control, read_value(message.updates["value"]))
+        except ValueError as error:
+            self._correct_later(message.uuid, str(error))
+            return False
+        self._forget_correction(message.uuid)
+        return True
+
+    def _correct_later(self, uuid: str, why: str) -> None:
+        self._forget_correction(uuid)
+        loop = asyncio.get_running_loop()
+        self._corrections[uuid] = loop.call_later(HANDS_OFF, self._correct, uuid, why)
+
+    def _forget_correction(self, uuid: str) -> None:
+        if uuid in self._corrections:
+            self._corrections.pop(uuid).cancel()
+
+    def _correct(self, uuid: str, why: str) -> None:
+        self._corrections.pop(uuid, None)
+        control = self._page.control(uuid)
+        if control is None:
+            return
+        self._told.happened("value", f"A page sent a value that a control cannot hold: {why}")
+        self._page.tell(why)
+        self._page.show_again(control)

@@ -1,0 +1,326 @@
+"""What the door answers: the headers of every reply, and the files and routes that are not viser's.
+
+`workbench.ui.server.gated_server` decides who gets which reply, and `workbench.ui.server.responses` what a browser may do with it; here is
+how each is made.
+
+`PAGE` is the Content-Security-Policy of viser's page. Nothing is allowed there but what is listed, and each exception
+is needed: `tests/ui/server/test_page_policy.py` takes them away one by one and finds the page broken.
+
+- ``script-src``: our own files and viser's program, the latter by the hashes of its two scripts (one unpacks the
+  other). Not ``unsafe-inline``: a name, a note or a file from elsewhere that came into the page as HTML in spite of all
+  escaping would still not run. ``unsafe-hashes`` allows the few fixed handlers in our templates and no others.
+  ``wasm-unsafe-eval`` is for the program that unpacks what the server sends. JavaScript's own ``eval`` stays forbidden:
+  viser needs it for Gaussian splats and Plotly, and the workbench has neither (``web_assets/no_eval.js``).
+- ``worker-src blob:``: viser's connection and its sorting run in workers that are made from texts.
+- ``style-src 'unsafe-inline'``: viser's widgets and our HTML have styles in their tags. A style runs no code, and the
+  next lines leave it nowhere to send anything.
+- ``img-src data: blob:``: pictures that come over the websocket, and viser's own icons.
+- ``connect-src``: this server alone. viser's page takes the address of another one from its own address
+  (``?websocket=``, ``?playbackPath=``), and obeys it. ``data:`` and ``blob:`` are textures and programs that the page
+  has already. The websocket is named with its scheme for browsers to which ``'self'`` does not mean ``ws:`` as well.
+- ``frame-src 'self'``: rerun's viewer beside the recordings.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import functools
+import gzip
+import hashlib
+import html
+import logging
+import mimetypes
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from pathlib import Path
+from urllib.parse import unquote
+
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from workbench.machine.text import short_line
+from workbench.machine.web_assets import web_assets_folder
+from workbench.ui.server import access, viser_private
+from workbench.ui.server.file_response import FileReply, send_file
+
+Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
+"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
+status, the content type and the body, or a file to be sent without reading it whole. Runs in a thread
+of its own, so it may read files."""
+
+SCRIPTS = (
+    "no_eval.js",
+    "let_in.js",
+    "typed_first.js",
+    "pressed.js",
+    "keys.js",
+    "pressed_by_key.js",
+    "view_stays.js",
+    "library_keys.js",
+    "view_width.js",
+    "unfolded.js",
+    "typed_numbers.js",
+    "steady_resolution.js",
+    "tab_title.js",
+)
+"""Of ``web_assets/``, run by the page; each says what it is for."""
+STYLES = "panels/page.css"
+"""Of ``web_assets/``. In the page's head, since an HTML element of viser's is gone while the panel that it is in is folded."""
+
+LONGEST_NAME = 255
+"""Bytes of a file's name in every usual file system, and `LONGEST_PATH` of a whole path, some of which is the folder's."""
+LONGEST_PATH = 3000
+
+_log = logging.getLogger("workbench.door")
+
+
+def asked_of(request: Request) -> access.Asked:
+    """What the gate wants to know of a request."""
+    get = request.headers.get_all
+    return access.Asked(
+        path=request.path,
+        host=get("Host"),
+        origin=get("Origin"),
+        cookie=get("Cookie"),
+        fetch_site=get("Sec-Fetch-Site"),
+        fetch_mode=get("Sec-Fetch-Mode"),
+        fetch_dest=get("Sec-Fetch-Dest"),
+        # Exactly viser's own question, so that what it takes for a handshake is what was judged as one.
+        websocket=get("Upgrade") == ["websocket"],
+    )
+
+
+def refusals(example: str) -> Callable[[str], Response]:
+    """Makes 403 replies that say why, and what to do: open an address like ``example``."""
+    folder = web_assets_folder()
+    page = (folder / "refused.html").read_text(encoding="utf-8")
+    page = page.replace("{{logo}}", (folder / "logo.svg").read_text(encoding="utf-8"))
+    page = page.replace("{{example}}", html.escape(example))
+
+    def refuse(reason: str) -> Response:
+        body = page.replace("{{reason}}", html.escape(reason)).encode()
+        return reply(403, "text/html; charset=utf-8", body, PAGE_OF_OURS)
+
+    return refuse
+
+
+def reply(status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False) -> Response:
+    extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
+    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **EVERY_REPLY, **extra, **headers}
+    return Response(status, HTTPStatus(status).phrase, Headers(fields), body)
+
+
+def entered_reply(entered: access.Entered) -> Response:
+    cookie = {"Set-Cookie": entered.set_cookie, **PAGE_OF_OURS}
+    if not entered.by_page:
+        return reply(303, "text/plain; charset=utf-8", b"", {"Location": entered.location, **cookie})
+    onward = f'<!doctype html><title>Workbench</title><meta http-equiv="refresh" content="0;url={html.escape(entered.location)}">'
+    return reply(200, "text/html; charset=utf-8", onward.encode(), cookie)
+
+
+async def admitted_reply(
+    routes: Mapping[str, tuple[Handler, Mapping[str, str]]],
+    viser_hook: viser_private.Hook,
+    connection: ServerConnection,
+    request: Request,
+    authority: str,
+) -> Response:
+    page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
+    # Decoded once, as viser does; what is still encoded after that is part of a file's name.
+    path = unquote(request.path.partition("?")[0]).replace("\\", "/")
+    if not _is_path_of_files(path):
+        return _no_such_file(page)
+    prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
+    if prefix is None:
+        response = viser_hook(connection, request)
+        if response is None:  # viser took for a handshake what was not judged as one
+            return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            zipped = response.headers.get("Content-Encoding") == "gzip"
+            # In a thread: packing viser's page anew takes a while, at the first time.
+            response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
+        for name, value in {**EVERY_REPLY, **page}.items():
+            response.headers[name] = value
+        return response
+    handler, headers = routes[prefix]
+    accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
+
+    def work() -> Response | FileReply:
+        try:
+            made = handler(path[len(prefix) :])
+        except Exception:
+            _log.exception("The route %s failed on %s.", prefix, short_line(path, 300))
+            made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
+        if isinstance(made, FileReply):
+            return made
+        status, kind, body = made
+        zip_it = accepts_gzip and len(body) > 1024 and _compresses(kind)
+        return reply(status, kind, gzip.compress(body, 6) if zip_it else body, {**page, **headers}, zip_it)
+
+    # In a thread: reading and compressing would hold up every page's websocket.
+    made = await asyncio.to_thread(work)
+    if isinstance(made, Response):
+        return made
+    fields = {**EVERY_REPLY, **page, **headers}
+    return await send_file(connection, made, fields, accepts_gzip, lambda: _no_such_file(page))
+
+
+def _is_path_of_files(path: str) -> bool:
+    """Whether a file could have this path: the system raises on a name that is too long, and on a NUL in it."""
+    parts = path.encode("utf-8", "surrogatepass").split(b"/")
+    return (
+        b".." not in parts
+        and "\0" not in path
+        and all(len(part) <= LONGEST_NAME for part in parts)
+        and sum(map(len, parts)) <= LONGEST_PATH
+    )
+
+
+def _no_such_file(headers: Mapping[str, str]) -> Response:
+    return reply(404, "text/plain; charset=utf-8", b"There is no such file.", headers)
+
+
+@functools.lru_cache(maxsize=4)
+def with_our_head(page: bytes, zipped: bool) -> bytes:
+    """viser's page with `STYLES` and `SCRIPTS` in its head; viser itself offers no way to add one.
+
+    Raises:
+        ValueError: it has no head; viser is not the one that this was written for.
+    """
+    plain = gzip.decompress(page) if zipped else page
+    before, head_end, after = plain.partition(b"</head>")
+    if not head_end:
+        raise ValueError(
+            f"viser {viser_private.WRITTEN_FOR} serves a page with a </head>; this one has none."
+        )
+    tags = f'<link rel="stylesheet" href="/workbench/{STYLES}">'
+    tags += "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
+    plain = before + tags.encode() + head_end + after
+    return gzip.compress(plain, 6) if zipped else plain
+
+
+def _compresses(kind: str) -> bool:
+    plain = kind.partition(";")[0]
+    return plain.startswith("text/") or plain in (
+        "application/json",
+        "application/javascript",
+        "application/wasm",
+        "image/svg+xml",
+    )
+
+
+def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
+    """A handler that serves the files below ``folder``, and nothing that a link there points out to."""
+    root = folder.resolve()
+
+    def handle(path: str) -> tuple[int, str, bytes]:
+        try:
+            file = (root / path.lstrip("/")).resolve()
+        except RuntimeError:  # a link that leads to itself
+            file = root
+        if not file.is_relative_to(root) or not file.is_file():
+            return 404, "text/plain; charset=utf-8", b"There is no such file."
+        return 200, content_type(file.name), file.read_bytes()
+
+    return handle
+
+
+def content_type(name: str) -> str:
+    """Content type by the end of a file's name. Not left to the system's table alone, which may call
+    JavaScript plain text, and browsers then refuse to run it."""
+    known = {
+        ".css": "text/css; charset=utf-8",
+        ".html": "text/html; charset=utf-8",
+        ".js": "text/javascript; charset=utf-8",
+        ".json": "application/json",
+        ".svg": "image/svg+xml",
+        ".wasm": "application/wasm",
+    }
+    return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+# --- The headers that tell a browser what it may do with what the door serves -----------------
+
+
+VISERS_SCRIPTS = (
+    "sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=",
+    "sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE=",
+)
+"""Of viser 1.1.1: the script in its page, and the one that this unpacks."""
+HANDLERS = (
+    "wb.press(event)",
+    "wb.choose(event,this)",
+    "wb.place(event)",
+    "wb.copy(event)",
+    "wb.intoSight(this)",
+    "wb.follow(this)",
+)
+"""Every handler in ``web_assets/panels``; what they do is in ``web_assets/pressed.js``."""
+
+
+def hash_of(script: str) -> str:
+    """As a Content-Security-Policy names a script."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _quoted(*hashes: str) -> str:
+    return " ".join(f"'{one}'" for one in hashes)
+
+
+DIRECTIVES: dict[str, str] = {
+    "default-src": "'none'",
+    "script-src": f"'self' 'wasm-unsafe-eval' 'unsafe-hashes' {_quoted(*VISERS_SCRIPTS, *map(hash_of, HANDLERS))}",
+    "worker-src": "blob:",
+    "style-src": "'self' 'unsafe-inline'",
+    "img-src": "'self' data: blob:",
+    "connect-src": "'self' data: blob: ws://{authority} wss://{authority}",
+    "frame-src": "'self'",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+    "frame-ancestors": "'self'",
+}
+
+
+def page_policy(authority: str) -> str:
+    """Content-Security-Policy for viser's page as seen on ``authority`` (``host:port``, known to be ours)."""
+    parts = (f"{name} {sources}" for name, sources in DIRECTIVES.items())
+    return "; ".join(parts).replace("{authority}", authority)
+
+
+EVERY_REPLY = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": ", ".join(
+        f"{feature}=()"
+        for feature in (
+            *("accelerometer", "autoplay", "browsing-topics", "camera", "display-capture", "encrypted-media"),
+            *("gamepad", "geolocation", "gyroscope", "hid", "identity-credentials-get", "idle-detection"),
+            *("local-fonts", "magnetometer", "microphone", "midi", "payment", "picture-in-picture"),
+            *(
+                "publickey-credentials-get",
+                "screen-wake-lock",
+                "serial",
+                "storage-access",
+                "usb",
+                "xr-spatial-tracking",
+            ),
+        )
+    )
+    + ", clipboard-write=(self), fullscreen=(self)",
+    "Connection": "close",
+}
+"""Of a refusal too: no guessing of types, no address passed on, no other site that frames, opens or embeds this one,
+and none of the machine's devices."""
+PAGE_OF_OURS = {
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'self'",
+    "Cache-Control": "no-store",
+}
+"""Of a refusal and of the step that sets the cookie."""

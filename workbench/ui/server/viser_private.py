@@ -1,0 +1,425 @@
+"""The only place that reaches into viser's private names; written for viser 1.1.1.
+
+viser serves its page and its websocket from one ``websockets`` server that it starts in
+``viser/infra/_infra.py``, and offers no way to look at a request first, to choose the socket, to
+refuse a message from a client, or to keep quiet. All four are needed (see `workbench.ui.server.gated_server`), so
+while a `viser.ViserServer` is being made, the name ``websockets`` in that one viser module stands for
+a look-alike whose ``serve`` is ours. Ours gives the real one the same arguments, with three changed:
+the socket (ours, already bound), ``process_request`` (viser's own hook, handed to the caller to wrap)
+and the handler (viser's own, but every message from a client is looked at before viser sees it, and a
+client that reads nothing is let go, see `workbench.ui.server.strangers`).
+
+Two nets below that: `missing_names` lists what an upgrade of viser took away, and is asked before
+anything starts; and `workbench.ui.server.gated_server` sends a request that must be refused through the finished
+server before it tells anyone the address.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import socket
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import rich
+import viser
+import viser._gui_handles
+import viser._messages
+import viser.infra
+import viser.infra._infra
+import websockets.asyncio.server
+from numpy.typing import NDArray
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.ui.server.listening import DoorError
+from workbench.ui.server.page_guard import PageGuard
+from workbench.ui.server.strangers import Connection, Strangers, ToldRarely, let_go_when_deaf
+
+WRITTEN_FOR = "1.1.1"
+
+Hook = Callable[[ServerConnection, Request], Response | None]
+AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
+
+PAGE_SHA256 = "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
+"""Of viser's page as it is installed: `workbench.ui.server.responses` allows the scripts of this one and no others."""
+
+REFUSED_FROM_CLIENTS = (
+    "ShareUrlRequest",  # opens a tunnel that makes the page public, whoever asks
+    "ShareUrlDisconnect",
+    "FileTransferStartUpload",  # no size limit, file name taken verbatim; nothing here takes uploads
+    "FileTransferPart",
+    "SceneNodeClickMessage",  # nothing of ours takes a click, a drag or a press that is held, so no page has them to say
+    "SceneNodeDragMessage",
+    "GuiButtonHoldMessage",
+)
+
+PRIVATE_NAMES = (
+    "infra.websockets.asyncio.server.serve",
+    "infra.websockets.datastructures.Headers",
+    "infra.websockets.exceptions.ConnectionClosedOK",
+    "infra.websockets.exceptions.ConnectionClosedError",
+    "infra.WebsockServer._background_worker",
+    "infra.WebsockMessageHandler.unregister_handler",
+    "messages.Message",
+    *(f"messages.{name}" for name in (*sorted(KINDS), *REFUSED_FROM_CLIENTS)),
+    "gui.AssignablePropsBase._queue_update",
+)
+"""Names that this module relies on.
+
+``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``, ``gui`` ``viser._gui_handles``.
+"""
+
+PRIVATE_ATTRIBUTES = (
+    "_websock_server",
+    "_websock_server._incoming_handlers",
+    "_websock_server._live_connections",
+    "_websock_server._server_thread",
+    "_websock_server._broadcast_buffer.message_counter",
+    "_websock_server._broadcast_buffer.generator_cursors",
+    "_connected_clients",
+    "gui._container_handle_from_uuid",
+    "gui._gui_input_handle_from_uuid",
+    "scene._handle_from_node_name",
+)
+"""Attributes of a `viser.ViserServer` that this module relies on."""
+
+STOP_SECONDS = 1.0
+"""How long a page gets to answer the closing handshake."""
+
+_making = threading.Lock()
+
+# A page that is told something may have gone a moment ago; nobody can know before.
+warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
+
+# Any: the checker rightly says that viser does not export these names.
+infra: Any = viser.infra._infra
+
+
+def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
+    """What a page calls it; the ``id`` of its element there too, where it is a button or a number (viser's
+    ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
+    return handle._impl.uuid
+
+
+def send_lines(
+    handle: viser.GuiUplotHandle,
+    data: tuple[NDArray[np.float64], ...],
+    sent: tuple[NDArray[np.float64] | list[float | None], ...],
+) -> None:
+    """Give a chart these data, and its browsers `sent`, in which None is a gap: viser's property makes NaN of it."""
+    props: Any = handle._impl.props
+    props.data = data
+    handle._queue_update("data", sent)
+
+
+def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
+    """Return when all that was written so far is in a batch on its way to each page, or after `patience` seconds.
+
+    A page takes a batch as a whole, so what is written after this does not hold up what was written before.
+    """
+    buffer = server._websock_server._broadcast_buffer
+    written, end = buffer.message_counter - 1, time.monotonic() + patience
+    # A page that reads slowly is behind by more than this wait; it must not keep the others waiting.
+    while any(taken < written for taken in list(buffer.generator_cursors.values())):
+        if time.monotonic() > end:
+            return
+        time.sleep(0.0005)
+
+
+def remove_nodes_but(server: viser.ViserServer, kept: tuple[str, ...]) -> None:
+    """Remove every node of the 3-D view but those at and below these names, as ``scene.reset`` removes all."""
+    for name, handle in list(server.scene._handle_from_node_name.items()):
+        stays = name == "/WorldAxes" or any(name == root or name.startswith(f"{root}/") for root in kept)
+        # A child goes with its parent.
+        if not stays and not handle._impl.removed:
+            handle.remove()
+
+
+def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
+    missing: list[str] = []
+    for name in dotted:
+        here = root
+        for part in name.split("."):
+            if not hasattr(here, part):
+                missing.append(name)
+                break
+            here = getattr(here, part)
+    return missing
+
+
+def missing_names() -> list[str]:
+    """Those of `PRIVATE_NAMES` that the installed viser does not have."""
+    roots = SimpleNamespace(infra=infra, messages=viser._messages, gui=viser._gui_handles)
+    return _missing(roots, PRIVATE_NAMES)
+
+
+def _page_is_known() -> bool:
+    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    return page.is_file() and hashlib.sha256(page.read_bytes()).hexdigest() == PAGE_SHA256
+
+
+def _moved(what: str) -> DoorError:
+    return DoorError(
+        f"The page cannot be made safe: {what}. workbench/ui/viser_seam.py is written for viser {WRITTEN_FOR} "
+        f"and viser {viser.__version__} is installed; install viser=={WRITTEN_FOR}."
+    )
+
+
+@dataclass
+class ViserPage:
+    """What viser has for one connection: a `workbench.ui.server.page_guard.ServedPage`."""
+
+    connection: ServerConnection
+    served: list[viser.ViserServer]
+    """The server, once it is made."""
+
+    def control(self, uuid: str) -> Any | None:
+        for gui in self._guis():
+            control = gui._gui_input_handle_from_uuid.get(uuid)
+            if control is not None:
+                return control
+        return None
+
+    def has_form(self, uuid: str) -> bool:
+        forms = (gui._container_handle_from_uuid.get(uuid) for gui in self._guis())
+        return any(isinstance(form, viser.GuiFormHandle) for form in forms)
+
+    def is_from_server(self, kind: str) -> bool:
+        known = getattr(viser._messages, kind, None)
+        return isinstance(known, type) and issubclass(known, viser._messages.Message)
+
+    def show_again(self, control: Any) -> None:
+        client = self._client()
+        if client is not None and not control._impl.is_button:
+            update = viser._messages.GuiUpdateMessage(control._impl.uuid, {"value": control.value})
+            client._websock_connection.queue_message(update)
+
+    def tell(self, sentence: str) -> None:
+        client = self._client()
+        if client is not None:
+            client.add_notification("Not possible", sentence, color="orange", auto_close_seconds=6.0)
+
+    def _client(self) -> viser.ClientHandle | None:
+        for server in self.served:
+            for number, connection in list(server._websock_server._live_connections.items()):
+                if connection is self.connection:
+                    return server._connected_clients.get(number)
+        return None
+
+    def _guis(self) -> Iterator[viser.GuiApi]:
+        for server in self.served:
+            yield server.gui
+        client = self._client()
+        if client is not None:
+            yield client.gui
+
+
+def _watched(
+    handler: Callable[[ServerConnection], Awaitable[None]], served: list[viser.ViserServer], told: ToldRarely
+) -> Callable[[ServerConnection], Awaitable[None]]:
+    async def watched(connection: ServerConnection) -> None:
+        receive = connection.recv
+        guard = PageGuard(ViserPage(connection, served), told)
+
+        async def receive_checked() -> object:
+            while True:
+                raw = await receive()
+                await guard.wait_turn(len(raw))
+                if guard.admits(raw):
+                    return raw
+
+        connection.recv = receive_checked  # type: ignore[method-assign,assignment]
+        listening = asyncio.create_task(let_go_when_deaf(connection))
+        try:
+            await handler(connection)
+        except MalformedMessage as error:
+            # Without this the connection is closed as well, but with a traceback of websockets in the
+            # author's terminal for every frame that a stranger cares to send.
+            told.happened("malformed", f"Closed a page's connection: it sent {error}.")
+            # It may still be sending, and never come to the answer.
+            connection.close_timeout = STOP_SECONDS
+            await connection.close(1008, "malformed message")
+        finally:
+            guard.close()
+            listening.cancel()
+
+    return watched
+
+
+@contextlib.contextmanager
+def _quiet_viser() -> Iterator[None]:
+    """Drop what viser prints of its own accord; ``verbose=False`` does not stop its start and stop
+    lines. Only calls that come from viser are dropped, so that others may print meanwhile."""
+    print_rich = rich.print
+
+    def print_unless_viser(*things: Any, **options: Any) -> None:
+        if not sys._getframe(1).f_globals.get("__name__", "").startswith("viser"):
+            print_rich(*things, **options)
+
+    rich.print = print_unless_viser
+    try:
+        yield
+    finally:
+        rich.print = print_rich
+
+
+@dataclass(frozen=True)
+class GatedViser:
+    server: viser.ViserServer
+    _serving: websockets.asyncio.server.serve
+    _closing: set[asyncio.Task[None]] = field(default_factory=set)
+
+    def close_pages(self, reason: str) -> None:
+        """Close every page, and every answer that is on its way; returns when that has begun."""
+        listening = self._serving.server
+        begun = threading.Event()
+
+        def close() -> None:
+            for connection in list(listening.handlers):
+                if connection in listening.connections:
+                    connection.close_timeout = STOP_SECONDS
+                    closing = connection.loop.create_task(connection.close(1008, reason))
+                    self._closing.add(closing)
+                    closing.add_done_callback(self._closing.discard)
+                elif isinstance(connection, Connection) and connection.admitted:
+                    connection.transport.abort()
+            begun.set()
+
+        listening.get_loop().call_soon_threadsafe(close)
+        begun.wait(timeout=10.0)
+
+    def stop(self) -> None:
+        """Stop viser and close every connection, within about a second.
+
+        `websockets` would wait for each socket on which a browser has not asked anything yet (Chromium
+        holds such sockets open), and ten seconds for a page that does not answer the closing handshake.
+        """
+        listening = self._serving.server
+        loop = listening.get_loop()
+        started = loop.time()
+
+        def drop() -> None:
+            patient = loop.time() - started < STOP_SECONDS
+            for connection in list(listening.handlers):
+                if not (patient and connection in listening.connections):
+                    connection.transport.abort()
+            # Again: a socket that was just accepted is not among the handlers yet.
+            loop.call_later(0.02, drop)
+
+        if not loop.is_closed():
+            with contextlib.suppress(RuntimeError):  # closed since: then nothing is left to drop
+                loop.call_soon_threadsafe(drop)
+        with _making, _quiet_viser():
+            self.server.stop()
+
+
+def make_viser(
+    listening: socket.socket,
+    wrap: Callable[[Hook], AsyncHook],
+    label: str | None,
+    response_seconds: float,
+    told: ToldRarely,
+) -> GatedViser:
+    """Make a `viser.ViserServer` that serves on ``listening`` only, behind the hook that ``wrap`` makes
+    of viser's own.
+
+    Args:
+        listening: bound and listening; the server owns it from here on.
+        wrap: gets viser's ``process_request`` (files for plain requests, None for a handshake).
+        label: shown at the top of viser's panel.
+        response_seconds: longest that one request may take, its whole answer included.
+        told: says what pages did that they should not.
+
+    Raises:
+        DoorError: the installed viser has moved. Nothing is left listening.
+    """
+    missing = missing_names()
+    if missing:
+        listening.close()
+        raise _moved("viser no longer has " + ", ".join(missing))
+    if not _page_is_known():
+        listening.close()
+        raise _moved("its page in the browser is another one")
+    real_serve = websockets.asyncio.server.serve
+    serving: list[websockets.asyncio.server.serve] = []
+    served: list[viser.ViserServer] = []
+    strangers = Strangers(told)
+
+    def serve(
+        handler: Callable[[ServerConnection], Awaitable[None]], host: str, port: int, **options: Any
+    ) -> websockets.asyncio.server.serve:
+        # viser's host and port are left out: it would bind another port without a word if this one
+        # were taken, and let the environment (_VISER_PORT_OVERRIDE) choose it.
+        options.update(
+            process_request=wrap(options["process_request"]),
+            max_size=MAX_BYTES,
+            open_timeout=response_seconds,
+            server_header=None,
+            create_connection=strangers.connection,
+            unix=listening.family == socket.AF_UNIX,
+            logger=_quiet_logger(),
+        )
+        made = real_serve(_watched(handler, served, told), sock=listening, **options)
+        serving.append(made)
+        return made
+
+    look_alike = SimpleNamespace(
+        asyncio=SimpleNamespace(server=SimpleNamespace(serve=serve, ServerConnection=ServerConnection)),
+        datastructures=infra.websockets.datastructures,
+        exceptions=infra.websockets.exceptions,
+    )
+    with _making:
+        real = infra.websockets
+        infra.websockets = look_alike  # type: ignore[assignment]
+        try:
+            with _quiet_viser():
+                # If viser ever stops calling our serve, this is where it binds: loopback, any port.
+                server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
+        finally:
+            infra.websockets = real
+    missing = _missing(server, PRIVATE_ATTRIBUTES)
+    if missing or len(serving) != 1:
+        with _quiet_viser():
+            server.stop()
+        listening.close()
+        raise _moved(
+            "viser did not start its server the known way" if not missing else f"viser has no {missing}"
+        )
+    served.append(server)
+    for name in REFUSED_FROM_CLIENTS:
+        server._websock_server.unregister_handler(getattr(viser._messages, name))
+    return GatedViser(server, serving[0])
+
+
+def _quiet_logger() -> logging.Logger:
+    """Logger for `websockets`: a port scanner's garbage is no error of ours, nor is a browser that goes away before
+    its answer is all there, and neither must put a traceback into the author's terminal."""
+    logger = logging.getLogger("workbench.door.websockets")
+    logger.setLevel(logging.WARNING)
+    if not logger.filters:
+        logger.addFilter(_is_news)
+    return logger
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    if record.getMessage() == "opening handshake failed":
+        return False
+    error = record.exc_info[1] if record.exc_info else None
+    if not isinstance(error, AssertionError):
+        return True
+    # `websockets` ends a connection after its answer, and asserts that it has not ended yet: who was answered has gone.
+    return traceback.extract_tb(error.__traceback__)[-1].name != "send_eof"

@@ -1,0 +1,1 @@
+"""What is made of recordings to be handed on."""

@@ -1,0 +1,308 @@
+"""What is made from recordings to be handed on: films, moving pages, sheets of pictures, datasets.
+
+One list of what can be made, for the page and the command line. Making takes processor and memory, and some of it a
+renderer: the page has it done by a process of its own (`workbench.ui.share.make`).
+
+Encoding a film takes a core for a while, and drawing a scene takes a renderer that the server's process must not
+import (a crash in a driver would take the page along). What is stopped before it is finished leaves nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.jobs.pool import Deal, PoolError, Processes, Share, Work
+from workbench.machine.files import new_file
+from workbench.machine.software_vulkan import ensure_render_device
+from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.source import Source
+from workbench.recording.films import (
+    Eye,
+    camera_of,
+    cameras_by_name,
+    contact_sheet,
+    enlarged,
+    frames,
+    scene_frames,
+    write_mp4,
+)
+from workbench.recording.lerobot.export import ExportOptions, export_lerobot
+from workbench.recording.reader.reading import read_source
+from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
+from workbench.ui.widgets.templates import counted, sentence
+
+What = Literal["film", "scene", "page", "sheet", "lerobot"]
+MOST_SAID = 5
+"""Sentences on recordings that were left out."""
+EVERY_CAMERA = ""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    what: What
+    sources: tuple[Source, ...]
+    folder: Path
+    """Where the files go; for a dataset the folder that it becomes."""
+    camera: str = EVERY_CAMERA
+    """Of a film."""
+    eye: Eye | None = None
+    """From where a scene is seen; None: a usual place."""
+    export: ExportOptions = ExportOptions()
+    """Of a dataset."""
+
+
+@dataclass(frozen=True)
+class Made:
+    paths: tuple[Path, ...]
+    words: str
+    """What it is, in a sentence or two."""
+    not_made: tuple[str, ...] = ()
+    """Of which recordings it could not be made, each a sentence that names it and says why."""
+
+
+OnProgress = Callable[[float, str], None]
+
+
+def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> Made:
+    """Make it, of every recording that has what is wanted.
+
+    Args:
+        on_progress: called with the part that is done, 0..1, and what is done now.
+
+    Raises:
+        ValueError: none of the recordings can be read and has what is wanted; the message says which lacks what.
+        OSError: it cannot be written; the message says why. What was finished before stays.
+        RuntimeError: this machine has nothing to render with.
+    """
+    if wanted.what == "lerobot":
+        return _dataset(wanted, on_progress)
+    paths: list[Path] = []
+    not_made: list[str] = []
+    for number, source in enumerate(wanted.sources):
+        part_done = _part(on_progress, number, len(wanted.sources))
+        part_done(0.0, source.stem)
+        try:
+            paths += _of_readable(wanted, source, part_done)
+        except ValueError as error:
+            not_made.append(str(error) if source.stem in str(error) else f"{source.stem}: {error}")
+    if not paths:
+        raise ValueError("\n".join(not_made))
+    on_progress(1.0, "done")
+    words = counted(len(paths), "file")
+    if not_made:
+        words += f"; {len(not_made)} could not be made. {' '.join(not_made)}"
+    return Made(tuple(paths), words, tuple(not_made))
+
+
+def file_name(what: What, source: str, camera: str = "") -> str:
+    """Of what is made from the recording that is called `source`, and of its `camera` where it is a film of one."""
+    suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
+    return source + suffix.get(what, ".sheet.png")
+
+
+def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> list[Path]:
+    episode = read_source(source)
+    try:
+        return _of_one(wanted, source, episode, on_progress)
+    except ValueError as error:
+        if not episode.unread:
+            raise
+        raise ValueError(
+            " ".join(broken.sentence for broken in episode.unread)
+        ) from error  # it does not lack pictures, they cannot be read
+
+
+def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
+    name, fps = source.stem, 1.0 / seconds_a_step(episode)
+    if wanted.what == "film":
+        cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
+        if not cameras:
+            raise ValueError(f"{name} was recorded without pictures, so there is no film of it.")
+        paths = []
+        for number, camera in enumerate(cameras):
+            path = wanted.folder / file_name("film", name, camera)
+            seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
+            told = _part(on_progress, number, len(cameras))
+            write_mp4(path, _counted(seen, episode, f"{name}: {camera}", told), fps)
+            paths.append(path)
+        return paths
+    path = wanted.folder / file_name(wanted.what, name)
+    if wanted.what == "scene":
+        seen = _counted(scene_frames(episode, wanted.eye), episode, f"{name}: the 3-D view", on_progress)
+        write_mp4(path, seen, fps)
+    elif wanted.what == "page":
+        write_scene_html(
+            path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the moving page")
+        )
+    else:
+        with new_file(path) as temporary:
+            contact_sheet(episode).save(temporary, format="PNG")
+    return [path]
+
+
+def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
+    count = len(wanted.sources)
+    made = export_lerobot(
+        [(source.stem, partial(read_source, source)) for source in wanted.sources],
+        wanted.folder,
+        wanted.export,
+        lambda done, doing: on_progress(done / max(count, 1), doing),
+    )
+    words = f"{counted(made.episodes, 'episode')}, {counted(made.frames, 'frame')}"
+    if made.left_out:
+        words += f"; {made.left_out} without success left out"
+    if made.not_fitting:
+        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+    return Made((made.folder,), " ".join([words + ".", *made.not_fitting[:MOST_SAID], *made.notes]))
+
+
+def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
+    """Of one of several."""
+    return lambda done, doing: on_progress((number + done) / count, doing)
+
+
+def _counted(
+    pictures: Iterable[NDArray[np.uint8]], episode: Episode, doing: str, on_progress: OnProgress
+) -> Iterator[NDArray[np.uint8]]:
+    for state, picture in enumerate(pictures):
+        on_progress(state / (episode.length + 1), doing)
+        yield picture
+
+
+# --- Something is made from recordings in a process of its own, while the page goes on --------
+
+
+END_SECONDS = 5.0
+SAY_EVERY = 0.1
+"""Seconds. A sheet of pictures is quick, and a line a frame would be more to read than to make."""
+
+
+@dataclass(frozen=True)
+class MakingView:
+    """How it stands."""
+
+    running: bool = False
+    done: float = 0.0
+    """0..1"""
+    doing: str = ""
+    problem: str = ""
+    """Why it could not be made, in a sentence; empty if it could, or was stopped."""
+    made: tuple[Made, ...] = ()
+    """All that was made so far, the newest first."""
+
+
+class Making:
+    """At most one thing at a time. All methods may be called from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._view = MakingView()
+        self._stopped = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._scratch: Path | None = None
+
+    def view(self) -> MakingView:
+        return self._view
+
+    def scratch(self) -> Path:
+        """A folder for what is fetched by the page and then not needed any more; gone after `close`."""
+        with self._lock:
+            if self._scratch is None:
+                self._scratch = Path(tempfile.mkdtemp(prefix="workbench-shared-"))
+            return self._scratch
+
+    def start(self, wanted: Wanted) -> bool:
+        """Begin; False where something is made already."""
+        with self._lock:
+            if self._view.running:
+                return False
+            self._stopped.clear()
+            self._view = MakingView(running=True, doing="starting", made=self._view.made)
+            self._thread = threading.Thread(target=self._run, args=(wanted,), name="making", daemon=True)
+            self._thread.start()
+            return True
+
+    def stop(self) -> None:
+        """End what is made now; nothing of it stays. Returns at once."""
+        self._stopped.set()
+
+    def close(self) -> None:
+        """Stop, wait for the end of the process, and take the scratch folder away."""
+        self.stop()
+        if self._thread is not None:
+            # One that hangs is ended with this process, by its `machine.processes.family`.
+            self._thread.join(END_SECONDS)
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+
+    def _run(self, wanted: Wanted) -> None:
+        came: list[Made | str] = []
+        work = Work(_make, (wanted,), Made | str, tuple[float, str], "that makes it")
+        deal: Deal[Made | str, tuple[float, str]] = Deal(
+            range(1), lambda number, one: came.append(one), self._hear, self._stopped.is_set
+        )
+        try:
+            Processes().run(work, deal)
+        except OSError as error:
+            came.append(f"The process that makes it could not be started: {error}.")
+        except PoolError as error:
+            came.append(sentence(str(error)))
+        with self._lock:
+            made = tuple(one for one in came if isinstance(one, Made))
+            problem = "".join(one for one in came if isinstance(one, str) and not self._stopped.is_set())
+            self._view = MakingView(problem=problem, made=(*made, *self._view.made))
+
+    def _hear(self, news: tuple[float, str]) -> None:
+        with self._lock:
+            self._view = replace(self._view, done=news[0], doing=news[1])
+
+
+class _Stopped(BaseException):
+    """Goes through the blocks that take half-written files away."""
+
+
+def _make(wanted: Wanted, share: Share) -> None:
+    """In the other process."""
+    said_at = 0.0
+
+    def on_progress(done: float, doing: str) -> None:
+        nonlocal said_at
+        if time.monotonic() - said_at >= SAY_EVERY:
+            said_at = time.monotonic()
+            share.say((done, doing))
+
+    def look(number: int, frame: FrameType | None) -> None:
+        if share.limit() == 0:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            raise _Stopped
+
+    if share.next() is None:
+        return
+    # By a signal: a film of an episode takes a while in which nobody says how far it is.
+    signal.signal(signal.SIGALRM, look)
+    signal.setitimer(signal.ITIMER_REAL, SAY_EVERY, SAY_EVERY)
+    if wanted.what == "scene":
+        os.environ.update(ensure_render_device(install=False).env)
+    made: Made | str
+    with contextlib.suppress(_Stopped):
+        try:
+            made = make(wanted, on_progress)
+        except (ValueError, OSError, RuntimeError) as error:
+            made = str(error)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        share.tell(0, made)

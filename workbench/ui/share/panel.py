@@ -1,0 +1,257 @@
+"""The Share tab: choose what is to be made of the recordings, make it, save it; and rerun beside it.
+
+They are about the recordings that are selected in the library, and where none is, about those that are open; where
+both are there and differ, a person chooses.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from workbench.core.cameras.conventions import triple
+from workbench.recording.episode.row import LibraryRow
+from workbench.recording.episode.source import Source
+from workbench.recording.films import Eye, cameras_by_name
+from workbench.recording.lerobot.export import ExportOptions
+from workbench.recording.library.library import Library
+from workbench.session.review.view import ReviewView
+from workbench.ui.library.panel import LibraryPanel
+from workbench.ui.server.file_response import Offers
+from workbench.ui.server.gated_server import Door
+from workbench.ui.share.make import EVERY_CAMERA, Made, Making, MakingView, Wanted, What, file_name
+from workbench.ui.share.rerun_view import RerunPages, RerunView
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import counted, render
+
+WHAT: dict[str, What] = {
+    "Film of a camera (mp4)": "film",
+    "Film of the 3-D view (mp4)": "scene",
+    "Moving 3-D page (html)": "page",
+    "Sheet of pictures (png)": "sheet",
+    "LeRobot dataset": "lerobot",
+}
+ALL_CAMERAS = "every camera"
+SELECTED, OPENED = "what is selected in the library", "what is open in the review"
+MOST_SHOWN = 6
+"""Made things in the list; the newest ones."""
+MOST_NAMED = 5
+"""Recordings and files that are named before they are made; of the others their number is said."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What the tab is about."""
+
+    sources: tuple[Source, ...] = ()
+    cameras: tuple[str, ...] = ()
+    """Those that are known of them: of recordings that are not open none is."""
+    selected: bool = False
+    """They are those that are selected in the library, and not those that are open."""
+    in_view: bool = False
+    """It is the one recording that the 3-D view shows: a film of the view is made from where the page looks."""
+
+
+class SharePanel:
+    """The controls in the present container.
+
+    Args:
+        server: The page.
+        offers: Where what was made is fetched.
+        making: What makes it; it outlives this page.
+        folder: Datasets go into a folder of it that is named for them.
+    """
+
+    def __init__(self, server: viser.ViserServer, offers: Offers, making: Making, folder: Path) -> None:
+        self._offers, self._making, self._folder = offers, making, folder
+        self._chosen = Chosen()
+        self._drawn: object = None
+        self._of = server.gui.add_dropdown(
+            "Of", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="It stays as you choose it"
+        )
+        self._about = server.gui.add_html("")
+        self._what = server.gui.add_dropdown("Make", tuple(WHAT))
+        self._camera = server.gui.add_dropdown("Camera", _names(()))
+        self._successes = server.gui.add_checkbox(
+            "Only successes", True, hint="Leave out recordings that reach success at no step"
+        )
+        self._fitting = server.gui.add_checkbox(
+            "Only what fits",
+            True,
+            hint="Leave out recordings that cannot be read, or lack what the first one has; which is said",
+        )
+        self._task = server.gui.add_text(
+            "Task", "", hint="In words, for policies that read; empty: the task's id"
+        )
+        self._will = server.gui.add_html("")
+        self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
+        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._made = server.gui.add_html("")
+        self._make.on_click(lambda event: self._start(event.client))
+        self._stop.on_click(lambda _: self._making.stop())
+
+    def takes_opened(self, choice: bool) -> bool:
+        """Whether it is to be about what is open although other recordings are selected; `choice`: there are both."""
+        self._of.visible = choice
+        return choice and self._of.value == OPENED
+
+    def draw(self, chosen: Chosen) -> None:
+        self._chosen = chosen
+        view = self._making.view()
+        what = WHAT[self._what.value]
+        camera = self._camera.value
+        now = (chosen, view, what, camera)
+        if now == self._drawn:
+            return
+        self._drawn = now
+        names = [source.stem for source in chosen.sources]
+        files = list(zip(short_names(names), names))
+        self._about.content = render("share_about", files=files, most=MOST_NAMED, selected=chosen.selected)
+        options = _names(chosen.cameras)
+        if self._camera.options != options:
+            self._camera.options = options
+        self._camera.visible = what == "film" and len(options) > 2
+        self._successes.visible = what == "lerobot"
+        self._fitting.visible = what == "lerobot" and len(names) > 1
+        self._task.visible = what == "lerobot"
+        self._make.visible = not view.running
+        self._stop.visible = view.running
+        self._make.disabled = not chosen.sources
+        will = None if view.running or not names else will_make(what, chosen, camera, self._folder)
+        self._will.content = "" if will is None else render("share_will", **will, most=MOST_NAMED)
+        self._made.content = self._html(view)
+
+    def _start(self, client: viser.ClientHandle | None) -> None:
+        chosen, what = self._chosen, WHAT[self._what.value]
+        if not chosen.sources:
+            return
+        wanted = Wanted(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
+        if what == "lerobot":
+            now = datetime.datetime.now()
+            words = self._task.value.strip()[:400]
+            export = ExportOptions(
+                only_successes=self._successes.value,
+                only_fitting=self._fitting.value,
+                instruction=words or None,
+            )
+            folder = self._folder / "datasets" / f"lerobot_{now:%Y-%m-%dT%H-%M-%S}"
+            self._making.start(replace(wanted, folder=folder, export=export))
+            return
+        camera = self._camera.value if self._camera.value in chosen.cameras else EVERY_CAMERA
+        # A folder of its own each time: names that were made before are not in the way.
+        folder = Path(tempfile.mkdtemp(dir=self._making.scratch()))
+        self._making.start(replace(wanted, folder=folder, camera=camera))
+
+    def _html(self, view: MakingView) -> str:
+        made = [(one, self._links(one)) for one in view.made[:MOST_SHOWN]]
+        return render("share", view=view, made=made)
+
+    def _links(self, made: Made) -> list[tuple[str, Path, str]]:
+        """Of its files: where each is fetched, it, and its short name."""
+        files = [path for path in made.paths if path.is_file()]
+        short = short_names([path.name for path in files])
+        return [(self._offers.address(path, download=True), path, name) for path, name in zip(files, short)]
+
+
+def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str, Any]:
+    """What a press on *Make* makes, as far as it is known before the recordings are read: in words, its files
+    with their short names, and the folder ``where`` they go; empty for files that the page offers to save."""
+    names = [source.stem for source in chosen.sources]
+    of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
+    if what == "lerobot":
+        where = f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a"
+        return {"what": f"one dataset {of}", "files": (), "where": where}
+    if what != "film":
+        files = [file_name(what, name) for name in names]
+    elif camera in chosen.cameras:
+        files = [file_name(what, name, camera) for name in names]
+    elif chosen.cameras and len(names) == 1:
+        files = [file_name(what, name, known) for name in names for known in chosen.cameras]
+    else:
+        known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
+        return {"what": f"one film for each camera{known} {of}", "files": (), "where": ""}
+    return {"what": counted(len(files), "file"), "files": list(zip(files, short_names(files))), "where": ""}
+
+
+_TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Without the time that a recording's name ends with, where they differ without it too: it is half of the name."""
+    short = [_TIME.sub("", name) for name in names]
+    return short if len(set(short)) == len(short) else list(names)
+
+
+def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
+    return (ALL_CAMERAS, *cameras)
+
+
+def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
+    """From where this page looks."""
+    if client is None or client.camera.image_width == 0:
+        return None
+    camera = client.camera
+    return Eye(
+        triple(camera.position), triple(camera.look_at), triple(camera.up_direction), float(camera.fov)
+    )
+
+
+class Sharing:
+    """What is shared of a folder of recordings through a door, whatever page is shown. One a door."""
+
+    def __init__(self, door: Door) -> None:
+        self._offers = Offers(door)
+        self._rerun = RerunPages(door, self._offers)
+        self._making = Making()
+
+    def part(
+        self,
+        server: viser.ViserServer,
+        library: Library,
+        table: LibraryPanel,
+        make_way: Callable[[Callable[[bool], None]], int],
+        unfolded: Callable[[], None],
+    ) -> SharePart:
+        """The Share tab, in the present container; `make_way` and `unfolded` as `RerunView` has them."""
+        share = SharePanel(server, self._offers, self._making, library.folder)
+        server.gui.add_divider()
+        return SharePart(library, table, share, RerunView(server, self._rerun, make_way, unfolded))
+
+    def close(self) -> None:
+        """Stop what is made, and take away what was made for the page."""
+        self._making.close()
+
+
+class SharePart(PagePart[ReviewView]):
+    """The Share tab of a review page."""
+
+    def __init__(self, library: Library, table: LibraryPanel, share: SharePanel, rerun: RerunView) -> None:
+        self._library, self._table, self._share, self._rerun = library, table, share, rerun
+
+    def draw(self, view: ReviewView) -> None:
+        opened = {one.id: one.episode for one in view.opened}
+        ids = self._table.selected()
+        if self._share.takes_opened(bool(ids) and bool(opened) and set(ids) != set(opened)):
+            ids = ()
+        rows = [row for row in map(self._library.row, ids or tuple(opened)) if row is not None]
+        rows = [row for row in rows if row.problem is None]
+        cameras = {name: None for row in rows if row.id in opened for name in cameras_by_name(opened[row.id])}
+        alone = len(rows) == 1 and len(view.opened) == 1 and rows[0].id in opened
+        self._share.draw(
+            Chosen(tuple(row.source for row in rows), tuple(cameras), selected=bool(ids), in_view=alone)
+        )
+        states = {one.id: state for one, state in zip(view.opened, view.states)}
+        moments = {path: states[row.id] for row in rows if row.id in states for path in rerun_files((row,))}
+        self._rerun.draw(rerun_files(rows), len(rows), moments)
+
+
+def rerun_files(rows: Sequence[LibraryRow]) -> tuple[Path, ...]:
+    """The .rrd files of these; ManiSkill's recordings have none."""
+    return tuple(path for row in rows for path in row.paths if path.suffix == ".rrd")

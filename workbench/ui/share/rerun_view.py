@@ -1,0 +1,255 @@
+"""Recordings in rerun's own viewer, beside the page or in a tab of its own, through the page's one door.
+
+rerun's web viewer is a program of 43 MB that looks at any address it is given and tells its makers that it runs. Here
+it comes from the wheel that wrote the recordings (so file and viewer are of one version), packed; it is served under
+the page's own address, where the same cookie lets it in and one forwarded port carries all of it; and a content
+security policy lets it talk to nobody else.
+
+Which recordings it opens stands in its address, and has to be a whole address there, host and port included. What
+host a browser sees is known in the browser alone (behind ``ssh -L`` it is another one), so the page that is opened
+is a small one of ours that puts the addresses together and goes on to rerun's.
+
+The moment that it opens at cannot stand there: rerun takes one in the address of its own servers' recordings only. So
+a few lines of ours in its page tell it when it has the recording, through the way in that it has for that
+(``viewer_control``, rerun 0.41: one message of protobuf's, written by hand). If another rerun knows no such message, it
+opens at the first moment, which the panel's heading then still tells apart.
+"""
+
+from __future__ import annotations
+
+import gzip
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+
+import viser
+
+from workbench.machine.web_assets import web_assets_folder
+from workbench.recording.reader.reading import told_rerun
+from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
+from workbench.ui.server.file_response import FileReply, Offers
+from workbench.ui.server.gated_server import Door
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.templates import render
+
+log = logging.getLogger(__name__)
+
+SHARE, LEAST = 0.66, 480
+"""Of the width between the other panels; and pixels. The rest is the scene's, with the timeline under it."""
+SETTLES = 0.3
+"""Seconds from what a panel shows being asked for until the panel is where it stays."""
+Moments = Mapping[Path, int]
+"""The step at which a recording is looked at."""
+
+_SHOW = "/rerun/show/"
+_BLUEPRINT = ".rbl"
+_VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
+
+
+class RerunPages:
+    """The addresses under which recordings are shown. One a door."""
+
+    def __init__(self, door: Door, offers: Offers) -> None:
+        self._offers = offers
+        self._lock = threading.Lock()
+        self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}
+        self._keys: dict[tuple[Path, ...], str] = {}
+        headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
+        door.add_route(_VIEWER, _viewer_file, headers)
+        door.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
+
+    def address(self, recordings: Sequence[Path], moments: Callable[[], Moments] = dict) -> str:
+        """The address, from the root of the server, that opens these ``.rrd`` files together.
+
+        Args:
+            moments: asked when the address is opened: the step at which each of them begins, where that is not the first.
+        """
+        paths = tuple(Path(path).resolve() for path in recordings)
+        with self._lock:
+            key = self._keys.setdefault(paths, secrets.token_urlsafe(16))
+            self._shown[key] = paths, moments
+        return f"{_SHOW}{key}/"
+
+    def _go_on(self, asked: str) -> tuple[int, str, bytes]:
+        with self._lock:
+            shown = self._shown.get(asked.partition("/")[0])
+        if shown is None:
+            return 404, "text/plain; charset=utf-8", b"There is no such recording."
+        paths, moments = shown
+        part = asked.partition("/")[2]
+        for number, path in enumerate(paths):
+            if part == f"{number}{_BLUEPRINT}" and (blueprint := _blueprint(path)) is not None:
+                return 200, "application/octet-stream", blueprint
+        names = ", ".join(path.stem for path in paths)
+        # The first moment too: rerun follows what it reads until it reads, at the end of a file, that it is to pause.
+        begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
+        page = render(
+            "rerun_go_on",
+            names=names,
+            blueprints=[f"{n}{_BLUEPRINT}" for n, path in enumerate(paths) if _blueprint(path)],
+            paths=[self._offers.address(path) for path in paths],
+            moments=[f"{store}@{step}" for store, step in _stores(begins)],
+            viewer=_VIEWER,
+        )
+        return 200, "text/html; charset=utf-8", page.encode()
+
+
+def _blueprint(path: Path) -> bytes | None:
+    try:
+        return told_rerun(path)[1]
+    except (ValueError, OSError) as error:
+        log.info("%s shows no blueprint of its own before it is read: %s", path.name, error)
+        return None
+
+
+def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
+    for path, step in moments.items():
+        try:
+            store, _ = told_rerun(path)
+        except (ValueError, OSError) as error:
+            log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
+            continue
+        if store is not None:
+            yield store, step
+
+
+def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
+    if name not in VIEWER_FILES:
+        return 404, "text/plain; charset=utf-8", b"There is no such file."
+    if name == "index.html":
+        page = gzip.decompress(viewer_file(name).read_bytes())
+        before, head, after = page.partition(b"<head>")
+        ours = b"<script>" + (web_assets_folder() / "in_rerun.js").read_bytes() + b"</script>"
+        return 200, VIEWER_FILES[name], before + head + ours + after
+    return FileReply(viewer_file(name), VIEWER_FILES[name], gzipped=True)
+
+
+class RerunView:
+    """Buttons in the present container that open recordings in rerun, and the panel in which they are shown.
+
+    Args:
+        server: The page.
+        pages: Where rerun is served.
+        make_way: Called before the panel comes, to make room for it, with what folds and unfolds it; says how many
+            pixels there are between the other panels then.
+        unfolded: Called when a page shows the panel, which may have been unfolded there.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        pages: RerunPages,
+        make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0,
+        unfolded: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._server, self._pages, self._make_way, self._unfolded = server, pages, make_way, unfolded
+        self._paths: tuple[Path, ...] = ()
+        self._moments: Moments = {}
+        self._chosen = 0
+        self._panel: viser.PanelHandle | None = None
+        self._lock = threading.Lock()
+        self._problem = ""
+        self._waiting = False
+        self._drawn: object = None
+        self._width = LEAST
+        self._asked_at: float | None = None
+        """When a page last asked for what is in the panel, if the panel has got no width since."""
+        self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
+        self._words = server.gui.add_html("")
+        self._button.on_click(lambda _: self.open())
+
+    def draw(
+        self, paths: Sequence[Path], chosen: int | None = None, moments: Moments = MappingProxyType({})
+    ) -> None:
+        """From now on the buttons are about these ``.rrd`` files, of as many recordings as are `chosen`.
+
+        Args:
+            moments: the step at which each is looked at, of those that are.
+        """
+        self._moments = moments
+        self._chosen = len(paths) if chosen is None else chosen
+        self._paths = tuple(paths)
+        disabled = not self._paths or self._waiting
+        self._button.disabled = disabled
+        wanted = (self._paths, self._chosen, self._waiting, self._problem)
+        if wanted != self._drawn:
+            self._drawn = wanted
+            words = render(
+                "rerun",
+                address=self._address(self._paths) if self._paths else None,
+                lacking=self._chosen > len(self._paths),
+                waiting=self._waiting,
+                problem=self._problem,
+            )
+            self._words.content = words
+        self._widen()
+
+    def _widen(self) -> None:
+        """Give the panel its width on a page that has just placed it.
+
+        viser gives 300 pixels to what is docked beside another panel, whatever width it is docked with; only one that
+        is there takes a width. That it is there is known by its asking for what is in it.
+        """
+        with self._lock:
+            asked = self._asked_at
+            if self._panel is not None and asked is not None and time.monotonic() - asked > SETTLES:
+                self._asked_at = None
+                self._panel.set_width(self._width)
+
+    def _address(self, paths: tuple[Path, ...]) -> str:
+        def moments() -> Moments:
+            with self._lock:
+                self._asked_at = time.monotonic()
+            return {path: self._moments.get(path, 0) for path in paths}
+
+        return self._pages.address(paths, moments)
+
+    def open(self) -> None:
+        """Show the recordings in a panel beside the scene; returns when the viewer is there to be loaded."""
+        paths, moments = self._paths, self._moments
+        with self._lock:
+            if not paths or self._waiting:
+                return
+            self._waiting, self._problem = not is_kept(), ""
+        try:
+            if self._waiting:
+                self.draw(paths, self._chosen, moments)
+                viewer_file("index.html")
+        except RuntimeError as error:
+            self._problem = str(error)
+            return
+        finally:
+            self._waiting = False
+            self.draw(self._paths, self._chosen, self._moments)
+        self.close()
+        room = self._make_way(self._fold)
+        with self._lock:
+            self._panel = panel = self._server.gui.add_panel(order=6.0)
+        with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
+            self._server.gui.add_button("Close rerun", icon=viser.Icon.X, color="gray").on_click(
+                lambda _: self.close()
+            )
+            begins = {path: moments.get(path, 0) for path in paths}
+            heading = [(path.stem, begins[path]) for path in paths]
+            self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
+            Presses(self._server).when_unfolded(self._unfolded)
+        # Beside the scene, with a border that can be dragged.
+        panel.dock_left()
+        self._width = max(LEAST, round(SHARE * room))
+
+    def _fold(self, folded: bool) -> None:
+        with self._lock:
+            if self._panel is not None:
+                (self._panel.minimize if folded else self._panel.expand)()
+
+    def close(self) -> None:
+        """Take the panel away, and the program that runs in it."""
+        with self._lock:
+            panel, self._panel = self._panel, None
+        if panel is not None:
+            panel.remove()

@@ -1,0 +1,110 @@
+"""The 3-D view of an episode as one HTML file that moves: opened from a disk or a mail, without a server or a network.
+
+viser's page can play what its server would have sent, from a recording that stands in the page itself. So the scene is
+built as for a page that nobody looks at, moved from state to state with the pauses between them, and written down. The
+player has a time line, a pause button and speeds; the view is turned and moved as live.
+
+The player begins anew at the end without a pause, so the last state is held for a while, and its clock runs on. What
+time and step it is in the episode is therefore said by a caption of ours, with what the recording is; the player's own
+clock is not shown.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from workbench.machine.files import new_file
+from workbench.recording.episode.episode import Episode
+from workbench.recording.films import Eye, usual_eye
+from workbench.session.review.events import success_words
+from workbench.ui.scene.bodies import SceneView
+from workbench.ui.scene.env_grid import lay_out
+from workbench.ui.server.gated_server import DoorOptions, open_door
+from workbench.ui.widgets.templates import counted, render
+
+TRIANGLES = 80_000
+"""About how many are drawn. A robot's own meshes have twice that, and the file would be three times the size."""
+
+PAUSE = 1.0
+"""Seconds at the end."""
+
+
+def write_scene_html(
+    path: Path,
+    episode: Episode,
+    eye: Eye | None = None,
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> None:
+    """Write the moving scene to a new file at `path`.
+
+    Args:
+        path: where; must not exist.
+        episode: what.
+        eye: from where it is seen at first.
+        on_progress: called with the part that is done, 0..1.
+
+    Raises:
+        ValueError: the recording holds no scene.
+        OSError: it cannot be written there.
+    """
+    if episode.geometry is None or episode.poses is None:
+        raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to show.")
+    eye = eye or usual_eye(episode)
+    with new_file(path) as temporary:
+        # A door that lets nobody in: viser's server has to be somewhere, and nobody is told where.
+        door = open_door(DoorOptions(port=0))
+        try:
+            page = _recorded(door.server, episode, eye, on_progress)
+        finally:
+            door.close()
+        title = f"{episode.info.task}, {counted(episode.length, 'step')}"
+        page = page.replace("</body>", _caption(episode) + "</body>", 1)
+        page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{html.escape(title)}</title>", page, count=1)
+        temporary.write_text(page, encoding="utf-8")
+    on_progress(1.0)
+
+
+def seconds_a_step(episode: Episode) -> float:
+    return episode.info.control_dt if episode.info.control_dt > 0 else 0.05
+
+
+def _caption(episode: Episode) -> str:
+    info = episode.info
+    about = f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
+    ended, mood = success_words(episode)
+    dt = seconds_a_step(episode)
+    return render("scene_caption", about=about, ended=ended if mood else "", dt=dt, steps=episode.length)
+
+
+def _recorded(
+    server: viser.ViserServer, episode: Episode, eye: Eye, on_progress: Callable[[float], None]
+) -> str:
+    geometry, poses = episode.geometry, episode.poses
+    assert geometry is not None and poses is not None
+    env = 0 if geometry.num_envs == 1 else episode.info.env_index
+    server.scene.set_up_direction("+z")
+    # viser's own lights: its player goes back to them at every turn, and other ones would flash.
+    camera = server.initial_camera
+    camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
+    camera.near, camera.far = 0.05, 300.0
+    # All envs of the scene that it came from; the other ones stand where nobody looks and are not drawn.
+    batch = np.full((geometry.num_envs, *poses.shape[1:]), np.nan, np.float32)
+    batch[env] = poses[0]
+    scene = SceneView(server)
+    layout = lay_out(geometry, batch)
+    scene.build(geometry, layout, batch, env, TRIANGLES)
+    recording = server.get_scene_serializer()
+    for state, now in enumerate(poses):
+        batch[env] = now
+        scene.move(batch, layout, env)
+        recording.insert_sleep(seconds_a_step(episode))
+        on_progress(0.9 * state / len(poses))
+    # It begins anew by itself; without a pause one does not see how it ended.
+    recording.insert_sleep(PAUSE)
+    return recording.as_html(dark_mode=True)

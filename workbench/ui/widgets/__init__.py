@@ -1,0 +1,1 @@
+"""Inputs, charts and other parts that panels are made of."""

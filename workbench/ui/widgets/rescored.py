@@ -1,0 +1,111 @@
+"""What was judged again, of the past or of recordings: how far it is, a list of what is otherwise, and a chart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import viser
+from numpy.typing import NDArray
+
+from workbench.jobs.verdict import Verdict
+from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore.background import RUNNING, JudgedView
+from workbench.ui.widgets.click_targets import Paged, Presses
+from workbench.ui.widgets.line_chart import Line, LineChart, span_of
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import render
+
+MOST_ROWS = 10
+"""Of the list, at a time."""
+RECORD_COLOUR = "#adb5bd"
+View = TypeVar("View")
+Of = TypeVar("Of")
+
+
+class JudgedPanel(PagePart[View], Generic[View, Of]):
+    """Its parts, to be put into the present container in an order of its own; a row of the list goes to its run.
+
+    Args:
+        server: The page.
+        column: What the list calls a run.
+    """
+
+    every = 0.25
+    advice = ""
+    """A sentence for where the bodies came far from the record."""
+
+    def __init__(self, server: viser.ViserServer, column: str) -> None:
+        self._server, self._column = server, column
+        self._listed: Sequence[Verdict[Of]] = ()
+        self._failed_since = ""
+        """As the status says it; the rows need not say it again."""
+
+    def _add_status(self, label: str, stop: Callable[[], None]) -> None:
+        self._stop = self._server.gui.add_button(label, icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._stop.on_click(lambda _: stop())
+        self._status = self._server.gui.add_html("")
+
+    def _add_list(self) -> None:
+        self._list = self._server.gui.add_html("", visible=False)
+        self._presses = Presses(self._server)
+        self._pages = Paged(MOST_ROWS)
+
+    def _add_chart(self) -> None:
+        self._chart = LineChart(self._server, self._server.gui.add_folder(None), height=160)
+
+    def _draw_status(self, judged: JudgedView, title: str = "", idle: str = "") -> None:
+        self._failed_since = judged.why if judged.state == "failed" else ""
+        self._stop.visible = judged.state in RUNNING
+        self._status.visible = judged.state != "none" or bool(idle)
+        self._status.content = status_html(judged, title, idle, self.advice)
+
+    def _draw_list(self, listed: Sequence[Verdict[Of]]) -> None:
+        self._listed = listed
+        self._list.visible = bool(listed)
+        if listed:
+            rows = [self._row(place) for place in self._pages.places(len(listed))]
+            pages = self._pages.shown(lambda key, do: self._presses.id_of(key, lambda _: do()))
+            self._list.content = render("judged_list", rows=rows, more=pages, column=self._column)
+
+    def _draw_chart(
+        self, title: str, x: NDArray, old: NDArray, new: NDArray, dot: NDArray | None = None
+    ) -> None:
+        lines = Line("as recorded", old, RECORD_COLOUR, 1.2), Line("judged again", new)
+        self._chart.draw(title, x, lines, dot, span_of([line.values for line in lines]))
+
+    def _row(self, place: int) -> dict[str, Any]:
+        verdict, row = self._listed[place], place % MOST_ROWS
+        told = self._failed_since and verdict.why_not.startswith(self._failed_since)
+        return {
+            "badge": None,
+            "changed": "not judged" if told else words.what_changed(verdict),
+            "returns": "" if verdict.why_not else words.returns(verdict),
+            "drift": f"drifted {words.drift(verdict)}" if verdict.drifted else "",
+            "same": not verdict.differs,
+            "press": self._presses.id_of(("row", row), lambda _: self._go(row)),
+            **self._of_row(verdict),
+        }
+
+    def _go(self, row: int) -> None:
+        place = self._pages.first + row
+        if place < len(self._listed):
+            self._show(self._listed[place])
+
+    def _of_row(self, verdict: Verdict[Of]) -> dict[str, Any]:
+        """What the run is called, a hint, and whether it is selected."""
+        raise NotImplementedError
+
+    def _show(self, verdict: Verdict[Of]) -> None:
+        """Go there."""
+        raise NotImplementedError
+
+
+def status_html(judged: JudgedView, title: str = "", idle: str = "", advice: str = "") -> str:
+    """
+    Args:
+        title: Over it.
+        idle: What is said before anything was judged.
+        advice: As `JudgedPanel.advice`.
+    """
+    return render("judged", judged=judged, title=title, idle=idle, advice=advice, words=words)

@@ -1,0 +1,101 @@
+"""HTML of the panels, made from the templates in ``web_assets/panels``.
+
+viser puts the text of ``add_html`` into the page as it is, so one message of an author's exception
+with a ``<script>`` in it would run there. Everything that is shown as HTML therefore goes through
+`render`, which escapes every value it is given; no other module writes a tag. Characters that are not seen are shown:
+one that turns the direction of writing makes a name look like another, and half of a surrogate pair, as in the name of a
+file that is not UTF-8, cannot be sent to a page at all.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import jinja2
+
+from workbench.machine.text import plain_text
+from workbench.machine.web_assets import web_assets_folder
+
+
+def render(template: str, **values: Any) -> str:
+    """``web_assets/panels/<template>.html`` with these values, all of them escaped."""
+    return _environment().get_template(f"{template}.html").render(**values)
+
+
+class _Placed(Protocol):
+    @property
+    def file(self) -> str | None: ...
+    @property
+    def line(self) -> int | None: ...
+
+
+def place(thing: _Placed | None) -> str:
+    """``push.py:88`` of a problem, a finding, a busy worker; empty where no file is known."""
+    if thing is None or not thing.file:
+        return ""
+    return Path(thing.file).name + (f":{thing.line}" if thing.line else "")
+
+
+def size(count: float) -> str:
+    """Bytes as a person says them: ``640 B``, ``2.5 MB``, ``1.2 GB``, to three digits, by 1000."""
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} GB"
+
+
+def percent(done: float, total: float) -> int:
+    """How much of a whole is done; 0 while the whole is not known."""
+    return round(100 * done / total) if total else 0
+
+
+COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
+
+
+def letter(index: int) -> str:
+    """What a recording is called on the page: A to D, then numbers."""
+    return "ABCD"[index] if index < 4 else str(index + 1)
+
+
+def colour(index: int) -> str:
+    """Of a recording that is compared, in legends, curves and the view."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def short_text(text: str, longest: int = 120) -> str:
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def sentence(why: str) -> str:
+    """With a capital and a full stop."""
+    return f"{why[:1].upper()}{why[1:].removesuffix('.')}." if why else ""
+
+
+def counted(count: int, what: str) -> str:
+    """``1 step``, ``7 steps``."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _shown(value: Any) -> Any:
+    # Not Markup: that is a template's own text, whose values have been here.
+    return plain_text(value, "\n\t") if type(value) is str else value
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(web_assets_folder() / "panels"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters = (place, size, percent, counted, short_text, letter, colour)
+    environment.filters.update({filter.__name__: filter for filter in filters})
+    macros = environment.get_template("can_be_pressed.html").module
+    environment.globals.update({name: getattr(macros, name) for name in ("press", "to_copy", "badge")})
+    return environment
