@@ -1,25 +1,40 @@
-"""Workbench: an interactive authoring workbench for ManiSkill tasks."""
+"""Workbench: an interactive authoring workbench for ManiSkill tasks. What is importable by promise is in `__all__`."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from workbench.core.capture.inspect_env import list_contacts as list_contacts
+    from workbench.core.snapshots.snapshot import begin_anew as begin_anew
+    from workbench.core.snapshots.snapshot import restore_snapshot as restore_snapshot
+    from workbench.core.snapshots.snapshot import take_snapshot as take_snapshot
     from workbench.gym_env import make as make
     from workbench.recorder import Recorder as Recorder
+    from workbench.recording.reader.read_episode import read_episode as read_episode
 
 __version__ = "0.1.0"
+__all__ = ["Recorder", "begin_anew", "list_contacts", "make", "read_episode", "restore_snapshot", "take_snapshot"]
+
+_HOMES = {
+    "Recorder": "recorder",
+    "begin_anew": "core.snapshots.snapshot",
+    "list_contacts": "core.capture.inspect_env",
+    "make": "gym_env",
+    "read_episode": "recording.reader.read_episode",
+    "restore_snapshot": "core.snapshots.snapshot",
+    "take_snapshot": "core.snapshots.snapshot",
+}
 
 
 def __getattr__(name: str) -> Any:
     # Not imported above: the process that serves the page imports this package, and must start without
     # the seconds and the graphics driver that ManiSkill takes.
-    if name == "make":
-        from workbench.gym_env import make
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
 
-        return make
-    if name == "Recorder":
-        from workbench.recorder import Recorder
 
-        return Recorder
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
