@@ -15,7 +15,15 @@ if TYPE_CHECKING:
     from workbench.recording.reader.read_episode import read_episode as read_episode
 
 __version__ = "0.1.0"
-__all__ = ["Recorder", "begin_anew", "list_contacts", "make", "read_episode", "restore_snapshot", "take_snapshot"]
+__all__ = [
+    "Recorder",
+    "begin_anew",
+    "list_contacts",
+    "make",
+    "read_episode",
+    "restore_snapshot",
+    "take_snapshot",
+]
 
 _HOMES = {
     "Recorder": "recorder",

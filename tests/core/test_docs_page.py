@@ -1,4 +1,4 @@
-"""The docs page of the batched env: what it tells people to type runs."""
+"""The docs pages that people copy from: what they tell people to type runs, and nothing public is left out."""
 
 from __future__ import annotations
 
@@ -7,15 +7,34 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).parents[2] / "web_assets" / "docs" / "batched_env.md"
+import workbench
+
+DOCS = Path(__file__).parents[2] / "web_assets" / "docs"
 
 
-def test_every_block_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
-    assert len(blocks) == 5
+@pytest.mark.parametrize(
+    ("page", "count", "printed"),
+    [
+        ("batched_env.md", 5, ("actor cube", "{}", "table-workspace")),  # the restore report, and a contact
+        ("api.md", 1, ("table-workspace",)),
+    ],
+)
+def test_every_block_of_a_page_runs(
+    page: str, count: int, printed: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), flags=re.DOTALL)
+    assert len(blocks) == count
     names: dict[str, object] = {}
     for block in blocks:
-        exec(compile(block, str(PAGE), "exec"), names)
-    printed = capsys.readouterr().out
-    assert "actor cube" in printed and "{}" in printed, "the restore report"
-    assert "table-workspace" in printed, "a contact"
+        exec(compile(block, page, "exec"), names)
+    out = capsys.readouterr().out
+    assert [words for words in printed if words not in out] == []
+
+
+def test_what_is_importable_by_promise_is_on_its_page() -> None:
+    told = re.findall(r"^\| `workbench\.(\w+)\(", (DOCS / "api.md").read_text(), re.M)
+    assert sorted(told) == sorted(workbench.__all__)
+    for name in workbench.__all__:
+        assert getattr(workbench, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        workbench.nothing  # noqa: B018
