@@ -33,6 +33,7 @@ from workbench.session.protocol.messages import (
     Settings,
     SingleStep,
     Status,
+    StepBack,
     WarmUp,
 )
 
@@ -52,6 +53,8 @@ class ScriptedWorker:
     pid = None
     load_waits = False
     vitals = Vitals()
+    goes_back = True
+    """Whether it comes to the recorded states that it is asked for; they look as it does where it stands."""
 
     def __init__(
         self,
@@ -125,6 +128,12 @@ class ScriptedWorker:
             self._send(self._at(poses, elapsed), envs, seeds=np.arange(count))
         elif isinstance(request, Restore):
             self._restore(request)
+        elif isinstance(request, StepBack) and self.goes_back:
+            last, restored = (
+                self._lived[-1],
+                Restored(request.env_idx, (), -1, None, {}, number=request.number),
+            )
+            self._send(last, request.env_idx, restored=restored)
         elif isinstance(request, Settings) and request.cameras:
             self._draw(request)
 
