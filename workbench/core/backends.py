@@ -1,18 +1,4 @@
-"""Which simulation and which renderer this machine can give.
-
-``auto`` must never surprise. It is the batched CPU everywhere, since the tests of GPU simulation (``make test-gpu``) have
-passed on no machine so far: the GPU is taken where it is asked for. It needs CUDA *and* PhysX's GPU library, and SAPIEN
-fetches that library from the network at first use. So it is looked for on disk, never fetched by the way.
-
-Keep the render device alive, so that only the first scene of a process pays for it.
-
-SAPIEN compiles its shaders for a render device, which takes 5 to 19 s on a software driver, and
-throws both away when the last ``RenderSystem`` on that device goes. A tool that closes one env and
-makes the next one would pay every time. One idle RenderSystem that is held for the life of the
-process keeps them: the next env with cameras is made in about 0.2 s. On NVIDIA drivers it may also
-avoid the failure after some 28 make and close cycles (ManiSkill #1474, #1477), since the Vulkan
-instance is not made anew.
-"""
+"""Simulation backend and renderer of this machine."""
 
 from __future__ import annotations
 
@@ -53,7 +39,10 @@ def gpu_library_path() -> Path:
 
 
 def why_no_gpu_simulation() -> str | None:
-    """One sentence, or None when GPU simulation can be used."""
+    """The reason in one sentence, or None when GPU simulation can be used.
+
+    PhysX's GPU library is looked for on disk: asking SAPIEN for it would fetch it from the network.
+    """
     if not torch.cuda.is_available():
         return "no CUDA device is visible to torch"
     if not physx.is_gpu_enabled() and not gpu_library_path().exists():
@@ -92,7 +81,8 @@ def _device_summary() -> str:
 
 
 def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
-    """Settle ``auto``; refuse ``gpu`` where it cannot be.
+    """Choose simulation and renderer. ``auto`` is the batched CPU: GPU simulation has passed its tests
+    (``make test-gpu``) on no machine so far.
 
     Raises:
         BackendUnavailable: with the reason, and what to use instead.
@@ -122,9 +112,11 @@ _kept: dict[str, sapien.render.RenderSystem] = {}
 
 
 def keep_render_device(device: str) -> None:
-    """Hold a render device for good: ``cpu``, ``cuda``, ``cuda:1``, or ManiSkill's own names for them.
+    """Keep a render device for the life of the process: ``cpu``, ``cuda``, ``cuda:1``, or ManiSkill's names for them.
 
-    Takes as long as compiling the shaders the first time, nothing afterwards.
+    SAPIEN compiles its shaders for a render device (5 to 19 s on a software driver) and drops them with the last
+    ``RenderSystem`` on it. With one idle RenderSystem kept, the next env with cameras is made in about 0.2 s. On NVIDIA
+    drivers it may also avoid a failure after some 28 make and close cycles (ManiSkill #1474, #1477).
 
     Raises:
         RuntimeError: the machine has no such render device.

@@ -1,10 +1,4 @@
-"""What a task broke of the rules: raised, or noted as a row, at the line that did it.
-
-What goes wrong shows later than it is done: at the fetch, after the write. So whoever notes a write keeps the
-frames that led to it, and the error carries those as the innermost of its traceback.
-
-The line of a task's source that assigns an attribute, for where nobody saw it happen.
-"""
+"""Reports broken rules at the line of the task that broke them."""
 
 from __future__ import annotations
 
@@ -85,7 +79,11 @@ class _Row:
 
 
 class BrokenRules:
-    """The rules that one env checks, and where its task broke them."""
+    """The rules that one env checks, and where its task broke them.
+
+    A lost write shows at the fetch that follows: callers keep the frames of the write, and the error carries them as the
+    innermost of its traceback.
+    """
 
     def __init__(
         self, degrees: Mapping[str, Degree], on_finding: Callable[[Finding], None] = warn_of

@@ -1,12 +1,4 @@
-"""What can be set about one camera, as plain numbers that cross the pipe.
-
-The same camera is spoken of in four places: the env that renders it, the page where it is moved, the author's file
-where it is written, and the files in which other programs want it. All of them speak of these settings, so that
-"the camera asked for" and "the camera that there is" can be compared number by number.
-
-The functions that ask SAPIEN are in `take_pictures`, so that whoever only shows pictures need not
-import a simulator.
-"""
+"""Camera settings, descriptions and pictures as plain data, without a simulator."""
 
 from __future__ import annotations
 
@@ -27,7 +19,7 @@ Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[fl
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Where one camera stands and how it sees: what ManiSkill's ``CameraConfig`` says of it."""
+    """Pose, lens, size and shader of one camera, as ManiSkill's ``CameraConfig`` has them."""
 
     position: tuple[float, float, float]
     """Metres, in the frame of its mount; in the env's frame if it stands still."""

@@ -1,4 +1,4 @@
-"""Which envs of a batch are meant: the numbers that a caller names, read and checked."""
+"""Checks the env numbers that a caller names."""
 
 from __future__ import annotations
 

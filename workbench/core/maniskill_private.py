@@ -1,14 +1,4 @@
-"""The private names of ManiSkill 3.0.1 that the core leans on, all of them, in one place.
-
-ManiSkill's structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``; bodies of
-a CPU system raise on both. The structs are made deep inside ManiSkill's builders, so the four cached
-properties that ask are replaced, once a process, by ones that ask our system when (and only when) the
-struct belongs to a batched CPU scene. A stock scene in the same process gets the original code.
-
-What drawing and pictures read of ManiSkill's structs is here too, one small function each.
-``tests/core/test_maniskill_private.py`` and ``tests/core/test_scene_seams.py`` name every attribute used here, so that an
-upgrade fails loudly there and not in the middle of an author's task.
-"""
+"""All private names of ManiSkill 3.0.1 that the core uses."""
 
 from __future__ import annotations
 
@@ -46,7 +36,11 @@ from workbench.core.camera_data import CallSite, CameraKey, CameraKind
 @cache
 def install_index_seams(batched_system: Callable[[Any], Any]) -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system: `batched_system(scene)`, None for any other scene.
-    Safe to call again."""
+
+    Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, on which bodies of a CPU system raise.
+    ManiSkill's builders make the structs, so the cached properties that ask are replaced, once a process; a stock scene gets
+    the original code. Safe to call again.
+    """
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_set_ee_action = PDEEPosController.set_action
 

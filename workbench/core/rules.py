@@ -1,11 +1,4 @@
-"""The rules of GPU simulation, each with an id and a degree: what happens where a task breaks it.
-
-A rule that *stops* raises at the line that broke it. One that *warns* is told with that line, and the operation goes on
-as it does where no rule is checked, to the last bit. By default a rule stops where the state of other envs is
-overwritten, since every number after that is wrong, and warns everywhere else: what ManiSkill can run is run.
-
-The table imports nothing of the simulation, so commands and pages can read it without torch.
-"""
+"""The rules of GPU simulation, each with an id and a degree. Imports no simulator."""
 
 from __future__ import annotations
 
@@ -14,6 +7,8 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 Degree = Literal["stop", "warn", "off"]
+"""*stop* raises at the line that broke the rule; *warn* reports the line, and the operation goes on as without rules, to the
+last bit. By default a rule stops where the state of other envs is overwritten, since every number after that is wrong."""
 DEGREES: tuple[Degree, ...] = get_args(Degree)
 
 

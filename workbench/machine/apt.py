@@ -1,15 +1,4 @@
-"""Debian packages, installed where that is allowed, and the sources that a machine has them from.
-
-Set-up must not stop to ask, must not fail because an unattended upgrade holds dpkg's lock for a
-moment, and must never pretend: without root it installs nothing and hands back the command.
-
-Debian 12's own Mesa is too old for SAPIEN and its backports suite has a good one, but the line that
-adds backports must name a mirror, and the right mirror is the one that this machine already uses: a
-company's or a container's may be the only one that it reaches. So the sources are parsed, in both of
-apt's formats (sources.list(5)): one line a source, ``deb [options] uri suite component...``, and
-deb822 paragraphs with ``Types:``, ``URIs:``, ``Suites:``, ``Components:``. What says how a mirror is
-trusted (``Signed-By``, ``Trusted``) is taken over with it, otherwise apt would refuse the new source.
-"""
+"""Debian packages: installed where that is allowed, and the sources they come from."""
 
 from __future__ import annotations
 
@@ -57,7 +46,7 @@ def os_release() -> dict[str, str]:
 
 
 def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: float = 900) -> None:
-    """Run apt-get without questions; its output goes to stderr so that stdout stays for shell lines.
+    """Run apt-get without questions, waiting for dpkg's lock, which an unattended upgrade may hold.
 
     Raises:
         AptFailed: it is missing, ended with an error or took longer than `timeout_s`.
@@ -115,7 +104,11 @@ ONE_LINE_NAMES = {"signed-by": "Signed-By", "trusted": "Trusted", "arch": "Archi
 
 @dataclass(frozen=True)
 class AptSource:
-    """One binary ("deb") source, in either format."""
+    """One binary ("deb") source, in either format of sources.list(5).
+
+    One line a source, ``deb [options] uri suite component...``, or deb822 paragraphs with ``Types:``, ``URIs:``, ``Suites:``,
+    ``Components:``.
+    """
 
     uris: tuple[str, ...]
     suites: tuple[str, ...]
@@ -175,8 +168,9 @@ def read_apt_sources(folder: Path = Path("/etc/apt")) -> list[AptSource]:
 def backports_source(sources: list[AptSource], codename: str) -> str | None:
     """A deb822 source for ``CODENAME-backports`` on the mirror that ``CODENAME`` itself comes from.
 
-    None if no source gives that release's ``main``, so that there is no mirror to take over. apt holds
-    backports back by itself (its Release file says ``NotAutomatic``): adding it upgrades nothing.
+    That mirror may be the only one that the machine reaches; its trust options (``Signed-By``, ``Trusted``) are taken over,
+    or apt refuses the source. None if no source gives that release's ``main``. apt holds backports back by itself (their
+    Release file says ``NotAutomatic``): adding them upgrades nothing.
     """
     for source in sources:
         if codename in source.suites and "main" in source.components:

@@ -1,9 +1,4 @@
-"""The browser that the tests drive: the machine's own Chromium.
-
-Playwright's own browsers come from a download that many machines cannot reach, and a system Chromium
-is what users have. Ubuntu's ``chromium-browser`` is a snap behind a shell script that may only say
-"install the snap", so a name on PATH proves nothing: it must tell its version.
-"""
+"""The machine's own Chromium, which the tests drive."""
 
 from __future__ import annotations
 
@@ -26,7 +21,10 @@ def find_chromium() -> str | None:
 
 
 def chromium_version(path: str) -> str | None:
-    """What ``PATH --version`` says, None if it does not run or is not a Chromium."""
+    """What ``PATH --version`` prints, None if it does not run or is not a Chromium.
+
+    Ubuntu's ``chromium-browser`` may be a script that only says "install the snap": a name on PATH proves nothing.
+    """
     try:
         done = subprocess.run(
             [path, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20

@@ -1,10 +1,4 @@
-"""What this machine can do for the workbench, and what to do about each lack.
-
-Every question is asked where its answer cannot hurt: SAPIEN's renderer and torch's CUDA in child
-processes with a time limit, because a broken driver crashes or hangs whoever loads it; PhysX's GPU
-library by looking on disk, because SAPIEN fetches it from the network when asked to enable it. So
-the report always comes, within seconds, on the machine where nothing else works.
-"""
+"""Checks what this machine can do for the workbench, and advises on what is missing."""
 
 from __future__ import annotations
 
@@ -61,7 +55,11 @@ class Finding:
 
 
 def diagnose() -> list[Finding]:
-    """Look at everything. Never raises: a question that fails is a finding with the failure in it."""
+    """Check everything. Never raises: a check that fails is a finding with the failure in it.
+
+    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are asked in child processes with a
+    time limit. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
+    """
     questions: list[tuple[str, Callable[[], list[Finding]]]] = [
         ("Python", _python),
         ("packages", _packages),

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, whoever reads, dies or fills the disk meanwhile."""
+"""Reads and writes files safely: whole or not at all, and regular files only."""
 
 from __future__ import annotations
 

@@ -1,14 +1,4 @@
-"""Whether SAPIEN finds something to render with, asked of SAPIEN itself.
-
-That a driver file (ICD) lies in /usr/share/vulkan proves nothing: Mesa 22.3's software driver is
-there on every Debian 12 with Chromium, and SAPIEN refuses it; an NVIDIA ICD without the kernel module
-crashes or hangs in native code. So a child process builds a `sapien.render.RenderSystem` on the same
-device that ManiSkill would ask for, and tells the name; if it crashes or hangs, that is the answer.
-
-The driver's name and version come from Vulkan (``VkPhysicalDeviceDriverProperties``, core since 1.2),
-because SAPIEN tells only the device's. Run as a module this file is that child: it prints one line of
-JSON.
-"""
+"""Asks SAPIEN, in a child process, whether it can render. Run as a module this is that child."""
 
 from __future__ import annotations
 
@@ -58,6 +48,10 @@ class RenderProbe:
 
 def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float = 60) -> RenderProbe:
     """Ask a child process, started with this process's environment and `env` on top.
+
+    A driver file (ICD) proves nothing: Debian 12's Mesa 22.3 is there and SAPIEN refuses it, and an NVIDIA ICD without the
+    kernel module crashes or hangs in native code. So the child builds a `sapien.render.RenderSystem` on the device that
+    ManiSkill would ask for.
 
     Never raises for what the child does: a crash, a hang of `timeout_s` or a missing library is an
     answer with ``ok=False``.
@@ -150,9 +144,9 @@ def _loads(library: str) -> bool:
 
 
 def _vulkan_drivers() -> dict[str, str]:
-    """Device name -> driver name and version, for every device that Vulkan lists.
+    """Device name -> driver name and version, for every device that Vulkan lists; SAPIEN has the device's name only.
 
-    Written against the C layout of Vulkan 1.2 on 64 bits: VkApplicationInfo is 48 bytes with apiVersion
+    From ``VkPhysicalDeviceDriverProperties`` (core since 1.2). Written against the C layout of Vulkan 1.2 on 64 bits: VkApplicationInfo is 48 bytes with apiVersion
     at 44; VkInstanceCreateInfo is 64 bytes with the application info's address at 24;
     VkPhysicalDeviceDriverProperties has driverName (256 characters) at 20 and driverInfo at 276;
     VkPhysicalDeviceProperties2 has pNext at 8 and the properties at 16, their deviceName at 20.

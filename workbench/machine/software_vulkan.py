@@ -1,23 +1,4 @@
-"""A software Vulkan driver for someone who is not root: apt's packages, unpacked into their own folder.
-
-On a shared server nobody installs a package because one user wants camera pictures. apt needs root
-for dpkg's database, not for fetching: with its lists and its cache in a folder of our own it resolves
-what Mesa needs beyond what the machine has, checks the same signatures with the same keys, and
-downloads. `dpkg-deb` unpacks. The Vulkan loader is then told of the driver by VK_DRIVER_FILES, and
-the dynamic linker of its libraries by LD_LIBRARY_PATH, in the environment of the process that
-renders and of no other. Deleting the folder undoes all of it.
-
-A machine whose driver works is left alone; that is settled by asking SAPIEN (render_device.py), not
-by looking for files. Where nothing works, Mesa's software driver (lavapipe) does, from 24.3 on: from
-the distribution if that has it, from Debian's backports suite otherwise. Root gets it installed with
-apt. Anyone else gets the very same packages unpacked into a folder of their own (private_mesa.py),
-and a pair of environment variables that the process which renders must be started with: they are in
-`RenderProbe.env`, and ``python -m workbench.machine.software_vulkan --export`` prints them for a
-shell.
-
-Nothing here is fatal: a workbench without camera pictures is still a workbench. What could not be
-done is said in `RenderProbe.error`, with the command to type.
-"""
+"""Provides a software Vulkan driver (Mesa lavapipe) where SAPIEN finds no other."""
 
 from __future__ import annotations
 
@@ -68,6 +49,10 @@ def unpack_private_mesa(
     package: str, extra_source: str | None, choose: Callable[[list[PackageVersion]], PackageVersion | None]
 ) -> dict[str, str]:
     """Fetch `package` with the libraries that this machine lacks and unpack them into the user's cache.
+
+    apt needs root for dpkg's database, not for fetching: with lists and cache in a folder of our own it resolves, checks
+    the same signatures and downloads; `dpkg-deb` unpacks. VK_DRIVER_FILES and LD_LIBRARY_PATH then name driver and libraries
+    to the process that renders. Deleting the folder undoes all of it.
 
     Args:
         package: the package that carries lavapipe.
@@ -211,7 +196,11 @@ def plan_mesa() -> MesaPlan | None:
 
 
 def ensure_render_device(install: bool) -> RenderProbe:
-    """Find a render device, and with `install` bring what is missing. Slow only where it installs.
+    """Find a render device, and with `install` provide what is missing. Slow only where it installs.
+
+    A machine whose driver works is left alone. Otherwise Mesa's lavapipe does, from 24.3 on, from the distribution or from
+    Debian's backports: installed with apt for root, unpacked into the user's cache for others, who start the process that
+    renders with `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
 
     Returns:
         The last probe. Where ``ok``, start the process that renders with ``probe.env`` added. Where not,

@@ -1,12 +1,4 @@
-"""Numbers and lengths as text, NaN and infinite ones too: one way for the page, the terminal and the files.
-
-Short, since it is one decision that everything that shows a number must share.
-
-What a terminal gets can clear it, rename its window, write to the clipboard or move the cursor over what stood there;
-characters that turn the direction of writing make a name look like another. So all of these are shown as Python would
-write them (``\x1b``, ``\u202e``). Of an author's prints the colours are kept: only ``ESC [ numbers m``, and of the numbers
-only those that a reader can still see through. `guard_terminal` stands between a process and its terminal.
-"""
+"""Text for people: numbers, lengths, and text from elsewhere made safe for a terminal."""
 
 from __future__ import annotations
 
@@ -77,7 +69,11 @@ HARMLESS = frozenset((0, 1, 2, 3, 4, 7, 9, 22, 23, 24, 27, 29, *range(30, 50), *
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """`text` with every control, unseen and direction character shown escaped, but for those in `keep`."""
+    r"""`text` with every control, unseen and direction character escaped as Python does (``\x1b``), except those in `keep`.
+
+    Such characters can clear a terminal, rename its window, write to the clipboard, move the cursor over other text, or make a
+    name look like another.
+    """
     if not _SHOWN.search(text):
         return text
     return _SHOWN.sub(

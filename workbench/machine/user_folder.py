@@ -1,4 +1,4 @@
-"""The folder of this user's configuration: files that nobody else may write, changed in one step, by one process at a time."""
+"""The user's configuration folder: private files, replaced whole, by one process at a time."""
 
 from __future__ import annotations
 

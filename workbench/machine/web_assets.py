@@ -1,10 +1,4 @@
-"""Where the files that the browser gets lie on this machine.
-
-A source checkout keeps them in the top-level folder ``web_assets/``, where people look for them; a
-wheel cannot install a folder beside the package, so it carries a copy as package data,
-``workbench/_web_assets``. The wheel's copy is asked first, because an installed package must never
-pick up a folder that merely happens to lie beside it in site-packages.
-"""
+"""Finds the folder with the browser's files."""
 
 from __future__ import annotations
 
@@ -13,7 +7,9 @@ from pathlib import Path
 
 
 def web_assets_folder() -> Path:
-    """Folder with the files for the browser.
+    """Folder with the files for the browser: ``web_assets/`` of a checkout, ``workbench/_web_assets`` of a wheel.
+
+    The wheel's copy is asked first: an installed package must not pick up a folder beside it in site-packages.
 
     Raises:
         FileNotFoundError: neither the wheel's copy nor the checkout's folder is there.

@@ -1,22 +1,4 @@
-"""Every way to say where a camera stands and how it sees, and the way between them.
-
-A pose of a camera is said in many ways: as the quaternion of ManiSkill's config, as "from here look there", as
-roll, pitch and yaw, as the extrinsic matrix that OpenCV's calibration gives or the model matrix of a renderer, in
-the env's frame or in that of the link that it rides on. Each pair of them has a sign or an axis to get wrong, and a
-wrong one shows as a camera that looks at the back wall. So there is one place for all of them, and one meeting
-point: a pose is seven numbers ``[x, y, z, qw, qx, qy, qz]``, camera to world, in ManiSkill's camera frame (x forward,
-y left, z up; what SAPIEN and ROS's body frames use). Whatever else is wanted is computed from that, and to that.
-
-The three conventions differ only in what the camera's own axes are called:
-
-* ``maniskill``: x forward, y left, z up;
-* ``opencv`` (also ROS's optical frames, COLMAP): x right, y down, z forward;
-* ``opengl`` (also Blender, NeRF): x right, y up, z backward.
-
-The lens is OpenCV's pinhole: (u, v, 1) z = K (x, y, z), pixels counted from the outer edge of the picture's top left
-pixel, which makes the middle of a picture W / 2, H / 2, as SAPIEN has it. Nothing of a simulator is imported, since the
-server turns a page's numbers around with it.
-"""
+"""Conversions between conventions for camera poses and lenses, without a simulator."""
 
 from __future__ import annotations
 
@@ -34,6 +16,14 @@ from workbench.core.camera_data import CameraSettings, Matrix3
 
 Floats = NDArray[np.float64]
 Convention = Literal["maniskill", "opencv", "opengl"]
+"""What the camera's own axes are.
+
+* ``maniskill`` (also SAPIEN, ROS's body frames): x forward, y left, z up;
+* ``opencv`` (also ROS's optical frames, COLMAP): x right, y down, z forward;
+* ``opengl`` (also Blender, NeRF): x right, y up, z backward.
+
+All conversions go through one pose: ``[x, y, z, qw, qx, qy, qz]``, camera to world, in the first of these.
+"""
 Direction = Literal["camera_to_world", "world_to_camera"]
 
 _AXES: dict[str, Floats] = {
@@ -324,7 +314,11 @@ def opengl_model_matrix(pose: ArrayLike) -> Floats:
 
 
 def intrinsic_from_fov(fov: float, width: int, height: int) -> Floats:
-    """(3, 3) of a vertical field of view in radians: square pixels, the axis through the picture's middle."""
+    """(3, 3) of a vertical field of view in radians: square pixels, the axis through the picture's middle.
+
+    OpenCV's pinhole, (u, v, 1) z = K (x, y, z), with pixels counted from the outer edge of the top left pixel, as in
+    SAPIEN: the middle of a picture is W / 2, H / 2.
+    """
     _check_size(width, height)
     if not 0 < fov < math.pi:
         raise ValueError(f"a vertical field of view lies between 0 and pi radians, not {fov}")

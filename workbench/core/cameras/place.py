@@ -1,14 +1,4 @@
-"""A live camera: what its config says as plain numbers, and that camera put elsewhere, or given another lens, size or shader, in all envs at once.
-
-Where a camera stands and how it sees are properties of SAPIEN's camera components, which can be set at any time;
-its size and its shader are given to a component when it is made, so for those the component alone is exchanged, on
-the entity on which the old one was. Both leave bodies and physics untouched. ManiSkill's own objects around the
-components are brought along (config, cached matrices, camera group), so that its observations and ``get_params``
-are those of the placed camera: as if the env had been built with such a config.
-
-What was placed stays: resets and snapshots do not touch cameras, except for a reset that builds the scene anew,
-after which `PlacedCameras.put_back` is to be called.
-"""
+"""Placement of a live camera in all envs: pose, lens, size and shader."""
 
 from __future__ import annotations
 
@@ -42,7 +32,14 @@ class _Placed:
 
 
 class PlacedCameras:
-    """The cameras of one env that stand elsewhere than its task says."""
+    """The cameras of one env whose pose, lens, size or shader differ from the task's.
+
+    Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made, so a new
+    component takes its place on the same entity. Bodies and physics are untouched. ManiSkill's objects around the
+    components follow (config, cached matrices, camera group): observations and ``get_params`` are those of an env that
+    was built with such a config. Resets and snapshots keep a placement; a reset that rebuilds the scene does not: call
+    `put_back` after it.
+    """
 
     def __init__(self) -> None:
         self._placed: dict[CameraKey, _Placed] = {}

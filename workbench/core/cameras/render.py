@@ -1,23 +1,4 @@
-"""Pictures of chosen cameras of one chosen env, and of nothing else.
-
-ManiSkill renders all cameras of all envs or none, and on a software driver a picture costs 50 ms. A
-page shows a few cameras of one env, so here only those are rendered, from that env's own sub-scene.
-
-What a camera must not see is the delicate part. ManiSkill hides a task's ``_hidden_objects`` from
-sensors and shows them to human cameras, on a stock CPU env by the visibility of the drawn body, in
-batched simulation by moving the object 99999 m away. Here visibility is used always, and an object
-that ManiSkill has moved away is put back while human cameras look; both are undone before returning,
-so a picture leaves no trace in the simulation. The pictures are those that ManiSkill itself would
-give for the state: its own shaders and texture transforms make them.
-
-The pictures that belong to a step, out of the observation where it has them already.
-
-A task that observes pictures (``obs_mode="rgb+depth"`` and the like) has drawn its sensors for this very step, and a
-picture takes 25 to 50 ms on a software renderer: a recording that draws them again would take twice as long as the
-episode. So what the observation holds is taken from there, and only the rest is drawn. Both are the same picture (tested),
-with two exceptions that are drawn: depth that does not fit into ManiSkill's whole millimetres, which end at 32.767 m, and
-shaders that give more than millimetres.
-"""
+"""Pictures of chosen cameras of one env."""
 
 from __future__ import annotations
 
@@ -100,7 +81,10 @@ def segmentation_names(env: Any) -> dict[int, str]:
 def take_pictures(
     env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
 ) -> tuple[Picture, ...]:
-    """Render the cameras that are asked for, in env `env_index`; in the order asked.
+    """Render the requested cameras of env `env_index`, in the order of `requests`.
+
+    ManiSkill renders all cameras of all envs or none, 50 ms a picture on a software driver. Here only the requested
+    ones are rendered, from the env's own sub-scene, with ManiSkill's shaders and texture transforms.
 
     Args:
         poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
@@ -231,7 +215,12 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 
 @contextmanager
 def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
-    """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
+    """Within this, draw the task's hidden objects in this env, or do not.
+
+    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on a stock CPU env by visibility,
+    in batched simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away
+    is put back while human cameras look. Both are undone, so a picture leaves no trace in the simulation.
+    """
     slot_of = scene_index(env).slot_of
     true = (
         {slot: pose for rows in hidden_poses(env) for slot, pose in zip(*rows, strict=True)} if shown else {}
@@ -326,10 +315,11 @@ def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
 
 
 def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:
-    """Pictures of the cameras that are asked for, of the state that was observed last, env by env.
+    """Pictures of the requested cameras, of the last observed state, env by env.
 
-    Depth and segmentation that were observed are as ManiSkill has them: int16, whole millimetres and ids. Raises as
-    `take_pictures`.
+    A picture takes 25 to 50 ms on a software renderer, so what the observation holds is taken from there: the same
+    picture (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Rendered are the others, depth
+    beyond 32.767 m, and shaders that give more than millimetres. Raises as `take_pictures`.
     """
     if not requests:
         return []

@@ -1,9 +1,4 @@
-"""Pictures of a scene of which nothing is left but its shapes and where they were.
-
-A recording holds meshes, materials and poses. That is all that a renderer needs: no env, no task file, no physics, and
-so a film can be made of an episode whose task does not exist any more, on a machine without a browser. SAPIEN draws it,
-as it drew the task's own cameras, and from anywhere.
-"""
+"""Pictures of a recorded scene, from its shapes and poses alone."""
 
 from __future__ import annotations
 
@@ -22,7 +17,7 @@ NEAR, FAR = 0.01, 300.0
 
 
 class RecordedScene:
-    """The bodies of one env, as a scene of SAPIEN's with one camera.
+    """The recorded bodies of one env, as a SAPIEN scene with one camera. Needs no env, task file or physics.
 
     Args:
         geometry: What they look like.

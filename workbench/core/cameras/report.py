@@ -1,10 +1,4 @@
-"""What a camera sees of a task over many envs, as numbers: plain data that crosses the pipe.
-
-One picture says whether a camera is well placed in one env. An author needs to know of all of them: in how many the
-cube is in the picture at all, how large, whether the border cuts it, whether the arm stands before it. `visibility`
-measures that; here is what it found, one array over the envs for each object, what of it a person reads first, and
-one mark between 0 and 1 by which envs are put in order (worst first) and placements are compared.
-"""
+"""Camera reports: what a camera sees of each object, as arrays over envs."""
 
 from __future__ import annotations
 

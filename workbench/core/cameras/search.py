@@ -1,16 +1,4 @@
-"""Suggests where a camera could stand: placements that see what must be seen, in all of the envs.
-
-The space of placements is small (an eye in a box, looking towards the objects) and the measure has no gradient (an
-object is behind the arm or it is not), so it is sampled: eyes spread over the box, each looking at a point near the
-objects. What makes that quick enough to wait for is that nearly all of a picture's cost is the robot's meshes: on a
-software driver 2 ms without them, 30 ms with them. So every sample is looked at without the robot, in all envs, which
-settles size, cutting and what else is in the way, and bounds the score from above; with the robot only the best of
-those are looked at. Around the best a second, smaller sample is drawn, twice.
-
-A placement's score is the mean of its mark in the average env and its mark in the worst one: a camera that loses
-the cube in one env of eight is not nearly as good as one that does not. The five best are given that stand apart,
-since five neighbours are one suggestion. For a seed the search is the same every time.
-"""
+"""Search for camera placements that see chosen objects in all envs."""
 
 from __future__ import annotations
 
@@ -73,10 +61,10 @@ def suggest_cameras(
     progress: Callable[[int, int], None] = lambda done, total: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[OfferedPlacement, ...]:
-    """The best placements found for envs that are already reset, the best first; the envs are left as they are.
+    """The best placements found, best first, for envs that are already reset; the envs stay as they are.
 
-    Fewer than `SearchSpace.best` are given where no more of them stand apart or see anything, and those found until
-    then where the search is cancelled.
+    Placements that stand apart are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
+    there are not more, or if the search is cancelled. The same seed gives the same result.
 
     Args:
         progress: called after each look with how many were made and are to be made at most, so it should do little.
@@ -109,7 +97,13 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
 
 
 class _Search:
-    """One run of `suggest_cameras`: what its stages share."""
+    """One run of `suggest_cameras`.
+
+    The space is small and the score has no gradient, so it is sampled: eyes spread over the box, each looking at a point
+    near the objects, then `ROUNDS` smaller samples around the best. Nearly all of a picture's cost is the robot's meshes
+    (software driver: 2 ms without them, 30 ms with them). So every sample is measured without the robot, which bounds
+    its score from above, and only the best of these with it.
+    """
 
     def __init__(
         self,

@@ -1,12 +1,4 @@
-"""A camera at any place in one env, for as long as it takes to look, and without a trace.
-
-To judge a placement that is only thought of, something has to take its picture. The env's own camera could be moved
-there and back, but it may be of another size and shader, and ManiSkill keeps its matrices. An entity of its own in
-the env's sub-scene would be one more in the list whose order our tables, snapshots and PhysX's packed state rely on,
-and would use up a number of the segmentation. So the camera lives in a second, empty ``sapien.Scene`` that shares
-the sub-scene's render system: it sees what that system draws, and the sub-scene never hears of it. (Measured with
-sapien 3.0.3: entities, packed poses, ids and pictures of the other cameras are equal before and after.)
-"""
+"""A camera at any pose of one env, for the time of a few pictures."""
 
 from __future__ import annotations
 
@@ -65,7 +57,11 @@ def temporary_camera(
     size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
 ) -> Iterator[TemporaryCamera]:
-    """A camera in one env; nothing of the env may be changed, and no other picture taken, while it is there.
+    """A camera in one env. While it exists, change nothing in the env and take no other picture.
+
+    It lives in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in the sub-scene
+    would change the order on which tables, snapshots and PhysX's packed state rely, and use up a segmentation id.
+    (Measured with sapien 3.0.3: entities, packed poses, ids and pictures of the other cameras are equal before and after.)
 
     Args:
         kind: sensors do not see what the task hides from them.

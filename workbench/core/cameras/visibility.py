@@ -1,16 +1,4 @@
-"""What a camera sees of the task's objects, measured in many envs: the pictures behind a `CameraReport`.
-
-Whether the cube is in view can be computed from boxes and frustums, and is then wrong wherever something stands
-before it. So it is rendered: the segmentation says whose every pixel is, and rendering once more with the robot's
-visuals switched off says what the robot stood before; rendering each object with all else switched off says where the
-border cuts it and what other things cover. Nearly all of a picture's cost is the robot's meshes (30 ms with a Panda on
-a software driver, 2 ms without), so the pictures without it come almost free. Their size may be less than the camera's
-own, with the same view.
-
-Any placement can be judged, a camera that exists and one that is only thought of alike; nothing of the env changes
-(see `temporary_camera`). What a sensor must not see it does not see here: a goal marker that the task hides counts
-as never drawn, and one that is part of the scene counts like any object.
-"""
+"""Measures what a camera sees of the objects of a task, for a `CameraReport`."""
 
 from __future__ import annotations
 
@@ -258,7 +246,13 @@ def measure(
     settings: CameraSettings,
     bare: CameraReport | None = None,
 ) -> CameraReport:
-    """Look; once more without the robot, if it is in view; and at each object alone; and count: a report of one env.
+    """Render and count pixels: a report of one env.
+
+    Boxes and frustums ignore what stands before an object, so it is rendered. The segmentation gives each pixel's object; a
+    second picture without the robot gives what the robot covers; one of each object alone gives what the border cuts and
+    what other things cover. The robot's meshes are nearly all of a picture's cost (30 ms with a Panda on a software
+    driver, 2 ms without), so the further pictures are almost free. An object that the task hides from sensors counts as
+    never drawn for a sensor.
 
     Args:
         settings: of the camera, in whose pixels things are counted; `view` may have fewer.

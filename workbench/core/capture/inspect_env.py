@@ -1,23 +1,4 @@
-"""Reads one env out: observation, state dict, joints, contacts.
-
-The numbers are taken from where the task itself takes them: the observation is the last one that the env
-returned, the state is ``get_state_dict()``, joints and drive targets come from ManiSkill's batched tensors. So
-what is shown is what the author's code sees, on the CPU as on a GPU, and not a second opinion of SAPIEN's.
-
-With ``obs_mode="state"`` the observation is one row of numbers, and which of forty is the cube's height is the
-first thing one asks. ManiSkill throws the names away when it flattens, so they are found by observing once
-more and not flattening: that runs the author's hooks, which may count or draw random numbers, hence it is done
-once a version of the task, and everything that the task remembers is put back afterwards.
-
-A task asks for the impulse on a body it knows (`contacts`); a person who wonders why the peg will not go in
-wants to see everything that touches anything. PhysX on the CPU has that list, and ManiSkill gives it for a
-single env only (``scene.get_contacts()``). Here it is read for one env at a time, with the names under which
-the rest of the workbench shows the bodies; the other envs cost nothing.
-
-A contact here is what PhysX calls one: two collision *shapes* that are nearer than their contact offsets
-(1 cm each unless the task says otherwise). So a pair of bodies may come more than once, and a contact with a
-positive `separation` and no impulse is two shapes that are near and do not touch.
-"""
+"""Reads one env: observation, state dict, joints and contacts."""
 
 from __future__ import annotations
 
@@ -48,7 +29,8 @@ MOST_VALUES = 64
 def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
     """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
 
-    Costs about 1 ms a section for a Panda on a table, and does not change how the episode goes on.
+    The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's batched
+    tensors. Costs about 1 ms a section for a Panda on a table, and does not change how the episode goes on.
 
     Raises:
         IndexError: there is no such env.
@@ -208,7 +190,11 @@ def _floats(value: torch.Tensor) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Contact:
-    """One pair of shapes in the last substep, with K points; float32, the env's own world frame."""
+    """One pair of collision shapes in the last substep, with K points; float32, the env's own world frame.
+
+    PhysX lists two shapes that are nearer than their contact offsets (1 cm each by default). So a pair of bodies may come
+    more than once, and a positive `separation` without an impulse means near, not touching.
+    """
 
     bodies: tuple[str, str]
     """Names as in `SceneIndex.names`; the name of the ``sapien.Entity`` for what ManiSkill does not manage."""
@@ -236,6 +222,8 @@ class Contact:
 
 def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
     """All contacts of one env in its last substep, ordered by their bodies' names, then by their points.
+
+    Stock ManiSkill has this for a single env only (``scene.get_contacts()``). Only the chosen env is read.
 
     (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
 

@@ -1,8 +1,4 @@
-"""What one env looks like from inside, as plain data that crosses the pipe.
-
-The functions that ask ManiSkill and SAPIEN are in `inspect_env`, so that whoever only shows this need not import
-a simulator. All of it is of one env: what is shown of a batch in full is read by nobody.
-"""
+"""State of one env for a person, as plain data without a simulator."""
 
 from __future__ import annotations
 

@@ -1,15 +1,4 @@
-"""What of a recorded episode it takes to live through it again, and how far apart two poses are: plain arrays.
-
-Whoever reads a recording need not know an env, and the env need not know files: between them goes this. State 0 is
-the reset; action t leads to state t + 1.
-
-How the state columns of a batch are named (`state_columns` makes them), for whoever takes them apart without torch.
-
-Whoever replays a recording makes the env anew: ManiSkill's ``replay_trajectory`` by
-``gym.make(env_id, **env_kwargs)``, the workbench by its own ``make``. What decides how an episode goes is the robot,
-the modes and the task's own arguments; how many envs stand beside each other, on which device, and what draws them, is
-up to who makes it again.
-"""
+"""A recorded episode as plain arrays, the names of its columns, and the keywords that remake its env."""
 
 from __future__ import annotations
 
@@ -27,7 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """T actions of one env, and its T + 1 states as far as they were recorded."""
+    """T actions of one env, and its T + 1 states as far as they were recorded.
+
+    State 0 is the reset; action t leads to state t + 1.
+    """
 
     name: str
     """What a person calls it."""
@@ -107,7 +99,10 @@ HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
-    """What `env` was made with (`given`) and the modes that it took; what JSON cannot say is left out."""
+    """Keywords of ``gym.make`` that make `env` again: those `given` and the modes it took, as far as JSON holds them.
+
+    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. `HOW_IT_IS_RUN` is left to whoever replays.
+    """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if env.agent is not None and isinstance(env.control_mode, str):
         modes["control_mode"] = env.control_mode

@@ -1,14 +1,4 @@
-"""A recorded state put into an env that runs, and how far an env is from a recorded state.
-
-What a recording keeps of a state is what ManiSkill's ``get_state_dict`` gives: by the names of actors and
-articulations, poses, velocities and joints. The env it is put into may be of other code: an actor gone, one renamed,
-an arm with another joint. So everything is matched by name and shape, what matches is put back with ManiSkill's own
-setters (the same rows, the same device), and what does not is told by name with the reason.
-
-Controllers stand outside of that dict unless they keep a target of their own. Without one they are left as a reset
-leaves them, but at the joints as they are now, and so are the drive targets: else the first thing that a restored
-robot did would be to run to where it stood before.
-"""
+"""Writes a recorded state into a running env, and measures how far an env is from one."""
 
 from __future__ import annotations
 
@@ -57,8 +47,11 @@ def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, s
 
 
 def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
-    """Put a recorded state into each of these envs, but for its `misfits`. The others are not touched, and the
-    tensors are fetched."""
+    """Put a recorded state into each of these envs, except its `misfits`; the other envs are not touched.
+
+    The env may be of other code (an actor gone, an arm with another joint), so states are matched by name and shape and
+    written by ManiSkill's own setters. Fetches the tensors.
+    """
     missed = {i: misfits(env, i, state) for i, state in states.items()}
     for name, struct in scene_index(env).states.items():
         fitting = [
@@ -73,7 +66,11 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
 
 
 def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
-    """Let controllers and drive targets of these envs' robots be where the joints are."""
+    """Set controllers and drive targets of these envs' robots to the present joint positions.
+
+    ``get_state_dict`` has controllers only if they keep a target of their own. The others would drive a restored robot
+    back to where it stood before.
+    """
     chosen = [int(i) for i in env_idx]
     if env.agent is None or not chosen:
         return

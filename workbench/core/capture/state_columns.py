@@ -1,18 +1,4 @@
-"""What a recording keeps of every env beside its poses: the simulation's state and the state observation, as columns.
-
-A dataset is asked for both: the observation is what a policy is trained on, and the state is what puts an episode back
-(``env.set_state_dict``). ManiSkill has them as nested dicts of tensors; what crosses a pipe and lands in a file is
-flat and numpy. So here they become one dict of arrays with names: ``state/actors/cube`` (N, 13),
-``state/articulations/panda`` (N, 13 + 2 * joints), both as ``get_state_dict`` lays them out, and ``obs/agent/qpos`` (N, ...)
-by the names that the task gave them.
-
-Three things are not as they are in ManiSkill. What only some envs have is NaN in the others (there the tensor has
-fewer rows than envs, and ``RecordEpisode`` records no state at all). A flattened observation (``obs_mode="state"``) is
-taken apart by the names that it was flattened from, where they can be told; else it is one array, ``obs/``. And
-pictures are left out: a recording has its own, of all cameras, encoded.
-
-On a GPU each tensor that is fetched by itself waits for the device; so all of them go in one copy.
-"""
+"""Simulation state and state observation of all envs, as named columns for a recording."""
 
 from __future__ import annotations
 
@@ -40,6 +26,11 @@ _PICTURES = ("sensor_data", "sensor_param", "pointcloud")
 
 def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     """The columns of the present moment, (N, ...) each; copies. About 0.1 ms for 16 PickCube envs.
+
+    ``state/actors/cube`` (N, 13) and ``state/articulations/panda`` (N, 13 + 2 * joints) as ``get_state_dict`` lays them
+    out, ``obs/agent/qpos`` (N, ...) by the task's names. Other than in ManiSkill: what an env lacks is NaN (ManiSkill's
+    tensor has fewer rows, and ``RecordEpisode`` records no state); a flattened observation is split by its names, or is
+    one column ``obs/`` where they are not known; pictures are left out, since a recording has its own.
 
     Raises:
         Exception: whatever a ``get_state_dict`` of the author's own raises.
@@ -114,6 +105,7 @@ def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
 
 
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
+    """On the host, in one copy a dtype: on a GPU each single fetch waits for the device."""
     if device.type == "cpu":
         # What is an array already was made for this.
         return {
@@ -146,7 +138,11 @@ _layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...
 
 
 def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
-    """Name, shape and dtype of each part of a flattened observation (N, D), or None if they cannot be told."""
+    """Name, shape and dtype of each part of a flattened observation (N, D), or None if they are not known.
+
+    ManiSkill drops the names, so the env is observed once more without flattening. That runs the author's hooks, which
+    may count or draw: it is done once a version of the task, and what the task remembers is restored.
+    """
     env = task.env
     if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:
         return None

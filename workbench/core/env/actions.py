@@ -1,9 +1,4 @@
-"""The action of a task as one flat vector with names, bounds and a value that means "hold still".
-
-ManiSkill's action space is a box without names, or for several robots a dict of boxes. A person who
-moves sliders needs to know that dimension 7 is the gripper; and "hold still" is not zero: zero is a
-half-open gripper, and for absolute joint control it is a pose at the middle of the joint limits.
-"""
+"""The action of a task as a flat vector with names, bounds and a hold value."""
 
 from __future__ import annotations
 
@@ -93,7 +88,7 @@ def random_action(
 def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.float32]:
     """(N, A) the action that leaves every joint where it is, as far as the controllers can say.
 
-    Delta and velocity controllers: zero. Absolute joint position: the present qpos, through the
+    Zero is not that: it is a half-open gripper, and in absolute joint control the middle of the limits. Delta and velocity controllers: zero. Absolute joint position: the present qpos, through the
     inverse of ManiSkill's ``clip_and_scale_action``. Absolute end-effector pose: zero, since its
     inverse would need the controller's frame; such a robot is better held by ``step(None)``.
     """

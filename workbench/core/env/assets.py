@@ -1,15 +1,4 @@
-"""Robots, objects and scenes that must be downloaded first: say which and how; never ask, never fetch.
-
-A task says only in part what it needs: some name it in ``asset_download_ids``, a robot names its own,
-and the scene datasets name nothing and fail on a file that is not there, in the middle of building. Where
-ManiSkill notices, it asks "download now? (y|n)" on standard input, leaves the process with ``exit()`` when
-the answer is no, and takes the environment variable MS_SKIP_ASSET_DOWNLOAD_PROMPT for a yes. A worker has no
-standard input, and nobody asked for gigabytes.
-
-So what is known beforehand is checked beforehand, and while the task is built every question, every
-download and every missing file becomes one error that names the asset and the command. The name is
-looked up: ManiSkill's table of downloads says where each is kept, and the missing path lies within.
-"""
+"""Assets that a task needs and that are not downloaded: named, never fetched."""
 
 from __future__ import annotations
 
@@ -82,11 +71,12 @@ def assets_at(path: str | Path) -> list[str]:
 
 @contextmanager
 def refuse_downloads(task: str) -> Iterator[None]:
-    """While this is on, whatever `task` still has to be downloaded for raises MissingAssets.
+    """Within this, an asset that `task` still needs raises MissingAssets.
 
-    ManiSkill's question is not asked and its download not begun, whatever the environment variable says.
-    An exception about a file that is not there, where a download would have put it, becomes the cause of
-    a MissingAssets; every other exception passes.
+    Some tasks declare nothing and fail on a missing file while they build. Where ManiSkill notices, it asks "download now?
+    (y|n)" on standard input, calls ``exit()`` on a no, and takes MS_SKIP_ASSET_DOWNLOAD_PROMPT for a yes. Here nothing is
+    asked or downloaded. An exception about a missing file that a download would provide becomes the cause of a
+    MissingAssets; other exceptions pass.
     """
 
     def ask(message: str) -> bool:

@@ -1,22 +1,4 @@
-"""A ManiSkill task class made to run N envs on the CPU.
-
-ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU, and its refusal is four small things: the name of
-the simulation backend, one ``is_cuda()``, the scene that ``_setup_scene`` builds, and how cameras are
-grouped. `batched_class` puts a mixin in front of the task class that answers those four, so the
-author's class is used as it is, and stock ``gym.make`` stays stock.
-
-Each env gets its own ``PhysxCpuSystem`` and its own ``RenderSystem``: exact (nothing of a neighbour can
-reach it), and a picture of env i renders env i alone.
-
-How many PhysX scenes a process can hold, told before it is too late.
-
-Each PhysX scene takes one of the process's thread-local keys (``PxTlsAlloc`` in PhysX's NpScene), of which Linux
-has 1024 (``PTHREAD_KEYS_MAX``); some twenty are taken once SAPIEN and torch are imported. Who takes the last one
-kills the process in native code, at whatever asks for a key next: "Couldn't create autoTSSkey mapping". So
-the free keys are counted, by taking all and giving them back, before the scenes of a batch are made.
-
-A constructor that leaves out its parent's: found by what is missing after it, and told at its ``def``.
-"""
+"""Task classes with N envs on the CPU, each with its own PhysX scene and render system."""
 
 from __future__ import annotations
 
@@ -167,7 +149,13 @@ class BatchedCpuScene(ManiSkillScene):
 
 
 class BatchedCpuMixin:
-    """Goes in front of a task class; see the module's text."""
+    """Batched CPU simulation of a task class, as the first of its bases.
+
+    ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU in four places: the name of the simulation backend, one
+    ``is_cuda()``, the scene that ``_setup_scene`` builds, and the groups of cameras. This mixin answers those four; the
+    author's class and stock ``gym.make`` stay as they are. Each env has its own ``PhysxCpuSystem`` and ``RenderSystem``, so
+    no neighbour can reach it, and a picture of env i renders env i alone.
+    """
 
     num_envs: int
     _system_class = BatchedCpuSystem
@@ -357,7 +345,12 @@ def require_scenes(count: int) -> None:
 
 
 def free_thread_keys() -> int | None:
-    """How many more ``pthread_key_create`` would give; None where there is no such limit to find out."""
+    """How many more thread-local keys this process can take; None where no limit is known.
+
+    Each PhysX scene takes one (``PxTlsAlloc`` in PhysX's NpScene). Linux has 1024 (``PTHREAD_KEYS_MAX``), some twenty are
+    taken once SAPIEN and torch are imported. Without a free one the process dies in native code: "Couldn't create
+    autoTSSkey mapping". They are counted by taking all and giving them back.
+    """
     if not sys.platform.startswith("linux"):
         return None
     library = ctypes.CDLL(None)
@@ -373,7 +366,7 @@ def free_thread_keys() -> int | None:
 
 
 class ForgottenInit(RuntimeError):
-    """Without it nothing is there, and the first use of anything fails far away ("weak reference to 'NoneType'")."""
+    """A constructor did not call its parent's; the first use would fail far away ("weak reference to 'NoneType'")."""
 
     def __init__(self, message: str, place: Place | None) -> None:
         super().__init__(message)

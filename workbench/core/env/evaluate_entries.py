@@ -1,19 +1,4 @@
-"""What ``evaluate()`` returned, split into columns with a row for each env and everything else.
-
-ManiSkill looks at ``success`` and ``fail`` alone and passes the rest of the dict on as it is: None, a string, a number,
-``progress.mean()``, a nested dict, an object of the task's own. Everything above the core reads the two halves that are
-made here, and never the dict.
-
-An entry is *per env* if it is a tensor, an array or a list whose first dimension has the length N. So with one env a tensor of
-shape (1,) is, and one of shape () is not; only ``success`` and ``fail`` of shape () are that one env's, as in ManiSkill. A
-nested dict is its leaves, named by the keys that lead to them.
-
-What is wrong with what a task's hooks return, in words; None where nothing is.
-
-ManiSkill takes success, fail, rewards and observations for batched, a row for each env, and looks at none. The checks here are
-pure: they name a failing and leave it to the caller what that means (`strict` tells it, the page shows it
-at the ``def`` of the hook).
-"""
+"""Splits what ``evaluate()`` returned into rows per env and other entries; checks what hooks return."""
 
 from __future__ import annotations
 
@@ -59,7 +44,12 @@ _short.maxstring = _short.maxlong = _short.maxother = MOST_LETTERS
 
 
 def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
-    """The entries of `info` that are real numbers with a row for each env, (N, ...) each; and the others. All are copies."""
+    """The entries of `info` that are real numbers with a row for each env, (N, ...) each; and the others. All are copies.
+
+    ManiSkill reads ``success`` and ``fail`` alone and passes the rest on: None, a string, ``progress.mean()``, an object. A
+    tensor, array or list has rows if its first dimension is N: with one env, shape (1,) has and () has not, except for
+    ``success`` and ``fail``, as in ManiSkill. A nested dict is split into its leaves, named by their keys.
+    """
     columns: dict[str, NDArray] = {}
     others: dict[str, OtherEntry] = {}
     left_out = 0

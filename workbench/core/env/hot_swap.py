@@ -1,10 +1,4 @@
-"""New code on a live env: another class, or other cameras, and the scene as it was.
-
-What an env *is* lies in its attributes and in its scene; what it *does*, in its class. So an author's edited class
-can be put on an env that runs, in a microsecond and without moving a body, as long as nothing that the old class
-built would have been built otherwise (`workbench.authoring.reload.level` decides that). Cameras are the one part of a
-scene that can be taken out and made anew, since physics knows nothing of them.
-"""
+"""Exchanges the class or the cameras of a running env; its scene stays."""
 
 from __future__ import annotations
 
@@ -23,7 +17,7 @@ from workbench.core.snapshots.snapshot import in_this_state, restore_memory, res
 
 
 def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
-    """Let `env` go on as an env of `task`; its state, scene and attributes are untouched.
+    """Make `env` an env of `task`; state, scene and attributes stay. Takes a microsecond and moves no body.
 
     Args:
         env: an unwrapped env, batched on the CPU or on the GPU.

@@ -1,17 +1,4 @@
-"""Rows of other envs, in what a task keeps on itself, that a partial reset changed, and the line that did it.
-
-A task that is reset in part must change the rows of ``env_idx`` only: of tensors, arrays, lists and Poses on itself, in
-dicts and in objects of its own (`task_members` finds them). Nothing raises when it does not:
-``self.target = torch.rand((self.num_envs, 2))`` gives every env another target in the middle of its episode.
-
-Values are compared before and after, so that what was computed anew and came out the same is no fault. Where they
-differ, the author must be told the assignment: the line after which they were others, found by looking at them after
-each line of the author's while the reset runs. That is done in the first partial reset of a class, and again after one
-that found something without a line; a debugger that is there already is left its place, and `find_assignment` then reads
-the line off the source.
-
-A partial reset, watched for what it does to rows of other envs in what the task keeps on itself, and told of.
-"""
+"""Finds rows of other envs that a partial reset changed on the task, and the line that did it."""
 
 from __future__ import annotations
 
@@ -48,6 +35,11 @@ _ITEM = re.compile(r"\[(\d+)\]")
 
 class KeptRows:
     """What a task keeps for each env, as it is when this is made.
+
+    A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task, in dicts and in
+    objects of its own. Nothing raises when it does not: ``self.target = torch.rand((self.num_envs, 2))`` gives every env
+    another target in the middle of its episode. Values are compared, so a value computed again with the same result is no
+    fault.
 
     Args:
         env: In the middle of an episode.
@@ -171,7 +163,11 @@ def _same(a: Any, b: Any) -> bool:
 
 
 class _Lines:
-    """Looks at the rows after each line of the author's, and remembers after which they were others."""
+    """Compares the rows after each line of the author's code, and keeps the line after which they differ.
+
+    Done in the first partial resets of a class, and after one whose line was not found. If a debugger is already tracing,
+    `find_assignment` reads the line from the source instead.
+    """
 
     def __init__(self, rows: KeptRows) -> None:
         self.rows = rows

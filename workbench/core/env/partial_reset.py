@@ -1,20 +1,4 @@
-"""A reset of some envs that leaves the others alone, and says whose fault it is when it cannot.
-
-Two things go wrong in ``BaseEnv.reset(options={"env_idx": ...})`` that a single env never meets. First,
-ManiSkill 3.0.1 resets the controllers of every env: it sets the reset mask back to all ones and only then
-calls ``controller.reset()``, though each controller asks that mask which envs it may touch. A controller with
-``use_target`` drives towards a target that it remembers, so in each env that was *not* reset the target jumps
-to where the joints happen to be, and the env no longer does what it would do alone. So what the
-controllers of the other envs remember is kept aside and put back before the first observation.
-
-Second, many tasks have never been reset in part: a hook that makes ``num_envs`` rows where ``len(env_idx)``
-are wanted, or replaces a buffer of N rows by one of the subset's. The exception is then a torch message
-about sizes, often raised in a hook that is right. The traceback stays as it is, and gets a note that names the
-task's line and the buffers that shrank.
-
-Nor has ManiSkill one order of rows: its setters give them to the envs of a mask, lowest first, and a task its own
-as ``self.x[env_idx]``. So envs are reset in ascending order, in whichever they are named.
-"""
+"""Partial resets that leave the other envs alone."""
 
 from __future__ import annotations
 
@@ -39,7 +23,12 @@ _CORE = str(Path(__file__).parents[1])
 
 
 class KeptControllers:
-    """What the active controllers remember of some envs: start, target and whatever else has a row an env."""
+    """What the active controllers remember of some envs: start, target and all else with a row an env.
+
+    ManiSkill 3.0.1 resets the controllers of every env in a partial reset: it sets the reset mask back to all ones before
+    ``controller.reset()``, which asks that mask. A controller with ``use_target`` then takes the present joints as its
+    target in envs that are not reset. So their values are kept and put back before the first observation.
+    """
 
     def __init__(self, env: Any, kept_envs: list[int]) -> None:
         self._rows = torch.tensor(kept_envs, dtype=torch.long, device=env.device)
@@ -84,7 +73,10 @@ def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
 def in_ascending_order(
     options: dict[str, Any], seeds: Any, env: Any
 ) -> tuple[dict[str, Any], list[int] | None]:
-    """Options of a partial reset with the envs in ascending order, and with them what has a row for each as named.
+    """Options of a partial reset with the envs, and the rows that belong to them, in ascending order.
+
+    ManiSkill's setters give rows to the envs of a mask, lowest first, and a task writes ``self.x[env_idx]``: only in
+    ascending order both mean the same.
 
     Args:
         seeds: what ``reset`` is given.
@@ -130,7 +122,11 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 
 @contextmanager
 def told_whose_fault(env: Any, untouched: list[int]) -> Iterator[None]:
-    """Add a note to an exception that leaves a reset by way of the task's own code."""
+    """Add a note with the task's line, and the buffers that shrank, to an exception that a reset raises.
+
+    A hook that makes ``num_envs`` rows instead of ``len(env_idx)``, or replaces a buffer of N rows by the subset's, raises a
+    torch message about sizes, often in a hook that is right.
+    """
     chosen = sorted(set(range(env.num_envs)).difference(untouched))
     rows = KeptRows(env, chosen) if untouched else None
     try:

@@ -1,4 +1,4 @@
-"""What one control step of the whole batch gives, as plain arrays that can cross a pipe."""
+"""Result of one control step of the whole batch, as plain arrays."""
 
 from __future__ import annotations
 

@@ -1,22 +1,4 @@
-"""The rules, checked: what would go wrong on the GPU is told here, at the line that does it.
-
-The batched CPU core runs a task through the code that the GPU runs, so most mistakes that the GPU does not
-forgive stop here too. The rest are silent: a write that the next fetch takes back, a neighbour's episode
-changed by a partial reset, a reward of shape (). `rules` lists them, with what happens where one is broken:
-
-* state set and not applied, applied or read without a fetch after a step, links read before their
-  articulation's new qpos reached them (`strict_system`, at the line that wrote or read);
-* SAPIEN's own setters, which the GPU does not look at (`struct_access`, at the line that called);
-* in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or
-  changed in what the task keeps on itself (here; `kept_rows` finds the assignment);
-* returns of ``evaluate``, the reward and the observation hooks without a row for each env (`entries`).
-
-What the GPU refuses in any case (a pose of another batch size, a static actor moved, two applies without a
-fetch, state touched while the scene is loaded) is refused whatever the degree, see `struct_access`.
-
-Only what goes wrong is told, by comparing values: ManiSkill's own tasks hear nothing, but for those that
-break a rule (``tests/core/env/test_strict.py`` lists them).
-"""
+"""Checks the rules of GPU simulation while a task runs."""
 
 from __future__ import annotations
 
@@ -49,7 +31,22 @@ _REWARD_HOOK = {
 
 
 class StrictMixin:
-    """Goes in front of a batched task class; see the module's text."""
+    """Checks of the rules for a batched task class, as the first of its bases.
+
+    Most mistakes that the GPU does not forgive stop in the batched CPU core too. These are silent, and reported at the
+    author's line:
+
+    * state set and not applied, applied or read without a fetch after a step, links read before their articulation's new
+      qpos reached them (`strict_system`);
+    * SAPIEN's own setters, which the GPU ignores (`accessors`);
+    * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or changed (here,
+      and `kept_rows`);
+    * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`evaluate_entries`).
+
+    What the GPU refuses in any case (another batch size, a static actor moved, two applies without a fetch, state touched
+    while the scene loads) is refused at every degree, see `accessors`. Values are compared, so only what goes wrong is
+    reported; ``tests/core/env/test_strict.py`` lists the ManiSkill tasks that break a rule.
+    """
 
     num_envs: int
     scene: Any

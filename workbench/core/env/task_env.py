@@ -1,9 +1,4 @@
-"""A running task: N envs behind one small interface that gives plain arrays.
-
-Everything that shows, checks, records or replays a task asks here, and never ManiSkill itself. The
-class underneath is the author's own, made batched on the CPU (`cpu_scene`) or handed to ManiSkill's
-GPU simulation, and the caller need not know which.
-"""
+"""A running task: N envs behind one interface that gives plain arrays."""
 
 from __future__ import annotations
 
@@ -44,7 +39,7 @@ class EnvOptions:
 
     num_envs: int = 16
     backend: Backend = "auto"
-    """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU if it works."""
+    """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: see `choose_backend`."""
     render: bool = True
     """False makes no render system: no pictures, and nothing asked of a graphics driver."""
     threads: int | None = None
@@ -131,7 +126,7 @@ def default_reward_mode(task: type[BaseEnv]) -> str:
 
 
 class TaskEnv:
-    """N envs of one task: reset, step, and what they look like, in plain arrays."""
+    """N envs of one task, on the CPU or a GPU: reset, step and snapshots, in plain arrays."""
 
     def __init__(
         self,

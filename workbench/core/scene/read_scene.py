@@ -1,15 +1,4 @@
-"""From the render bodies of a built scene to `SceneGeometry`.
-
-SAPIEN holds a render body for every body of every env, with shapes (boxes, meshes from files, meshes
-made in code), each with parts, scale, local pose and material. A viewer wants each different thing
-once. So the scene is walked by cheap keys (file, scale, pose, colour), and triangles are read only
-for a key that is new: 16 envs of a Panda cost little more than one. What is read from files is kept,
-reduced (`mesh_detail`), for the life of the process, because a hot reload asks for it again.
-
-On a machine without any Vulkan driver there are no render bodies. The collision shapes are still
-there, and a grey robot that moves is worth far more than an empty page. Bodies without collision shapes (goal markers)
-do not appear then.
-"""
+"""Reads meshes, materials and instances of a built scene."""
 
 from __future__ import annotations
 
@@ -59,8 +48,12 @@ class Part:
 def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_TEXELS) -> SceneGeometry:
     """Meshes, materials and instances of all bodies of a scene.
 
+    The scene is walked by cheap keys (file, scale, pose, colour), and triangles are read only for a new key: 16 envs of a
+    Panda cost little more than one. Meshes from files are kept, reduced, for the life of the process, for the next reload.
+
     Bodies that are hidden now are included; `SceneGeometry.body_hidden` names those that the task
-    hides from its sensors. Without a render device the collision shapes are given, in grey.
+    hides from its sensors. Without a render device the collision shapes are given, in grey; bodies that have none (goal
+    markers) are missing then.
     """
     index = scene_index(env)
     walk = _RenderWalk(max_faces, max_texels)

@@ -1,15 +1,4 @@
-"""What a built scene is made of, found out once: its bodies, where their poses lie, and what has a state.
-
-A viewer, a recorder and a timeline each want the pose of every body of every env, thirty times a second. Asked one by
-one a body costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. So it is settled once a scene which row of which
-tensor belongs to which (env, body), and a frame is one gather from ``px.cuda_rigid_body_data``, where ManiSkill keeps
-poses in its GPU simulation and in our batched CPU one. Static bodies are not in it and do not move: theirs are kept here.
-
-Two things would make that array a lie. A body that is hidden from the sensors in GPU simulation has
-been moved 99999 m away (SAPIEN cannot switch off drawing there); its true pose is what ManiSkill kept
-aside (`hidden_poses`). And objects that differ from env to env (`Actor.merge`) are one body by the merged name, or
-every env would have its own column with NaN in all other rows.
-"""
+"""Bodies of a built scene, where their poses are, and which have a state."""
 
 from __future__ import annotations
 
@@ -45,7 +34,13 @@ def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
 
 @dataclass(frozen=True)
 class SceneIndex:
-    """The bodies of one built scene."""
+    """The bodies of one built scene.
+
+    Asked one by one a body's pose costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. Here it is found once which row of
+    ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is one gather. Static bodies are not in that
+    tensor: `fixed` has their poses. A hidden body was moved 99999 m away; `hidden_poses` has its true pose. Objects that
+    differ from env to env (`Actor.merge`) are one body by the merged name.
+    """
 
     names: tuple[str, ...]
     """(B,) an actor's name, or ``articulation/link``; unique."""

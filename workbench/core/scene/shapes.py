@@ -1,21 +1,4 @@
-"""What the environments look like: shapes with materials, and which body of which env wears which.
-
-A viewer needs three things that ManiSkill keeps in three places: the list of bodies (actors,
-links, merged views of them), the meshes and materials that hang on each, and one array of poses a
-frame. The idea is to settle the first two once, when a scene is built, so that a frame is nothing
-but one array: ``poses[env, body] = [x, y, z, qw, qx, qy, qz]`` in the env's own world frame
-(metres, z up, quaternion wxyz). A body that an env does not have (``scene_idxs``) holds NaN there.
-
-Shapes that are equal (same triangles, same material) are one `Visual` with many instances, because
-a browser draws a thousand instances of one mesh as quickly as one, and is unusable with one node a
-body.
-
-Shapes that look the same, kept once, wherever they were read.
-
-Recordings of one task hold the same robot and the same table each; a texture is some megabytes, and sixty recordings
-that are open side by side would be half a gigabyte of them. What looks the same is known by a digest of all that is
-seen of it.
-"""
+"""Shapes of the envs: meshes with materials, and the bodies that have them."""
 
 from __future__ import annotations
 
@@ -86,7 +69,12 @@ class Visual:
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """Everything about a scene that does not change from frame to frame."""
+    """Everything about a scene that does not change from frame to frame.
+
+    A frame is one array, ``poses[env, body] = [x, y, z, qw, qx, qy, qz]`` in the env's own world frame (metres, z up, quaternion
+    wxyz), NaN for a body that an env does not have. Equal shapes are one `Visual` with many instances: a browser draws a
+    thousand instances of one mesh as fast as one, and is unusable with one node a body.
+    """
 
     num_envs: int
     body_names: tuple[str, ...]
@@ -115,7 +103,10 @@ def fingerprint(visuals: tuple[Visual, ...]) -> str:
 
 
 class SharedShapes:
-    """What was read so far. Not thread-safe."""
+    """Shapes that look the same, kept once, by a digest of all that is seen of them. Not thread-safe.
+
+    A texture is some megabytes: sixty open recordings of one task would hold half a gigabyte.
+    """
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[Mesh, Material]] = {}

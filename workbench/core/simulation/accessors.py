@@ -1,25 +1,4 @@
-"""ManiSkill's setters and getters of state, with words for what goes wrong in them.
-
-In GPU simulation, and so here, the setter of an Actor writes the rows of the envs that are being reset,
-and a value of another batch size stops in torch: "shape mismatch: value tensor of shape [4, 7] cannot be
-broadcast to indexing result of shape [2, 7]". That names no actor and no reset. A static actor stops in
-an assertion, its velocity in a KeyError. The setters are therefore wrapped, once a process: the
-error comes from the author's own call, names the object, and says what batch was wanted. A stock scene
-gets the stock setter and nothing else.
-
-Where rules are checked, `StrictCpuSystem` is told of every read and write besides.
-
-SAPIEN's own setters of state, which the GPU's simulation does not look at.
-
-``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env. In GPU simulation the state lives
-on the GPU, and the call changes an object that nobody reads. Here SAPIEN's objects are the
-simulation, so the call would work, and the task that was tried out would not be the task that trains.
-Where rules are checked, these setters tell of it, at the author's line.
-
-SAPIEN's classes are shared by all scenes of a process: the setters are replaced once, when the first
-scene with rules is built, and do what they did for every object that belongs to none, before a
-scene is complete, and when the core itself calls them.
-"""
+"""Wraps ManiSkill's and SAPIEN's state setters and getters with clear errors and rule checks."""
 
 from __future__ import annotations
 
@@ -70,7 +49,12 @@ TARGET_SETTERS = ("set_joint_drive_targets", "set_joint_drive_velocity_targets")
 
 @cache
 def install_struct_access() -> None:
-    """Put the words into ManiSkill's setters and getters. Safe to call again."""
+    """Wrap ManiSkill's setters and getters of state, once a process; a stock scene gets the stock code.
+
+    A value of another batch size stops in torch ("shape mismatch: value tensor of shape [4, 7] cannot be broadcast to indexing
+    result of shape [2, 7]"), a static actor in an assertion, its velocity in a KeyError. The wrappers raise from the author's
+    call, name the object and the batch that is expected, and report each read and write to a `StrictCpuSystem`.
+    """
     for owner, name, group in STATE_PROPERTIES:
         stock: property = owner.__dict__[name]
         getter = _told_reads(stock.fget, name, group)  # type: ignore[arg-type]
@@ -208,7 +192,12 @@ _strict_systems: weakref.WeakSet[StrictCpuSystem] = weakref.WeakSet()
 
 
 def guard_scenes(system: StrictCpuSystem) -> None:
-    """Let the setters of what is in the scenes of `system` raise, once it is laid out."""
+    """Report SAPIEN's own setters of state in the scenes of `system`, once it is laid out.
+
+    ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env and does nothing in GPU simulation. SAPIEN's classes are
+    shared by all scenes of a process: the setters are replaced once, and do as before for objects of other scenes, before a
+    scene is complete, and when the core calls them.
+    """
     _install()
     _strict_systems.add(system)
 

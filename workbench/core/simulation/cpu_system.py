@@ -1,21 +1,4 @@
-"""N CPU physics systems behind the interface of one GPU system.
-
-ManiSkill's GPU code never touches CUDA itself. It talks to one object, ``scene.px``, through
-tensors (``cuda_rigid_body_data``, ``cuda_articulation_qpos`` ...) that it reads after
-``gpu_fetch_*`` and writes before ``gpu_apply_*``. `BatchedCpuSystem` has that interface over N
-separate ``PhysxCpuSystem``s with CPU tensors, so every task runs batched on the CPU through the code
-path that the GPU uses: partial resets, reset masks and all. Each env has its own PhysX scene, so env
-i is exactly what ManiSkill's single CPU env would be, whatever its neighbours do.
-
-What makes it quick:
-
-* A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us)
-  and one gather by index over all envs; a Python getter costs 2 us *a body*. The layout of those
-  bytes is not documented, so it is checked against the getters when the scene is built.
-* An apply writes only what differs from the last fetch: a partial reset touches the bodies of the
-  envs that are reset and wakes nobody else.
-* What few tasks read (link velocities, joint accelerations, joint forces) is fetched when asked for.
-"""
+"""N CPU physics systems behind the interface of one GPU system."""
 
 from __future__ import annotations
 
@@ -75,7 +58,16 @@ def _applies(mirror: str, keep_awake: bool = False) -> Callable[..., None]:
 
 
 class BatchedCpuSystem:
-    """What ManiSkill calls ``scene.px``, over N CPU systems.
+    """What ManiSkill calls ``scene.px``, over N separate ``PhysxCpuSystem``s with CPU tensors.
+
+    ManiSkill's GPU code talks to ``scene.px`` alone: it reads tensors (``cuda_rigid_body_data`` ...) after ``gpu_fetch_*`` and
+    writes them before ``gpu_apply_*``. So every task runs here through the code path of the GPU, partial resets and reset masks
+    included, and env i is what ManiSkill's single CPU env would be.
+
+    * A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us) and one gather over all
+      envs; a Python getter costs 2 us *a body*.
+    * An apply writes only what differs from the last fetch: a partial reset wakes no body of another env.
+    * Link velocities, joint accelerations and joint forces are fetched when they are read: few tasks do.
 
     Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
     D the largest number of degrees of freedom. Poses are world poses of each env's own frame.

@@ -1,11 +1,4 @@
-"""Drawing bodies elsewhere than they stand: where ManiSkill's tensors have them, or where they stood in the past.
-
-ManiSkill's GPU cameras draw the very tensor that poses are written to (``RenderSystemGroup.set_cuda_poses``): every
-dynamic and kinematic actor and every link at its own row, applied or not, and cameras on them likewise. A pose that
-was set in ``evaluate`` is seen and never felt; a body that moved in a step is drawn where it was until the fetch.
-SAPIEN's CPU renderer draws its entities, which know nothing of the tensor. So what the tensor has elsewhere is found
-before each picture, and only what is drawn is moved there: physics does not notice. Static bodies have no row.
-"""
+"""Draws bodies elsewhere than SAPIEN has them, without moving them."""
 
 from __future__ import annotations
 
@@ -28,8 +21,12 @@ NOWHERE_ELSE: Places = {}
 def bodies_elsewhere(
     scenes: Sequence[sapien.Scene], layout: Layout, data: NDArray[np.float32], envs: Sequence[int]
 ) -> dict[int, Places]:
-    """The bodies whose row of the tensor is not where SAPIEN draws them: of each of these envs that has such, where the
-    tensor has them.
+    """By env, the bodies that the tensor has elsewhere than SAPIEN, and where; envs without such are left out.
+
+    ManiSkill's GPU cameras draw the tensor that poses are written to (``RenderSystemGroup.set_cuda_poses``), applied or not: a
+    pose set in ``evaluate`` is seen and never felt, and a body that moved in a step is drawn where it was until the fetch.
+    SAPIEN's CPU renderer draws its entities. Before each picture what differs is therefore moved, in what is drawn only.
+    Static bodies have no row.
 
     Args:
         data: (R, 13) what ManiSkill calls ``cuda_rigid_body_data``.

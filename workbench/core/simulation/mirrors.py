@@ -1,4 +1,4 @@
-"""The tensors that tasks write to, each beside what the simulation is known to hold of it."""
+"""Tensors that tasks write to, each with what the simulation holds."""
 
 from __future__ import annotations
 

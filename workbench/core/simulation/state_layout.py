@@ -1,14 +1,4 @@
-"""Where the state of N CPU physics systems lies: rows of the batch's tensors, and bytes of the packs.
-
-``PhysxCpuSystem.pack()`` gives the state of one env as float32: each dynamic or kinematic body as
-quaternion wxyz, position, linear and angular velocity; then each articulation as the same 13 numbers of
-its root, its qpos, its qvel, and target position and target velocity of each joint in turn.
-``sapien.Scene.pack_poses()`` gives quaternion and position of each entity. Neither is documented (found
-by measuring, sapien 3.0.3); so `check_layout` compares both with the getters when a scene is built.
-
-The envs need not be alike: the rows of one follow those of the other, and where an articulation has
-fewer joints than the widest, the padding reads a zero.
-"""
+"""Where the state of N CPU physics systems is: rows of tensors, and bytes of packs."""
 
 from __future__ import annotations
 
@@ -32,7 +22,14 @@ _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything lies: rows of the tensors, and positions in the concatenated packs."""
+    """Rows in the tensors, and positions in the concatenated packs.
+
+    ``PhysxCpuSystem.pack()`` gives float32: each dynamic or kinematic body as quaternion wxyz, position, linear and angular
+    velocity; then each articulation as the same 13 numbers of its root, its qpos, its qvel, and target position and target
+    velocity of each joint in turn. ``sapien.Scene.pack_poses()`` gives quaternion and position of each entity. Neither is
+    documented (found by measuring, sapien 3.0.3), so `check_layout` compares both with the getters. Envs need not be alike:
+    rows of one follow those of the other, and missing joints read a zero.
+    """
 
     bodies: list[Any]
     """PhysxRigidDynamicComponent. Any, here and below: SAPIEN's stubs want arrays of a literal shape."""

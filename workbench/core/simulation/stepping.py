@@ -1,45 +1,4 @@
-"""Stepping N physics systems: all cores, and one system's substeps in a row where nothing comes between.
-
-What was measured (PickCube-v1, 64 envs, two cores, physics part of a control step of five substeps; the bits
-are the same in every row, ``tests/core/simulation/test_stepping.py``):
-
-    one thread, env after env, substep after substep        24 ms
-    two threads                                             14 ms
-    one thread, the five substeps of an env in a row        17 ms
-    two threads, the five substeps in a row                  9 ms
-
-*Threads*, not processes: SAPIEN holds the interpreter lock in ``step()``, and `native_step` passes that by, so
-systems need not be forked, nor their state copied to and fro, and everything that a task does to its SAPIEN
-objects (masses, drive properties, friction) stays as true as in one thread. One system shared by all envs with
-PhysX's own threads was not chosen: it needs the envs kept metres apart, which costs float precision.
-
-*In a row*: a system of one Panda, table and cube touches some hundreds of kB, and walking through all
-envs for every substep throws each out of the cache before it is used again. ManiSkill's control step runs
-hooks between substeps, so their order is only changed when no hook can tell (`merging`, asked by
-`cpu_scene` for each control step).
-
-Each env's state is packed by the thread that just stepped it, while it is in that core's cache: the fetch that
-follows finds the bytes ready (12 us an env cold, 3 us warm).
-
-``PhysxCpuSystem.step()`` keeps the lock for as long as it runs: a second Python thread makes no
-progress, so threads over N systems gain nothing. The systems themselves are independent, and PhysX allows
-scenes to be simulated at once from several threads. What stands in between is only the binding, so it is
-passed by: SAPIEN's shared library exports the C++ method behind ``step()``, and ctypes gives the lock
-back while it runs. The bits are those of ``step()``, since it is the same code on the same object.
-
-The address of the C++ object comes from pybind11's own door for other libraries,
-``_pybind11_conduit_v1_`` (pybind11 2.14, "Allowing extensions of one binding to use another's objects"),
-which checks the ABI and the C++ type and gives nothing when either differs. The exported names are those
-of sapien 3.0.3 on Linux; ``tests/core/simulation/test_native_step.py`` names each of them. Where one is missing,
-`why_not_native` says which, and the systems are stepped by SAPIEN's own binding, one after the other.
-
-The envs of a batch cost unequal time (one rests, one is full of contacts), and a share dealt out
-beforehand makes every thread wait for the unluckiest. So all threads, the caller's too, take the next env
-from one iterator until it is empty; ``next`` on a list iterator is atomic under the interpreter lock.
-``concurrent.futures`` would cost a queue, a future and a condition an env; here a call costs two locks a
-thread (measured: the step of 16 Pandas on two cores takes 2.6 ms with this and 4.0 ms with an executor of
-two, 4.8 ms in one thread).
-"""
+"""Steps N physics systems on all cores, without the interpreter lock."""
 
 from __future__ import annotations
 
@@ -56,7 +15,25 @@ import sapien.physx as physx
 
 
 class Stepper:
-    """Substeps of N systems, done when they are needed."""
+    """Substeps of N systems, done when they are needed.
+
+    PickCube-v1, 64 envs, two cores, physics part of a control step of five substeps (the bits are the same in every row,
+    ``tests/core/simulation/test_stepping.py``):
+
+        one thread, env after env, substep after substep        24 ms
+        two threads                                             14 ms
+        one thread, the five substeps of an env in a row        17 ms
+        two threads, the five substeps in a row                  9 ms
+
+    *Threads*, not processes: `native_step` frees the interpreter lock, so no system is forked or copied, and what a task does
+    to its SAPIEN objects stays true. One system for all envs with PhysX's own threads would need the envs metres apart, which
+    costs float precision.
+
+    *In a row*: a Panda, table and cube touch some hundreds of kB, which a walk through all envs throws out of the cache.
+    ManiSkill runs hooks between substeps, so their order changes only when no hook can tell (`merging`).
+
+    The thread that stepped an env also packs it, while it is in that core's cache (12 us cold, 3 us warm).
+    """
 
     def __init__(
         self,
@@ -181,7 +158,15 @@ PLATFORM_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
 
 @dataclass(frozen=True)
 class NativeStep:
-    """The C++ method, and what is needed to find the object to call it on."""
+    """The C++ method behind ``PhysxCpuSystem.step()``, and what finds the object to call it on.
+
+    ``step()`` holds the interpreter lock, so threads over independent systems gain nothing. SAPIEN's shared library exports
+    the C++ method, and ctypes frees the lock while it runs: the same code on the same object. The object's address comes
+    from ``_pybind11_conduit_v1_`` (pybind11 2.14, "Allowing extensions of one binding to use another's objects"), which
+    checks ABI and C++ type. The exported names are those of sapien 3.0.3 on Linux
+    (``tests/core/simulation/test_native_step.py``). If one is missing, `why_not_native` says which, and SAPIEN's own
+    binding steps the systems one after the other.
+    """
 
     call: Callable[[int], None]
     """Steps the system at this address once; the interpreter lock is free while it runs."""
@@ -246,7 +231,12 @@ def usable_cores() -> int:
 
 
 class EnvThreads:
-    """Threads that wait for `run`; one run at a time."""
+    """Threads that wait for `run`; one run at a time.
+
+    Envs cost unequal time, so all threads, the caller's too, take the next env from one iterator; ``next`` on a list
+    iterator is atomic under the interpreter lock. (16 Pandas on two cores: 2.6 ms, with a ``concurrent.futures`` executor of
+    two 4.0 ms, in one thread 4.8 ms.)
+    """
 
     def __init__(self) -> None:
         self._busy = threading.Lock()

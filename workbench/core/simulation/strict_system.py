@@ -1,23 +1,4 @@
-"""A batched CPU system that notices what would be lost, or overwritten, on the GPU.
-
-On the GPU the tensors are a copy of the simulation: ``gpu_fetch_*`` writes them over with what the
-simulation holds, ``gpu_apply_*`` writes the simulation over with what they hold, both for all envs and
-both without a word. So a pose that was set and not applied is gone after the next fetch, an apply after a
-step without a fetch puts every body of every env back to where it was, and a read between the two
-gives the past. `BatchedCpuSystem` does the first and the last as the GPU does, and is kinder about the
-second; this one tells of all three. Where the rule only warns, what it does is what that one does, bit for bit.
-
-It compares values and not calls, so that what changes nothing is no fault: a pose set to what it was, an
-apply of bodies that have not moved. Where the setters of ManiSkill's structs were called from
-is kept until the write is applied (`Writes`): the fault is told at the line that wrote, though it shows
-only at the fetch.
-
-Who wrote to the tensors of the simulation, for as long as the write may still be lost.
-
-That a write is lost shows at the fetch after it, which is nobody's fault. So each write is kept with the frames that
-led to it until its group of tensors is fetched or applied, and what goes wrong then is told at the line that wrote. A
-task may also take a whole tensor and write to it where nobody sees: then whoever took it is the one to name.
-"""
+"""A batched CPU system that reports what would be lost or overwritten on the GPU."""
 
 from __future__ import annotations
 
@@ -62,7 +43,11 @@ class _Write:
 
 
 class Writes:
-    """Those that were neither applied nor fetched over."""
+    """Writes that were neither applied nor fetched over, each with the frames that led to it.
+
+    A lost write shows at the next fetch, and is reported at the line that wrote. A task may also take a whole tensor and
+    write to it unseen: then the line that took it is reported.
+    """
 
     def __init__(self) -> None:
         self._kept: list[_Write] = []
@@ -103,7 +88,14 @@ _MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
 
 
 class StrictCpuSystem(BatchedCpuSystem):
-    """See the module's text."""
+    """A `BatchedCpuSystem` that reports breaches of the rules of GPU simulation.
+
+    On the GPU ``gpu_fetch_*`` overwrites the tensors and ``gpu_apply_*`` the simulation, for all envs and without a word. So a
+    pose that was set and not applied is lost at the next fetch, an apply after a step without a fetch puts every body of
+    every env back, and a read between the two gives the past. `BatchedCpuSystem` does the first and the last as the GPU
+    does; this class reports all three, and changes no bit where a rule only warns. It compares values, not calls: a pose set
+    to what it was is no fault.
+    """
 
     rules: BrokenRules
     """What a broken rule is told to; of the env, so that it outlives a scene."""

@@ -1,38 +1,4 @@
-"""The simulation state of chosen envs of a `BatchedCpuSystem`: read, and written into the same or other envs.
-
-``PhysxCpuSystem.pack()`` has the pose and velocity of every body, qpos, qvel and the drive targets of an
-env, and ``unpack()`` writes them; after a control step the bytes are there already. What is added here:
-
-* *Names.* The bytes of two envs mean the same only if the envs are built alike. `Contents` says what
-  they mean, by the names that the rest of the workbench uses; where they differ (another task, an object more,
-  an arm with another joint), the bytes for the target are put together from its own and the source's.
-* *Sleep.* Writing a pose wakes a body, and a body at rest that wakes moves by some micrometres before it
-  sleeps again. What slept is put to sleep again. Every body is asked, 2 us each: a velocity in the pack does
-  not mean that one is awake (cubes of StackCube fall asleep with some left, and keep it).
-* *Forces* that ``set_qf`` left on the joints, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
-* *Contacts.* PhysX lists contacts of the last substep only, so after a restore its list is that of another
-  moment, and ``is_grasping`` would answer for it. The impulses that the task's queries count go along, and are
-  what the queries see until the next substep.
-* *Hidden objects* are drawn 99999 m away; it is their true pose that is kept.
-
-``unpack`` does not quite give back the bits that ``pack`` gave (`_settle_roots`). What PhysX keeps to itself
-is described in `snapshot`, and below.
-
-A new PhysX scene under an env that stays: the one way to make PhysX forget what it did before.
-
-PhysX solves contacts one after the other, and their order follows the numbers that it gave to pairs of
-shapes. Numbers of pairs that came apart are given out again, last returned first, so the order, and with it
-the last bits of every result, depends on all that was ever touched in that scene. No call takes it back, not
-``unpack``, not moving everything apart and together again (tried: the order turns round each time). In a grasp
-that is visible at once: the same state, written twice into the same env, went on differently in five of
-eight envs.
-
-A scene that was just made has no such history, and making one is cheap: what is expensive in an env are its
-meshes, materials, bodies and pictures, and they belong to the entities. So the entities of the env are taken
-out of their ``sapien.Scene`` and put, in the same order, into a new one with a new ``PhysxCpuSystem`` and the
-same ``RenderSystem``: 0.2 ms for a Panda, a table and a cube. SAPIEN's components stay the same Python
-objects, so nothing that ManiSkill or the task holds is out of date.
-"""
+"""Simulation state of chosen envs of a `BatchedCpuSystem`: read, and written into the same or other envs."""
 
 from __future__ import annotations
 
@@ -84,7 +50,19 @@ Contents = tuple[Part, ...]
 
 @dataclass(frozen=True)
 class CpuState:
-    """The simulation state of n envs, as columns."""
+    """The simulation state of n envs, as columns.
+
+    ``PhysxCpuSystem.pack()`` has pose and velocity of every body, qpos, qvel and drive targets. In addition:
+
+    * *Names*: bytes of two envs mean the same only if the envs are built alike. `Contents` says what they mean; where
+      they differ, the bytes are put together from the target's and the source's.
+    * *Sleep*: writing a pose wakes a body, which then moves by micrometres. What slept is put to sleep again. Every body is
+      asked (2 us each): a velocity in the pack does not mean that one is awake (cubes of StackCube sleep with some left).
+    * *Forces* of ``set_qf``, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
+    * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for it. The counted
+      impulses are kept, and answer queries until the next substep.
+    * *Hidden objects* are 99999 m away; their true pose is kept.
+    """
 
     contents: tuple[Contents, ...]
     """(n,)"""
@@ -449,7 +427,13 @@ def _hide(packed: bytes, hidden: list[tuple[int, NDArray[np.float32]]]) -> bytes
 
 
 def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
-    """Give these envs of a batched CPU scene a PhysX scene without a past.
+    """Give these envs of a batched CPU scene a new PhysX scene, which has no past.
+
+    PhysX solves contacts in the order of numbers that it gave to pairs of shapes, and reuses numbers, last returned first. So
+    the last bits of a result depend on all that was ever touched in that scene, and no call takes that back (tried:
+    ``unpack``, moving everything apart and together). The same grasp, written twice into the same env, went on differently in
+    five of eight envs. So the env's entities move, in order, into a new ``sapien.Scene`` with a new ``PhysxCpuSystem`` and the
+    same ``RenderSystem``: 0.2 ms for a Panda, a table and a cube. SAPIEN's components stay the same Python objects.
 
     Poses, velocities and drive targets stay; joint forces (``set_qf``) and contacts are gone.
 

@@ -1,10 +1,4 @@
-"""The simulation state of chosen envs of ManiSkill's GPU simulation.
-
-There is no packed state on the GPU, but the tensors that ManiSkill reads and writes are the state: poses and
-velocities of bodies, qpos, qvel, joint forces and drive targets. They are copied by the names of actors and
-articulations, and written through ManiSkill's own structs, which apply its reset mask. What PhysX keeps
-beside them (contacts, sleep) is on the device and out of reach.
-"""
+"""Simulation state of chosen envs of ManiSkill's GPU simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +19,10 @@ _JOINT_TENSORS = ("qf", "target_qpos", "target_qvel")
 
 @dataclass(frozen=True)
 class GpuState:
-    """The simulation state of n envs."""
+    """The simulation state of n envs: the tensors that ManiSkill reads and writes, by name.
+
+    What PhysX keeps on the device besides them (contacts, sleep) is out of reach.
+    """
 
     states: dict[str, NDArray[np.float32]]
     """(n, 13) of each actor: position, quaternion wxyz, linear and angular velocity; (n, 13 + 5 D) of each articulation:

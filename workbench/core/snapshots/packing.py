@@ -1,23 +1,4 @@
-"""A snapshot as bytes, without saying again what has not changed.
-
-A snapshot of every control step is what a scrubbed past is made of, and most of a snapshot is the same from
-step to step. Two random generators an env are 5 KB of state that changes at resets only, the generators
-of the process are 10 KB, a goal pose stays for an episode; the simulation of a PickCube env is 300 bytes.
-
-So a snapshot is cut in two. The *parts* are what mostly stays: each is pickled when it differs from what it was, gets a
-number that no other part of this packer has, and is given out once; a step then names its parts by number. Equality is
-asked of identity first (the reader of the generators gives the same tuple for the same state) and of the bytes next. The
-*body* is the snapshot pickled without them, by pickle's persistent ids.
-
-Measured on PickCube-v1 with random actions (two cores, ``tests/benchmarks/history_cost.py``): for 16 envs the body
-of a step has 8.8 KB where the pickled snapshot has 107, for 64 envs 32 KB where it has 380. Cutting takes 0.34
-and 0.61 ms, after 0.75 and 1.4 ms for the snapshot itself; with poses, numbers and actions the message of a step
-has 19 and 70 KB and takes 0.08 ms to pickle. A reset of one env adds 5 KB.
-
-The server keeps what a worker packed, and imports neither torch nor ManiSkill. When a moment is to be put back it joins
-the body and its parts into bytes that any worker unpickles as a plain `Snapshot`, so whoever receives one need not know
-that it was ever cut.
-"""
+"""Packs snapshots as bytes, without repeating what has not changed."""
 
 from __future__ import annotations
 
@@ -67,7 +48,17 @@ class _Kept:
 
 @dataclass
 class SnapshotPacker:
-    """Packs the snapshots of one env, one after the other."""
+    """Packs the snapshots of one env, one after the other.
+
+    Most of a snapshot stays from step to step (generators, goal poses). These *parts* are pickled when they change, get a
+    number that no other part of this packer has, and are given out once; the *body* is the snapshot pickled without them, by
+    pickle's persistent ids. Equality is identity first, bytes second. The server keeps both and imports neither torch nor
+    ManiSkill; a worker unpickles them joined as a plain `Snapshot`.
+
+    PickCube-v1, random actions, two cores (``tests/benchmarks/history_cost.py``): for 16 envs the body of a step has 8.8 KB
+    where the pickled snapshot has 107, for 64 envs 32 KB and 380. Cutting takes 0.34 and 0.61 ms, the snapshot itself 0.75 and
+    1.4 ms. A reset of one env adds 5 KB.
+    """
 
     _kept: dict[Any, _Kept] = field(default_factory=dict)
     """The parts of the last snapshot, by name."""
@@ -78,7 +69,7 @@ class SnapshotPacker:
     _last_keys: tuple[int, ...] | None = None
 
     def pack(self, snapshot: Snapshot) -> PackedSnapshot:
-        """Cut a snapshot into its body and its parts; see the module's text."""
+        """Cut a snapshot into its body and its parts."""
         new: dict[int, bytes] = {}
         places: dict[int, int] = {}
         before, self._kept = self._kept, {}

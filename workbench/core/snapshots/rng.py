@@ -1,16 +1,4 @@
-"""The random generators of a running task, to be put back later.
-
-ManiSkill gives every env two numpy generators: one that its episodes draw from and one that draws
-the seeds of episodes. ``RandomState.get_state`` converts 624 numbers one by one, 55 us a generator,
-which for 64 envs is a third of a control step. Few tasks draw between resets, so the generators are
-read in full only when their bytes in memory differ from those that were seen last (0.2 us a generator; numpy
-publishes the address, ``BitGenerator.ctypes.state_address``). One thing lies elsewhere: every second normal
-number is kept aside, and taking it changes no byte. While one is kept, all are read anew.
-
-torch, numpy and Python have one generator each for the whole process. They belong to no env, and to the
-author's training loop as much as to the task, so they are put back only when a whole batch is
-put back in its place: then the episode goes on with the draws that it had.
-"""
+"""Random generators of a running task: read, and written back."""
 
 from __future__ import annotations
 
@@ -32,7 +20,11 @@ RngState = tuple[Any, ...]
 
 
 class SharedRng(NamedTuple):
-    """The generators of the process."""
+    """The generators of the process: torch's, numpy's and Python's.
+
+    They belong to no env, and to the author's training loop as much as to the task: they are put back only when a whole batch
+    goes back to its place.
+    """
 
     torch_cpu: np.ndarray
     torch_device: np.ndarray | None
@@ -55,7 +47,12 @@ class _Seen:
 
 
 class RngReader:
-    """Reads the generators of one env object, and remembers what it read."""
+    """Reads the generators of one env object, and remembers what it read.
+
+    ``RandomState.get_state`` takes 55 us a generator, for 64 envs a third of a control step. So a generator is read only when
+    its bytes in memory differ from the last (0.2 us; numpy publishes ``BitGenerator.ctypes.state_address``). One exception:
+    every second normal number is kept aside, and taking it changes no byte. While one is kept, all are read.
+    """
 
     def __init__(self) -> None:
         self._seen: dict[str, _Seen] = {}

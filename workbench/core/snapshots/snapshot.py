@@ -1,33 +1,4 @@
-"""Snapshots of chosen envs: everything that decides how an episode goes on, kept and put back.
-
-A simulation state alone does not decide it. What does is gathered from five places: PhysX's bodies, joints
-and drive targets (`cpu_state`), controllers and whatever tensors the task keeps on itself (`task_buffers`), steps
-elapsed, and the random generators (`episode_rng`). All of it is copied a row an env, so the state of one env
-can be put back where it was, into another env, into all, or by name into an env that was built anew.
-
-How exact that is. *Two restores of a snapshot go on alike*, to the last bit, whatever the env did in between,
-because a restored env gets a PhysX scene without a past (`cpu_state`); so who wants a run that can be gone back
-to exactly restores each snapshot right after it was taken. *A restore goes on as the uninterrupted run did* except
-for what PhysX keeps to itself: contact caches, the order in which it solves contacts, and the last bit of an
-articulation's root, which it holds by its centre of mass and rounds when it is set. Nothing else is missing: an
-uninterrupted run whose bodies are moved into a new scene, with no number written, goes on as the restored one does
-(tested). How far that goes hangs on what touches, five steps later: nothing for a cart-pole, 1e-3 rad of a joint where a
-hand holds or pushes, 2e-2 rad for a humanoid that lies, and no bound where a fall or a slip hangs on it (``tests/benchmarks/restore_distance.py`` measures it by kind of task,
-``web_assets/docs/task_ids.md`` has every task's figures). Writing the state some steps earlier and making those
-steps again before it is written does not help: what is written takes the contacts with it. What helps is to write only
-at an *exact point* (`begin_anew`, or right after a restore), and to make every step since then again: that gives
-the moment to the last bit. The session goes back so (`session.worker.go_back`).
-
-Control steps of some envs of a batch, while the others stand still and notice nothing.
-
-The task's code is batched: its hooks run for all envs or for none. But PhysX has a scene an env on the CPU, and those
-of the envs that are to stand still are simply not stepped. What the hooks did to them meanwhile (a step more
-counted, targets of a robot, a buffer) is put back from a snapshot that was taken before. Their physics is only put
-back where somebody wrote to it: a state that is written, even the one that is there, wakes what slept and goes on
-otherwise in the last bits.
-
-In GPU simulation all envs are in one scene and all step; there the others are put back from the snapshot.
-"""
+"""Snapshots of chosen envs: taken, restored, and steps of some envs alone."""
 
 from __future__ import annotations
 
@@ -64,7 +35,21 @@ class Memory(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """Chosen envs at one moment. Holds copies only: it can be pickled, and outlives its env."""
+    """Everything that decides how the episodes of chosen envs go on. Copies only: it can be pickled, and outlives its env.
+
+    Gathered from PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its controllers
+    (`task_state`), elapsed steps and random generators (`rng`), a row an env: one env's state fits its own place, another
+    env, or by name an env that was built again.
+
+    *Two restores of a snapshot go on alike*, to the last bit: a restored env gets a PhysX scene without a past. *A restore goes
+    on as the uninterrupted run* except for what PhysX keeps to itself: contact caches, the order in which it solves
+    contacts, and the last bit of an articulation's root. Nothing else is missing (tested: an uninterrupted run whose bodies
+    move into a new scene, with no number written, goes on as the restored one). Five steps later that is nothing for a
+    cart-pole, 1e-3 rad of a joint where a hand holds or pushes, 2e-2 rad for a humanoid that lies, and without bound where a
+    fall or a slip hangs on it (``tests/benchmarks/restore_distance.py``; figures in ``web_assets/docs/task_ids.md``). Writing
+    an earlier state and repeating the steps does not help. Exact is a snapshot at an *exact point* (`begin_anew`, or right
+    after a restore) with every step since then made again; the session goes back so (`session.worker.go_back`).
+    """
 
     num_envs: int
     """N, of the env that it was taken of."""
@@ -278,7 +263,11 @@ def _pairs(
 
 @contextmanager
 def only_these_move(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
-    """Within this, control steps are of these envs.
+    """Within this, control steps move these envs only.
+
+    The task's hooks run for all envs or for none, but on the CPU PhysX has a scene an env, and the others are not stepped. What
+    hooks did to them (a step counted, targets, a buffer) is restored from `others`; their physics only where it was written
+    to, since writing even the present state wakes what slept. In GPU simulation all envs step, and the others are restored.
 
     Args:
         others: all other envs as they are now, which they are at the end again; None for a batch in which nobody

@@ -1,10 +1,4 @@
-"""Where a task keeps what it remembers: every attribute that may hold some, with its path and a way to put another.
-
-Nobody declares state, so it is looked for: on the env, its agents and their controllers, through dicts, lists,
-tuples, dataclasses, ManiSkill's Poses and objects of classes that the author wrote beside the task. What
-belongs to ManiSkill, SAPIEN, gymnasium or torch (scenes, actors, sensors, spaces) is not entered, and neither are
-BaseEnv's own members. `task_buffers` says what of it is state, and keeps that.
-"""
+"""Finds every attribute in which a task may keep state."""
 
 from __future__ import annotations
 
@@ -70,7 +64,11 @@ class Walk:
 
 
 def look_over(env: BaseEnv) -> Walk:
-    """Everything that a task may remember."""
+    """Everything that a task may remember.
+
+    Looked for on the env, its agents and their controllers, through dicts, lists, tuples, dataclasses, Poses and objects of
+    classes in the task's module. Not entered: what belongs to ManiSkill, SAPIEN, gymnasium or torch, and BaseEnv's members.
+    """
     walk = Walk(env, task_class(env).__module__)
     walk.entered[id(env)] = env
     walk.simulation = frozenset(

@@ -1,23 +1,4 @@
-"""What a task remembers between steps, on itself, its robots and their controllers; found, read, put back.
-
-A simulator's state is not a task's. The best distance so far, the stage of each env, a target pose that
-a controller goes after: tasks keep these as attributes, and ManiSkill's ``get_state_dict`` knows nothing of them.
-Nobody declares them either, so they are looked for (`task_members`).
-
-*Rows.* A tensor, an array or a list of plain values whose first dimension is the number of envs has one row
-an env, and the rows of chosen envs are copied. Anything else (a counter, a threshold) holds for the whole
-batch, so it is put back only when all envs are.
-
-*State or scene?* ``self.peg_half_sizes`` has a row an env too, but it describes pegs that were built, and
-copying env 3's row to env 7 would not change env 7's peg. The difference is when it was written: what has not
-changed since the scene was built (`note_scene`, called by the batched env) belongs to the scene. It is not
-copied, and if it has changed by the time of the restore, it gets back the value that it was built with.
-Where nobody noted that (GPU simulation), everything counts as state.
-
-*New tensors.* A value is put back as a new tensor, never written into the old one, which may be somebody
-else's: a controller's target is often the caller's action array itself. Two attributes that were one tensor
-stay one. What cannot be carried is named, with the reason.
-"""
+"""State that a task keeps between steps on itself, its robots and their controllers."""
 
 from __future__ import annotations
 
@@ -52,7 +33,18 @@ class Buffer(NamedTuple):
 
 
 class TaskState(NamedTuple):
-    """What a task, its robots and their controllers remembered."""
+    """What a task, its robots and their controllers remembered; ManiSkill's ``get_state_dict`` has none of it.
+
+    *Rows*: a tensor, array or list of plain values whose first dimension is N has a row an env, and the rows of chosen envs are
+    copied. All else (a counter, a threshold) holds for the whole batch, and is put back only when all envs are.
+
+    *State or scene*: ``self.peg_half_sizes`` has a row an env too, but describes pegs that were built. What has not changed
+    since the scene was built (`note_scene`) belongs to the scene: it is not copied, and a restore gives it the value that it
+    was built with. In GPU simulation nothing is noted, and everything counts as state.
+
+    *New tensors*: a value is put back as a new tensor, since the old one may be another's (a controller's target is often the
+    caller's action). Two attributes that were one tensor stay one. What cannot be carried is named, with the reason.
+    """
 
     buffers: dict[str, Buffer]
     """What was written since the scene was built, by path: ``best_distance``, ``agent.controllers['pd_ee_delta_pos'].controllers['arm']._target_qpos``, ``stages['reach']``."""

@@ -1,4 +1,4 @@
-"""Answers ``breakpoint()`` and ``pdb.set_trace()`` where there is no terminal to type into."""
+"""Answers ``breakpoint()`` and ``pdb.set_trace()`` without a terminal."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""How every Python process of the workbench is started, so that none imports from the current folder; and how it imports
-what takes long.
-"""
+"""Starts Python child processes, and speeds up slow imports."""
 
 from __future__ import annotations
 

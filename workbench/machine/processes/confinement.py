@@ -1,8 +1,4 @@
-"""What a process that reads files of others gives up before it opens the first of them (Linux).
-
-Landlock is asked through system calls, since libc has no names for it (``include/uapi/linux/landlock.h``). A kernel
-without it, or an older one, confines to what it knows; the limits on memory and files hold everywhere.
-"""
+"""Confines a process that reads files of others (Landlock and resource limits)."""
 
 from __future__ import annotations
 
@@ -35,7 +31,10 @@ MOST_OPEN_FILES = 512
 
 
 def landlock_version() -> int:
-    """Of this kernel; 0 where it has none, or it is turned off."""
+    """Of this kernel; 0 where it has none, or it is turned off.
+
+    Asked by system calls, since libc has no names for Landlock (``include/uapi/linux/landlock.h``).
+    """
     return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION), 0)
 
 

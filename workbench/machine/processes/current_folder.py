@@ -1,4 +1,4 @@
-"""The current folder of a moment, to come back to when a task has called ``os.chdir``: relative paths are meant from there."""
+"""Returns to a folder after a task has called ``os.chdir``."""
 
 from __future__ import annotations
 

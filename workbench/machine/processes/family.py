@@ -1,14 +1,4 @@
-"""The processes that a process started, read from ``/proc`` in tens of microseconds.
-
-A task may start processes that leave the worker's group (``setsid``) or its family (two forks, as a daemon does). Nothing
-finds those once the worker is gone: their parent is the system's first process, and what they say of themselves can
-be changed. So each worker is the child of a keeper, which is the *subreaper*: what loses its parent below it becomes its
-child. When the worker ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none, and
-ends as the worker did. It kills nothing else, since a child's number is free for another only when its parent took note of the end.
-
-The keeper is a fork from the moment before anything is imported: one system call, and 6 MB of its own. Against a
-cgroup it needs no rights, which a container or a login by ssh does not give, and the server's own children stay out of it.
-"""
+"""Process trees: read from ``/proc``, and ended as a whole."""
 
 from __future__ import annotations
 
@@ -134,7 +124,13 @@ def main() -> None:
 def begin_family(server: int) -> None:
     """Go on in a child of this process; the process itself never returns from here, and is its keeper.
 
-    To be called before any thread is started.
+    A task may start processes that leave the worker's group (``setsid``) or its family (two forks), which nothing finds once
+    the worker is gone. The keeper is their *subreaper*: what loses its parent below it becomes its child. When the worker
+    ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none, and ends as the worker
+    did. It kills nothing else: a child's number is free only after its parent has waited for it. A cgroup would need rights
+    that a container or an ssh login does not give.
+
+    Call it before any import (the keeper then has 6 MB of its own) and before any thread is started.
 
     Args:
         server: process id of the parent. The keeper ends its family when that is gone, however it went.

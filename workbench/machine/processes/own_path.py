@@ -1,8 +1,4 @@
-"""Takes the current folder out of where this command imports from. Imported first of all, for that effect.
-
-``python -m`` puts the folder where a command is started first on ``sys.path``, and so does an empty entry of
-``PYTHONPATH``: a ``numpy.py`` in a downloaded folder of recordings would run.
-"""
+"""Removes the current folder from ``sys.path``. Imported first, for that effect."""
 
 from __future__ import annotations
 
@@ -12,7 +8,9 @@ from collections.abc import Sequence
 
 
 def without_current_folder(path: Sequence[str], python_path: str) -> list[str]:
-    """`path` less the current folder, unless somebody named it or this very package is imported from there.
+    """`path` without the current folder, unless it was named or this package is imported from it.
+
+    ``python -m`` and an empty entry of ``PYTHONPATH`` add that folder: a ``numpy.py`` in a downloaded folder would run.
 
     Args:
         python_path: the variable ``PYTHONPATH``: what is named there, ``.`` too, is meant.

@@ -1,4 +1,4 @@
-"""Threads that do not end unheard: what one raises is said, and it begins again."""
+"""Threads that report what they raise, and start again."""
 
 from __future__ import annotations
 

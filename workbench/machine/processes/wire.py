@@ -1,14 +1,4 @@
-"""Messages between processes, calls and their answers among them, and the lines that they go over.
-
-The author's code runs in the worker: it may write whatever it likes into its line, and end in the middle of a message.
-So no word of it is believed or waited for: what comes is data of the kinds that are awaited, or `Unreadable`. A message is
-msgpack that is read by its types, never a pickle. Arrays stand behind it, one after the other; in it is what they are.
-
-    4 bytes    length of all that follows; framed as `multiprocessing.connection.Connection` does it
-    4 bytes    length of the message
-    message    msgpack: name of the class, number of the call (or nil), fields
-    arrays     bytes, in the order in which the message names them
-"""
+"""Messages between processes, calls and answers, and the sockets that carry them."""
 
 from __future__ import annotations
 
@@ -78,7 +68,16 @@ def value_type(question: type[Question[Any]]) -> Any:
 
 
 class Line:
-    """One end of a socket. What is sent may be sent by another thread than the one that receives."""
+    """One end of a socket. Another thread than the one that receives may send.
+
+    The author's code runs in the worker: it may write anything into the socket, and end in the middle of a message. So what
+    comes is either data of the expected types or `Unreadable`. A message is msgpack that is read by its types, never a pickle:
+
+        4 bytes    length of all that follows; framed as `multiprocessing.connection.Connection` does it
+        4 bytes    length of the message
+        message    msgpack: name of the class, number of the call (or nil), fields
+        arrays     bytes, in the order in which the message names them
+    """
 
     def __init__(
         self, end: socket.socket, kinds: Sequence[type] = (), questions: Sequence[type] = ()
