@@ -36,7 +36,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from workbench.authoring.loading.load import task_of_class
 from workbench.core.camera_data import Picture
 from workbench.core.cameras.render import Request, recorded_pictures, step_pictures
-from workbench.core.capture.state_columns import StateReading, read_states
+from workbench.core.capture.state_columns import StateReading, copy_states
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
@@ -220,7 +220,7 @@ class Recorder(gym.Wrapper):
         wanted = self._wanted()
         pictures = step_pictures(task, self._envs, wanted)
         seeds = self._seeds.copy() if reset_mask.any() else None
-        self._held.append(_Held(step, reset_mask, pictures, seeds, read_states(task)))
+        self._held.append(_Held(step, reset_mask, pictures, seeds, copy_states(task)))
         self._waiting_pictures += sum(picture.nbytes for picture in pictures)
         follows = np.array_equal(step.elapsed_steps, self._elapsed + 1)
         self._elapsed = step.elapsed_steps

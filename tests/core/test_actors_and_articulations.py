@@ -16,7 +16,7 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import BOX, box, by_hand
-from tests.core.single_env_judge import Bare, batch_of, follow
+from tests.core.stock_env import Bare, batch_of, follow
 
 
 class Table(Bare):

@@ -9,7 +9,7 @@ import pytest
 import sapien.physx as physx
 
 from tests.core.collision import Collision
-from tests.core.single_env_judge import batch_of
+from tests.core.stock_env import batch_of
 
 MEMBERS = sorted(name for name in dir(physx.PhysxGpuSystem) if not name.startswith("_"))
 REFUSED = {

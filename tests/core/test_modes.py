@@ -27,7 +27,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 import workbench
-from tests.core import single_env_judge
+from tests.core import stock_env
 
 pytestmark = pytest.mark.thorough
 
@@ -55,7 +55,7 @@ def put_in_same_state(batch: Any, stock: Any, env: int = ENV, seed: int = 0) -> 
     for each in (batch, stock):
         for hidden in each._hidden_objects:
             hidden.show_visual()  # hidden, it stands elsewhere in the batch and where it is in stock
-    single_env_judge.put_in_same_state(stock, batch, env)
+    stock_env.put_in_same_state(stock, batch, env)
 
 
 def assert_same(batched: Any, single: Any, path: str, env: int = ENV) -> None:

@@ -16,7 +16,7 @@ import torch
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from tests.core.collision import Collision
-from tests.core.single_env_judge import batch_of, follow
+from tests.core.stock_env import batch_of, follow
 
 pytestmark = pytest.mark.thorough
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from tests.core.single_env_judge import batch_of, put_in_same_state, single
+from tests.core.stock_env import batch_of, put_in_same_state, single
 
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 TOLERANCE = 2e-6

@@ -14,7 +14,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import by_hand
-from tests.core.single_env_judge import Bare
+from tests.core.stock_env import Bare
 
 RENDERED = {"obs_mode": "rgb+depth+segmentation", "render_backend": "cpu", "render_mode": "rgb_array"}
 

@@ -13,7 +13,7 @@ import pytest
 
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.authoring.problem import TaskError
-from workbench.core.capture.recorded_state import apart, misfits, read_states
+from workbench.core.capture.recorded_state import read_states, state_distance, state_mismatches
 from workbench.jobs.open_task import OpenedTask, step_checked
 from workbench.jobs.replay import arrive
 
@@ -105,7 +105,7 @@ def test_states_that_part_from_the_record_are_put_back_on_it(task: OpenedTask, r
     assert arrival.way == "corrected" and 1 <= arrival.corrected <= 8
     assert arrival.metres is not None and arrival.metres < 1e-4
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
-    assert apart(now, {n: rows[20] for n, rows in states.items()})[0] < 1e-4
+    assert state_distance(now, {n: rows[20] for n, rows in states.items()})[0] < 1e-4
 
 
 def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
@@ -122,14 +122,14 @@ def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
     # It stays where it is, and does not run to where it stood before.
     step_checked(task.env, task.loaded, None)
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
-    assert apart(now, run.state(25))[1] < 0.05
+    assert state_distance(now, run.state(25))[1] < 0.05
 
 
 def test_what_has_another_name_or_shape_is_told(task: OpenedTask, recorded: Recorded) -> None:
     state = dict(recorded.run(0).state(30))
     state["actors/lost"] = state.pop("actors/cube")
     state["articulations/panda"] = state["articulations/panda"][:-2]
-    missed = misfits(task.env.env, 0, state)
+    missed = state_mismatches(task.env.env, 0, state)
     assert "none of this name" in missed["actors/lost"]
     assert "none of this name" in missed["actors/cube"]
     assert "31 numbers now, and 29" in missed["articulations/panda"]

@@ -23,7 +23,7 @@ from workbench.authoring.problem import TaskError
 from workbench.cli.main import main
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.share import export_in_terminal
-from workbench.core.capture.recorded_state import apart, read_states
+from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.jobs.actions import read_given
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.record import RecordOptions, record
@@ -153,7 +153,7 @@ def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
     assert arrival.way == "re-simulated" and arrival.metres is not None and arrival.metres < 1e-5
     assert step.elapsed_steps.tolist()[1] == 8 and arrival.missed == {}
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
-    assert apart(now, run.state(8))[0] < 1e-5
+    assert state_distance(now, run.state(8))[0] < 1e-5
     task.env.close()
 
 

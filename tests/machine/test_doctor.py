@@ -8,15 +8,17 @@ import pytest
 from rich.console import Console
 
 from workbench.machine import doctor
-from workbench.machine.doctor import Finding, diagnose, exit_code, print_report
+from workbench.machine.doctor import DoctorFinding, diagnose, exit_code, print_report
 
 
 @pytest.fixture(scope="module")
-def findings(child_process: None) -> dict[str, Finding]:
+def findings(child_process: None) -> dict[str, DoctorFinding]:
     return {finding.topic: finding for finding in diagnose()}
 
 
-def test_every_topic_is_answered_and_this_machine_runs_the_workbench(findings: dict[str, Finding]) -> None:
+def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
+    findings: dict[str, DoctorFinding],
+) -> None:
     topics = {
         "Python",
         "packages",
@@ -33,7 +35,7 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(findings: d
     assert all(finding.advice for finding in findings.values() if finding.ok is not True)
 
 
-def test_versions_that_must_match_are_shown(findings: dict[str, Finding]) -> None:
+def test_versions_that_must_match_are_shown(findings: dict[str, DoctorFinding]) -> None:
     for pinned in ("mani-skill 3.0.1", "sapien 3.0.3", "viser 1.1.1", "rerun-sdk 0.41.0", "torch 2."):
         assert pinned in findings["packages"].what
 
@@ -68,7 +70,7 @@ def test_a_taken_port_is_said_with_the_option_to_change_it(monkeypatch: pytest.M
 def test_a_question_that_fails_is_told_and_the_others_are_answered(
     child_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail() -> list[Finding]:
+    def fail() -> list[DoctorFinding]:
         raise OSError("no such thing")
 
     monkeypatch.setattr(doctor, "_cores_and_memory", fail)
@@ -79,8 +81,8 @@ def test_a_question_that_fails_is_told_and_the_others_are_answered(
 
 def test_the_report_shows_what_to_do_and_reads_brackets_as_text() -> None:
     said = io.StringIO()
-    lack = Finding("render device", False, "found [none]", "Type: apt install [this]")
-    print_report([Finding("Python", True, "3.11"), lack], Console(file=said, width=60))
+    lack = DoctorFinding("render device", False, "found [none]", "Type: apt install [this]")
+    print_report([DoctorFinding("Python", True, "3.11"), lack], Console(file=said, width=60))
     assert "found [none]" in said.getvalue()
     assert "Type: apt install [this]" in said.getvalue()
     assert exit_code([lack]) == 1

@@ -13,7 +13,7 @@ from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
 from workbench.cli.terminal import err, print_finding, print_problem, progress_bar, refuse, say, warn
-from workbench.core.backends import gpu_left_alone
+from workbench.core.backends import unused_gpu_text
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import Progress, Recorded, RecordOptions, record, with_given_actions
 from workbench.recording.reader.reading import mend
@@ -65,7 +65,7 @@ def record_in_terminal(what: RecordOptions) -> int:
             err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
         for notice in hidden_in_words(what.task):
             warn(notice)
-        if (left_alone := gpu_left_alone(what.options.backend)) is not None:
+        if (left_alone := unused_gpu_text(what.options.backend)) is not None:
             warn(left_alone)
         left = (TextColumn("left"), TimeRemainingColumn())
         with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:

@@ -19,7 +19,7 @@ from rich.table import Table
 from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import TaskError
 from workbench.cli.terminal import Exit, TerminalPrompt, can_ask, out, print_finding, progress_bar, warn
-from workbench.core.backends import gpu_left_alone
+from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.open_task import open_task
@@ -142,7 +142,7 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
 def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust: bool) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may go to another
-    if (left_alone := gpu_left_alone(what.base.backend)) is not None:
+    if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
     with progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:

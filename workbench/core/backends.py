@@ -95,7 +95,7 @@ def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
     )
 
 
-def gpu_left_alone(wanted: Backend) -> str | None:
+def unused_gpu_text(wanted: Backend) -> str | None:
     """What is to be told where there is a GPU and ``auto`` does not simulate on it, a sentence; else None."""
     if wanted != "auto" or why_no_gpu_simulation() is not None:
         return None

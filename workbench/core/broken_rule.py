@@ -48,11 +48,11 @@ class BrokenRule(RuntimeError):
 
 
 class WrongReturn(BrokenRule):
-    """What a hook returned is not what ManiSkill takes it for: `hook` is its name, `said` the failing."""
+    """What a hook returned is not what ManiSkill takes it for: `hook` is its name, `problem` the failing."""
 
-    def __init__(self, said: str, hook: str, rule: str, place: Place | None) -> None:
-        super().__init__(f"{hook}() {said}{in_brackets(place)}.", rule, place)
-        self.said, self.hook = said, hook
+    def __init__(self, problem: str, hook: str, rule: str, place: Place | None) -> None:
+        super().__init__(f"{hook}() {problem}{in_brackets(place)}.", rule, place)
+        self.problem, self.hook = problem, hook
 
 
 class RuleWarning(UserWarning):
@@ -142,12 +142,12 @@ class BrokenRules:
             key: replace(row, finding=replace(row.finding, first_step=0)) for key, row in self._rows.items()
         }
 
-    def returned(self, rule: str, hook: str, said: str, place: Place | None) -> None:
+    def returned(self, rule: str, hook: str, problem: str, place: Place | None) -> None:
         """As `breaks`, of what a hook returned."""
         if self._degrees[rule] == "stop":
-            raise WrongReturn(said, hook, rule, place)
+            raise WrongReturn(problem, hook, rule, place)
         if self._degrees[rule] == "warn":
-            self._note(rule, f"{hook}() {said}.", place, hook, exact=False)
+            self._note(rule, f"{hook}() {problem}.", place, hook, exact=False)
 
     def _note(self, rule: str, message: str, place: Place | None, subject: Hashable, exact: bool) -> None:
         self.serial += 1

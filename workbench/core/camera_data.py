@@ -77,10 +77,10 @@ def _alike(a: Any, b: Any, close: float) -> bool:
     return a == b
 
 
-def in_words(value: object) -> str:
+def setting_text(value: object) -> str:
     """What one setting is, for a sentence."""
     if isinstance(value, tuple):
-        return f"({', '.join(map(in_words, value))})"
+        return f"({', '.join(map(setting_text, value))})"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

@@ -34,7 +34,7 @@ from workbench.core.camera_data import CallSite, CameraKey, CameraKind
 
 
 @cache
-def install_index_seams(batched_system: Callable[[Any], Any]) -> None:
+def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system: `batched_system(scene)`, None for any other scene.
 
     Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, on which bodies of a CPU system raise.

@@ -28,7 +28,7 @@ from workbench.core.camera_data import Picture
 from workbench.core.capture.recorded_run import STATE, states_of
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.task import Stepped, TaskDescription
-from workbench.machine.processes.watched_thread import say_failure
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files
@@ -369,7 +369,7 @@ class EpisodeFinisher:
         except Exception as error:
             # Its journal stays, and the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
-                say_failure(f"An episode of env {episode.env} could not be written", error)
+                report_failure(f"An episode of env {episode.env} could not be written", error)
             made = f"an episode of env {episode.env} could not be written: {error}"
         with self._lock:
             self._waiting -= 1

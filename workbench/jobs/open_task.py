@@ -34,7 +34,7 @@ from workbench.authoring.problem import (
     shorten,
 )
 from workbench.authoring.return_problems import check_step_returns, problem_from_return
-from workbench.core.backends import BackendUnavailable, find_renderer, gpu_left_alone
+from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.cameras.render import list_cameras, recorded_pictures, segmentation_names, take_pictures
 from workbench.core.cameras.visibility import objects_to_see
@@ -296,7 +296,7 @@ def describe(
 
 def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
     """What whoever opens it should know although it works, in sentences."""
-    gpu = gpu_left_alone(options.backend)
+    gpu = unused_gpu_text(options.backend)
     return (*(loaded.notices if loaded.followed else ()), *(() if gpu is None else (gpu,)))
 
 
@@ -348,7 +348,7 @@ class blamed:
     def _problem(self, error: BaseException) -> Problem:
         loaded = self._loaded
         if isinstance(error, WrongReturn):
-            return problem_from_return(loaded.cls, error.hook, error.said, loaded.source_files)
+            return problem_from_return(loaded.cls, error.hook, error.problem, loaded.source_files)
         env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
         if isinstance(error, (BrokenRule, ForgottenInit)):
             return _problem_at_its_place(error, self._stage, loaded)

@@ -24,7 +24,7 @@ from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_
 from workbench.machine.processes.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
 from workbench.machine.processes.family import describe_exit, end_family
-from workbench.machine.processes.wire import Line, Unpacker, Unreadable, pack, pack_message
+from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack, pack_message
 from workbench.machine.text import guard_terminal
 
 _LOOK_SECONDS = 0.1
@@ -209,7 +209,7 @@ news are the parts of a progress."""
 class _Process:
     """As the one that started it sees it."""
 
-    line: Line
+    line: MessageSocket
     keeper: subprocess.Popen[bytes]
     begun: set[int] = field(default_factory=set)
     """The items that it has and has told nothing of."""
@@ -237,7 +237,7 @@ class _Pool:
                     start_new_session=True,  # Ctrl-C in the terminal is for this process, which tells them
                     env=child_environment(),
                 )
-            process = _Process(Line(ours, (_Next, Answer, Progress)), keeper)
+            process = _Process(MessageSocket(ours, (_Next, Answer, Progress)), keeper)
             self._processes.append(process)
             self._busy.append(process)
             self._send(process, cores[i :: len(self._work.setups)] or cores)

@@ -20,7 +20,7 @@ from workbench.authoring.loading.reference import named_file
 from workbench.core.broken_rule import warn_of
 from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.recorded_run import RecordedRun, states_of
-from workbench.core.capture.recorded_state import apart
+from workbench.core.capture.recorded_state import state_distance
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
@@ -336,7 +336,7 @@ class _Episodes:
 
     def _put_right_start(self, env: int, given: RecordedRun, step: StepResult) -> StepResult:
         first, task = given.state(0), self._opened.env
-        if max(apart(states_of(read_state_columns(task), env), first)) <= _ELSEWHERE:
+        if max(state_distance(states_of(read_state_columns(task), env), first)) <= _ELSEWHERE:
             return step
         self._put_right.add(self._running[env])
         return put_there(self._opened, {env: first})

@@ -10,7 +10,7 @@ are put back on it. How far they were and how often that was needed is told, nev
 What a task draws at a reset hangs on more than the env's own seed where several envs were reset together: torch's
 numbers come in one piece for all of them. So the first state is compared as well, and put back where it is another.
 
-In a batch the envs that do not take part stand still (`only_these_move`), and what the task keeps for them is put
+In a batch the envs that do not take part stand still (`step_only`), and what the task keeps for them is put
 back afterwards, so that nobody is disturbed.
 """
 
@@ -25,17 +25,17 @@ from numpy.typing import NDArray
 
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import (
-    apart,
-    misfits,
     new_physics,
     read_states,
     same_state,
     settle_robot,
+    state_distance,
+    state_mismatches,
     write_states,
 )
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
-from workbench.core.snapshots.snapshot import Snapshot, only_these_move
+from workbench.core.snapshots.snapshot import Snapshot, step_only
 from workbench.jobs.open_task import OpenedTask, blamed, reset_checked, step_checked
 from workbench.machine.text import length
 
@@ -98,7 +98,7 @@ def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int
     with blamed("restore", opened.loaded, task):
         for i, run in runs.items():
             if run.env_states:
-                missed[i] |= misfits(env, i, run.state(0))
+                missed[i] |= state_mismatches(env, i, run.state(0))
         if wrong:
             write_states(env, wrong)
             settle_robot(env, list(wrong))
@@ -115,7 +115,7 @@ def put_there(
     """
     with blamed("restore", opened.loaded, opened.env):
         write_states(opened.env.env, states)
-        return opened.env.judge(action)
+        return opened.env.rescore(action)
 
 
 def arrive(
@@ -145,7 +145,7 @@ def arrive(
     kept, reason = _kept(opened, others)
     why_not = why_not or reason
     corrected = 0
-    with only_these_move(env, chosen, kept):
+    with step_only(env, chosen, kept):
         beginnings = begin_again(opened, dict.fromkeys(chosen, run))
         missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:
@@ -166,7 +166,7 @@ def arrive(
                 settle_robot(env, chosen)
                 env.elapsed_steps[chosen] = state
     with blamed("restore", opened.loaded, task):
-        step = task.judge()
+        step = task.rescore()
     metres, radians = _distance(env, chosen, run.state(state))
     way: Way = "put there" if why_not and state > 0 else "corrected" if corrected else "re-simulated"
     return step, Arrival(
@@ -220,7 +220,7 @@ def _distance(
     if not wanted:
         return None, None
     now = read_states(env)
-    found = [apart(_of(now, i), wanted) for i in chosen]
+    found = [state_distance(_of(now, i), wanted) for i in chosen]
     return max(metres for metres, _ in found), max(radians for _, radians in found)
 
 

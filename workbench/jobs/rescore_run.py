@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_run import RecordedRun
-from workbench.core.capture.recorded_state import apart, read_states
+from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
-from workbench.core.snapshots.snapshot import only_these_move
+from workbench.core.snapshots.snapshot import step_only
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.open_task import OpenedTask, blamed, step_checked
 from workbench.jobs.replay import begin_again, put_there, why_not_lived_through
@@ -173,7 +173,7 @@ def _begin(opened: OpenedTask, seats: dict[int, _Seat]) -> None:
     task = opened.env
     beginnings = begin_again(opened, {env: seat.run for env, seat in seats.items()})
     with blamed("restore", opened.loaded, task):
-        first = task.judge()
+        first = task.rescore()
     now = read_states(task.env)
     for env, seat in seats.items():
         seat.begins_otherwise = beginnings[env].otherwise
@@ -185,7 +185,7 @@ def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool)
     task = opened.env
     rows = {env: seat.run.action[seat.at] for env, seat in seats.items()}
     action = actions.action_of(task.parts, task.num_envs, rows)
-    others = only_these_move(task.env, [*seats], None) if len(seats) < task.num_envs else nullcontext()
+    others = step_only(task.env, [*seats], None) if len(seats) < task.num_envs else nullcontext()
     with others:
         step = step_checked(task, opened.loaded, action)
     now = read_states(task.env)
@@ -204,5 +204,7 @@ def _hear(seat: _Seat, step: StepResult, env: int, now: dict[str, NDArray[np.flo
         rows += [np.nan] * (seat.at - len(rows))
         rows.append(float(values[env]))
     recorded = seat.run.state(seat.at)
-    far = apart({name: rows[env] for name, rows in now.items()}, recorded) if recorded else (0.0, 0.0)
+    far = (
+        state_distance({name: rows[env] for name, rows in now.items()}, recorded) if recorded else (0.0, 0.0)
+    )
     seat.drift.append(far)

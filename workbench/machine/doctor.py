@@ -43,7 +43,7 @@ print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorFinding:
     """One line of the report."""
 
     topic: str
@@ -54,13 +54,13 @@ class Finding:
     """What to do; None where nothing is amiss."""
 
 
-def diagnose() -> list[Finding]:
+def diagnose() -> list[DoctorFinding]:
     """Check everything. Never raises: a check that fails is a finding with the failure in it.
 
     A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are asked in child processes with a
     time limit. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
     """
-    questions: list[tuple[str, Callable[[], list[Finding]]]] = [
+    questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
         ("packages", _packages),
         ("render device", _render_device),
@@ -72,23 +72,25 @@ def diagnose() -> list[Finding]:
     ]
     with ThreadPoolExecutor(len(questions)) as pool:
         answers = [(topic, pool.submit(question)) for topic, question in questions]
-    findings: list[Finding] = []
+    findings: list[DoctorFinding] = []
     for topic, answer in answers:
         failure = answer.exception()
         if failure is None:
             findings += answer.result()
         else:
             advice = "This question should not fail: please report it."
-            findings.append(Finding(topic, None, f"not known: {type(failure).__name__}: {failure}", advice))
+            findings.append(
+                DoctorFinding(topic, None, f"not known: {type(failure).__name__}: {failure}", advice)
+            )
     return findings
 
 
-def exit_code(findings: Sequence[Finding]) -> int:
+def exit_code(findings: Sequence[DoctorFinding]) -> int:
     """0 if the workbench can run here, with less perhaps; 1 if not."""
     return int(any(finding.ok is False for finding in findings))
 
 
-def print_report(findings: Sequence[Finding], console: Console | None = None) -> None:
+def print_report(findings: Sequence[DoctorFinding], console: Console | None = None) -> None:
     """The findings as a table, each lack followed by what to do."""
     console = console or Console(highlight=False)
     marks = {True: "[green]ok[/]", None: "[yellow]less[/]", False: "[red]no[/]"}
@@ -108,23 +110,25 @@ def print_report(findings: Sequence[Finding], console: Console | None = None) ->
         console.print("The workbench runs here.", style="green")
 
 
-def _python() -> list[Finding]:
+def _python() -> list[DoctorFinding]:
     what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"
     if not (3, 11) <= sys.version_info[:2] <= (3, 12):
         return [
-            Finding("Python", False, what, "Use Python 3.11 or 3.12: make PYTHON=/path/to/python3.12 open")
+            DoctorFinding(
+                "Python", False, what, "Use Python 3.11 or 3.12: make PYTHON=/path/to/python3.12 open"
+            )
         ]
     if platform.system() != "Linux":
-        return [Finding("Python", None, what, "Only Linux is tested.")]
-    return [Finding("Python", True, what)]
+        return [DoctorFinding("Python", None, what, "Only Linux is tested.")]
+    return [DoctorFinding("Python", True, what)]
 
 
-def _packages() -> list[Finding]:
+def _packages() -> list[DoctorFinding]:
     """Installed versions against those that the distribution asks for."""
     try:
         requirements = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:
-        return [Finding("packages", False, f"{DISTRIBUTION} is not installed", "Type: make open")]
+        return [DoctorFinding("packages", False, f"{DISTRIBUTION} is not installed", "Type: make open")]
     shown: list[str] = []
     wrong: list[str] = []
     for requirement in requirements:
@@ -142,17 +146,17 @@ def _packages() -> list[Finding]:
     what = ", ".join([f"workbench {importlib.metadata.version(DISTRIBUTION)}", *shown])
     if wrong:
         advice = "Type: pip install -c constraints.txt -e .  (in a clone: make open)"
-        return [Finding("packages", False, f"{what}. {'; '.join(wrong)}", advice)]
-    return [Finding("packages", True, what)]
+        return [DoctorFinding("packages", False, f"{what}. {'; '.join(wrong)}", advice)]
+    return [DoctorFinding("packages", True, what)]
 
 
-def _render_device() -> list[Finding]:
+def _render_device() -> list[DoctorFinding]:
     probe = ensure_render_device(install=False)
     topic = "render device"
     if not probe.ok:
         files = ", ".join(path.name for path in driver_files()) or "none"
         what = f"SAPIEN cannot render (Vulkan drivers on this machine: {files})"
-        return [Finding(topic, False if probe.missing_libraries else None, what, probe.error)]
+        return [DoctorFinding(topic, False if probe.missing_libraries else None, what, probe.error)]
     what = f"{probe.name}, driver {probe.driver or 'unknown'}"
     if probe.env:
         what += f", from {probe.env.get('VK_DRIVER_FILES')}"
@@ -160,10 +164,10 @@ def _render_device() -> list[Finding]:
         what += (
             "; in software: a camera picture of 128 x 128 takes some 50 ms, the first of a process 5 to 19 s"
         )
-    return [Finding(topic, True, what)]
+    return [DoctorFinding(topic, True, what)]
 
 
-def _gpu() -> list[Finding]:
+def _gpu() -> list[DoctorFinding]:
     """CUDA through torch, then PhysX on it, without causing SAPIEN to fetch anything."""
     child = subprocess.run(
         python_command("-c", GPU_QUESTIONS),
@@ -175,7 +179,9 @@ def _gpu() -> list[Finding]:
     )
     if child.returncode != 0:
         last = (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
-        return [Finding("CUDA", False, f"torch or SAPIEN does not load: {last}", "See the lines above.")]
+        return [
+            DoctorFinding("CUDA", False, f"torch or SAPIEN does not load: {last}", "See the lines above.")
+        ]
     answer = json.loads(child.stdout.strip().splitlines()[-1])
     cuda: list[str] = answer["cuda"]
     if cuda:
@@ -188,7 +194,7 @@ def _gpu() -> list[Finding]:
                 "GPU simulation has passed its tests on no machine so far, so --backend auto does not take it. In a clone, "
                 "make test-gpu says whether they pass on this one."
             )
-        return [Finding("CUDA", True, found), Finding("GPU physics", None, what, advice)]
+        return [DoctorFinding("CUDA", True, found), DoctorFinding("GPU physics", None, what, advice)]
     nvidia = Path("/proc/driver/nvidia/version").is_file()
     if nvidia and answer["built"] is None:
         advice = "There is an NVIDIA driver: install torch's CUDA build of the same version to use it."
@@ -202,14 +208,14 @@ def _gpu() -> list[Finding]:
         f"no device (torch {'without CUDA' if answer['built'] is None else 'for CUDA ' + answer['built']})"
     )
     return [
-        Finding("CUDA", None if advice else True, found, advice),
-        Finding(
+        DoctorFinding("CUDA", None if advice else True, found, advice),
+        DoctorFinding(
             "GPU physics", True, f"not on this machine, since {answer['why_not']}: the CPU core runs the envs"
         ),
     ]
 
 
-def _cores_and_memory() -> list[Finding]:
+def _cores_and_memory() -> list[DoctorFinding]:
     cores = len(os.sched_getaffinity(0))
     memory = psutil.virtual_memory()
     total, free = memory.total / 2**30, memory.available / 2**30
@@ -218,18 +224,18 @@ def _cores_and_memory() -> list[Finding]:
         advice = (
             f"Less than {LEAST_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
         )
-        return [Finding("cores, memory", None, what, advice)]
-    return [Finding("cores, memory", True, what)]
+        return [DoctorFinding("cores, memory", None, what, advice)]
+    return [DoctorFinding("cores, memory", True, what)]
 
 
-def _reading() -> list[Finding]:
+def _reading() -> list[DoctorFinding]:
     """How far the processes are confined that read recordings."""
     version = landlock_version()
     if version:
         what = f"recordings are read in processes that may read their folder and write nothing (Landlock {version})"
-        return [Finding("reading", True, what)]
+        return [DoctorFinding("reading", True, what)]
     return [
-        Finding(
+        DoctorFinding(
             "reading",
             None,
             "recordings are read in processes of their own, with limits on memory and time alone: this kernel has no Landlock",
@@ -238,7 +244,7 @@ def _reading() -> list[Finding]:
     ]
 
 
-def _page_address() -> list[Finding]:
+def _page_address() -> list[DoctorFinding]:
     tunnel = f"ssh -L {DEFAULT_PORT}:127.0.0.1:{DEFAULT_PORT} {getpass.getuser()}@{socket.gethostname()}"
     what = (
         f"http://127.0.0.1:{DEFAULT_PORT}/ and a token that `workbench open` prints; from elsewhere: {tunnel}"
@@ -252,16 +258,16 @@ def _page_address() -> list[Finding]:
             advice = (
                 f"Port {DEFAULT_PORT} is taken ({refusal.strerror}): use --port, with 0 for any free one."
             )
-            return [Finding("page", None, what, advice)]
-    return [Finding("page", True, what)]
+            return [DoctorFinding("page", None, what, advice)]
+    return [DoctorFinding("page", True, what)]
 
 
-def _chromium() -> list[Finding]:
+def _chromium() -> list[DoctorFinding]:
     path = find_chromium()
     if path is None:
         advice = f"Only `make test` needs it. {how_to_get_chromium()}"
-        return [Finding("browser (tests)", None, "no Chromium", advice)]
-    return [Finding("browser (tests)", True, f"{path}: {chromium_version(path)}")]
+        return [DoctorFinding("browser (tests)", None, "no Chromium", advice)]
+    return [DoctorFinding("browser (tests)", True, f"{path}: {chromium_version(path)}")]
 
 
 def main() -> int:

@@ -215,13 +215,13 @@ def _must_be_regular(path: str | os.PathLike[str], mode: int) -> None:
 
 
 def _too_large(path: str | os.PathLike[str], size: int | None, most_bytes: int) -> FileTooLarge:
-    has = "has more" if size is None else f"has {_in_words(size)}, more"
+    has = "has more" if size is None else f"has {_size_text(size)}, more"
     return FileTooLarge(
-        errno.EFBIG, f"{has} than the {_in_words(most_bytes)} that such a file may have", os.fspath(path)
+        errno.EFBIG, f"{has} than the {_size_text(most_bytes)} that such a file may have", os.fspath(path)
     )
 
 
-def _in_words(size: int) -> str:
+def _size_text(size: int) -> str:
     for unit, name in ((2**30, "GB"), (2**20, "MB"), (2**10, "KB")):
         if size >= unit:
             return f"{size / unit:.1f} {name}"

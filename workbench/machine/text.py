@@ -25,7 +25,7 @@ def number_text(value: float, form: str = ".4g") -> str:
     return format(value, form)
 
 
-def lost_text(values: ArrayLike) -> str:
+def nonfinite_text(values: ArrayLike) -> str:
     """How many of these are no finite numbers: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
     flat = np.asarray(values).reshape(-1)
     counts = {"NaN": int(np.isnan(flat).sum()), "infinite": int(np.isinf(flat).sum())}
@@ -38,7 +38,7 @@ def mean_text(values: ArrayLike, say: Callable[[float], str] = number_text) -> s
     flat = np.asarray(values, np.float64).reshape(-1)
     finite = flat[np.isfinite(flat)]
     return ", ".join(
-        part for part in (say(float(finite.mean())) if len(finite) else "", lost_text(flat)) if part
+        part for part in (say(float(finite.mean())) if len(finite) else "", nonfinite_text(flat)) if part
     )
 
 

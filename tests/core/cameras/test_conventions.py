@@ -16,7 +16,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from numpy.testing import assert_allclose
 
-from tests.core.single_env_judge import Bare, batch_of
+from tests.core.stock_env import Bare, batch_of
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras import conventions as frames
 from workbench.core.cameras.conventions import LookAt

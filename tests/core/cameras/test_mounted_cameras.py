@@ -14,7 +14,7 @@ import pytest
 import torch
 from mani_skill.utils.structs.pose import Pose
 
-from tests.core.single_env_judge import batch_of, put_in_same_state, single
+from tests.core.stock_env import batch_of, put_in_same_state, single
 from tests.core.watched import RENDERED, Watched, pictures
 from workbench.core.cameras.render import take_pictures
 from workbench.core.scene.scene_index import read_poses

@@ -14,7 +14,7 @@ import pytest
 import sapien
 from mani_skill.sensors.camera import CameraConfig
 
-from tests.core.single_env_judge import batch_of
+from tests.core.stock_env import batch_of
 from tests.core.watched import RENDERED, Watched, pictures
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.place import PlacedCameras, settings_of

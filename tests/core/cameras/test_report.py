@@ -16,8 +16,8 @@ from workbench.core.cameras.report import (
     DepthReport,
     ObjectSeen,
     SearchSpace,
-    in_words,
     join_reports,
+    report_text,
 )
 
 NAN = float("nan")
@@ -142,7 +142,7 @@ def test_joined_reports_are_end_to_end() -> None:
     other = report(thing(pixels=[5], cut=True), envs=(0,), depth=depth([7.0], [8.0]), pictures=4)
     both = join_reports([one, other])
     assert (both.envs, both.pictures, both.milliseconds) == ((0, 3, 0), 7, 3.0)
-    assert (both.camera, both.size, both.judged_size) == (("sensor", "eye"), (8, 6), (4, 3))
+    assert (both.camera, both.size, both.measured_size) == (("sensor", "eye"), (8, 6), (4, 3))
     assert both.objects[0].pixels.tolist() == [1, 2, 5] and both.objects[0].cut.tolist() == [
         False,
         False,
@@ -157,7 +157,7 @@ def test_joined_reports_are_end_to_end() -> None:
     [
         ({"camera": ("human", "eye")}, "different cameras"),
         ({"size": (8, 8)}, "different sizes"),
-        ({"judged_size": (8, 6)}, "different sizes"),
+        ({"measured_size": (8, 6)}, "different sizes"),
         ({"objects": (thing("ball"),)}, "different scenes"),
     ],
 )
@@ -177,8 +177,8 @@ def test_what_was_measured_is_said_of_what_is_there() -> None:
     half = thing("ball", pixels=[3, 0, 6], unhindered=[4, 0, 6], alone=[4, 0, 6], cut=[True, False, False])
     hardly = thing("peg", pixels=[995, 995], unhindered=[1000, 998])
     found = report(whole, half, hardly, thing("gone", present=False))
-    assert in_words(found, ("cube", "gone")) == "cube: in 2 of 2 envs, about 210 pixels"
-    assert in_words(found, ("ball", "peg")) == (
+    assert report_text(found, ("cube", "gone")) == "cube: in 2 of 2 envs, about 210 pixels"
+    assert report_text(found, ("ball", "peg")) == (
         "ball: in 2 of 3 envs, about 3 pixels, cut by the border in 33%, 12% behind the robot; "
         "peg: in 2 of 2 envs, about 995 pixels"
     )

@@ -19,8 +19,8 @@ from workbench.core.cameras.render import cameras_of, list_cameras, segmentation
 from workbench.core.cameras.report import CameraReport, ObjectSeen, join_reports
 from workbench.core.cameras.visibility import (
     Placement,
-    judge_placement,
     list_objects,
+    measure_placement,
     objects_to_see,
     placement_of,
     settings_of,
@@ -36,10 +36,10 @@ PEOPLE: CameraKey = ("human", "render_camera")
 FAR_FLOOR = LookAt((-1.5, 0.0, 0.5), (0.0, 0.0, 0.3))
 
 
-def judge_camera(
+def measure_camera(
     env: Any, camera: CameraKey, e: int, settings: CameraSettings | None = None, **how: Any
 ) -> CameraReport:
-    return judge_placement(env, e, placement_of(env, camera, e, settings), **how)
+    return measure_placement(env, e, placement_of(env, camera, e, settings), **how)
 
 
 def built(task: str, **kwargs: Any) -> Any:
@@ -64,7 +64,7 @@ def looking(look_at: LookAt, **others: Any) -> CameraSettings:
 
 
 def in_all_envs(env: Any, placement: Placement) -> CameraReport:
-    return join_reports([judge_placement(env, e, placement) for e in range(N)])
+    return join_reports([measure_placement(env, e, placement) for e in range(N)])
 
 
 def cube_at(env: Any, e: int) -> Any:
@@ -90,7 +90,7 @@ def test_of_a_robot_its_hand_comes_first_and_what_is_near_its_tool_before_the_re
 
 
 def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:
-    report = join_reports([judge_camera(env, SENSOR, e) for e in range(N)])
+    report = join_reports([measure_camera(env, SENSOR, e) for e in range(N)])
     images = env.get_obs(env.get_info())["sensor_data"]["base_camera"]
     cube = segmentation_names(env)
     number = next(number for number, name in cube.items() if name == "cube")
@@ -104,7 +104,7 @@ def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:
     summary = seen(report, "cube").summary()
     assert (summary.present, summary.seen, summary.cut) == (N, 1.0, 0.0)
     assert summary.median_pixels == np.median(seen(report, "cube").pixels)
-    assert report.size == report.judged_size == (128, 128) and report.envs == (0, 1, 2)
+    assert report.size == report.measured_size == (128, 128) and report.envs == (0, 1, 2)
 
 
 def test_judging_leaves_no_trace(env: Any) -> None:
@@ -131,11 +131,11 @@ def test_judging_leaves_no_trace(env: Any) -> None:
     poses = read_poses(env)
     poses[..., 2] += 0.1
     for e in range(N):
-        judge_camera(env, SENSOR, e, settings=looking(FAR_FLOOR), poses=poses[e])
-    judge_camera(env, PEOPLE, 1, size=(32, 32))
-    judge_placement(env, 0, Placement(looking(FAR_FLOOR), mount="panda/panda_hand"))
+        measure_camera(env, SENSOR, e, settings=looking(FAR_FLOOR), poses=poses[e])
+    measure_camera(env, PEOPLE, 1, size=(32, 32))
+    measure_placement(env, 0, Placement(looking(FAR_FLOOR), mount="panda/panda_hand"))
     with pytest.raises(ValueError, match="no body 'nothing'"):
-        judge_placement(env, 0, Placement(looking(FAR_FLOOR), mount="nothing"))
+        measure_placement(env, 0, Placement(looking(FAR_FLOOR), mount="nothing"))
     assert state() == before
 
 
@@ -144,11 +144,11 @@ def test_what_the_robot_stands_before_is_said(env: Any) -> None:
     x, y, z = cube_at(env, 0)
     behind = looking(LookAt((-1.2, 0.0, z + 0.05), (x, y, z)), fov=0.6)
     above = looking(LookAt((x, y, 0.5), (x, y, 0.0)), fov=0.6)
-    report = judge_placement(env, 0, Placement(behind))
+    report = measure_placement(env, 0, Placement(behind))
     cube = seen(report, "cube")
     assert cube.pixels[0] == 0 and cube.unhindered[0] > 5 and cube.hidden_share[0] == 1
     assert cube.summary().wholly_hidden == 1 and report.env_marks(["cube"])[0] == 0
-    free = judge_placement(env, 0, Placement(above))
+    free = measure_placement(env, 0, Placement(above))
     cube = seen(free, "cube")
     assert cube.pixels[0] == cube.unhindered[0] > 50 and cube.hidden_share[0] == 0 and not cube.cut[0]
     assert free.env_marks(["cube"])[0] > 0.7 and 0.3 < cube.margin[0] < 0.5
@@ -157,7 +157,7 @@ def test_what_the_robot_stands_before_is_said(env: Any) -> None:
 def test_what_stands_behind_another_object_is_said(env: Any) -> None:
     # From under the table: the table is in the way, and the robot is not.
     x, y, z = cube_at(env, 0)
-    report = judge_placement(env, 0, Placement(looking(LookAt((x + 0.02, y, -0.3), (x, y, z)))))
+    report = measure_placement(env, 0, Placement(looking(LookAt((x + 0.02, y, -0.3), (x, y, z)))))
     cube = seen(report, "cube")
     assert cube.unhindered[0] == cube.pixels[0] == 0 and cube.alone[0] > 20 and cube.covered_share[0] == 1
     assert cube.summary().covered == 1 and cube.summary().wholly_hidden == 0
@@ -165,8 +165,8 @@ def test_what_stands_behind_another_object_is_said(env: Any) -> None:
 
 def test_a_cut_object_and_one_out_of_view_are_told_apart(env: Any) -> None:
     x, y, z = cube_at(env, 1)
-    beside = judge_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 0.2, 0)), fov=0.9)))
-    away = judge_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 2, 0)), fov=0.9)))
+    beside = measure_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 0.2, 0)), fov=0.9)))
+    away = measure_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 2, 0)), fov=0.9)))
     assert seen(beside, "cube").cut[0] and seen(beside, "cube").pixels[0] > 0
     assert not seen(away, "cube").cut[0] and seen(away, "cube").pixels[0] == 0
     assert np.isnan(seen(away, "cube").hidden_share[0]) and seen(away, "cube").summary().seen == 0
@@ -183,7 +183,7 @@ def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stop
         at = np.array([x, y, 0.4])
         at[axis] += by
         position: Any = tuple(map(float, at))
-        return seen(judge_placement(env, 1, Placement(replace(down, position=position))), "cube")
+        return seen(measure_placement(env, 1, Placement(replace(down, position=position))), "cube")
 
     for axis in (0, 1):
         for side in (-1, 1):
@@ -202,10 +202,10 @@ def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stop
 def test_a_smaller_picture_has_the_same_view_and_counts_the_cameras_own_pixels(env: Any) -> None:
     x, y, _ = cube_at(env, 0)
     settings = looking(LookAt((x - 0.3, y, 0.5), (x, y, 0)), width=320, height=200, fov=0.8)
-    whole = judge_placement(env, 0, Placement(settings))
+    whole = measure_placement(env, 0, Placement(settings))
     for size in [(160, 100), (64, 64), small_size(320, 200)]:
-        small = judge_placement(env, 0, Placement(settings), size=size)
-        assert (small.size, small.judged_size) == ((320, 200), size)
+        small = measure_placement(env, 0, Placement(settings), size=size)
+        assert (small.size, small.measured_size) == ((320, 200), size)
         assert seen(small, "cube").pixels[0] == pytest.approx(seen(whole, "cube").pixels[0], rel=0.15)
         assert_allclose(small.depth.background, whole.depth.background, atol=0.03)
     assert small_size(320, 200) == (102, 64) and small_size(20, 40) == (20, 40)
@@ -233,7 +233,7 @@ def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
     mounted = Placement(with_pose(looking(FAR_FLOOR), local), mount="panda/panda_hand")
     for e in range(N):
         there = Placement(with_pose(looking(FAR_FLOOR), compose(poses[e, hand], local)))
-        ridden, still = judge_placement(env, e, mounted), judge_placement(env, e, there)
+        ridden, still = measure_placement(env, e, mounted), measure_placement(env, e, there)
         assert_array_equal(seen(ridden, "cube").pixels, seen(still, "cube").pixels)
 
 
@@ -241,28 +241,28 @@ def test_a_moment_of_the_past_is_judged_where_its_bodies_were(env: Any) -> None:
     cube = scene_index(env).names.index("cube")
     past = read_poses(env)
     past[:, cube, :3] += [0.0, 5.0, 0.0]
-    assert (seen(judge_camera(env, SENSOR, 0, poses=past[0]), "cube").pixels == 0).all()
-    assert (seen(judge_camera(env, SENSOR, 0), "cube").pixels > 0).all()
+    assert (seen(measure_camera(env, SENSOR, 0, poses=past[0]), "cube").pixels == 0).all()
+    assert (seen(measure_camera(env, SENSOR, 0), "cube").pixels > 0).all()
 
 
 def test_reports_are_joined_and_the_worst_env_comes_first(env: Any) -> None:
     past = read_poses(env)
     past[:, scene_index(env).names.index("cube"), :3] += [0.0, 5.0, 0.0]
-    now, last = judge_camera(env, SENSOR, 0), judge_camera(env, SENSOR, 2)
-    then = judge_camera(env, SENSOR, 1, poses=past[1])
+    now, last = measure_camera(env, SENSOR, 0), measure_camera(env, SENSOR, 2)
+    then = measure_camera(env, SENSOR, 1, poses=past[1])
     both = join_reports([now, last, then])
     assert both.envs == (0, 2, 1) and both.worst_first()[0] == 2
     assert both.pictures == now.pictures + last.pictures + then.pictures
     assert seen(both, "cube").summary().seen == pytest.approx(2 / 3)
     with pytest.raises(ValueError, match="different"):
-        join_reports([now, judge_camera(env, PEOPLE, 0, size=(32, 32))])
+        join_reports([now, measure_camera(env, PEOPLE, 0, size=(32, 32))])
     with pytest.raises(ValueError, match="no object dragon"):
         both.env_marks(["dragon"])
 
 
 def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> None:
     env = built("PickCube-v1")
-    sensor, people = judge_camera(env, SENSOR, 0), judge_camera(env, PEOPLE, 0, size=(128, 128))
+    sensor, people = measure_camera(env, SENSOR, 0), measure_camera(env, PEOPLE, 0, size=(128, 128))
     assert seen(sensor, "goal_site").never_drawn and seen(sensor, "goal_site").pixels[0] == 0
     assert not seen(people, "goal_site").never_drawn and seen(people, "goal_site").pixels[0] > 0
     assert [thing.name for thing in sensor.wanted_objects()] == ["cube"]
@@ -272,9 +272,9 @@ def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> N
 
 def test_what_cannot_be_judged_is_refused_by_name(env: Any) -> None:
     with pytest.raises(ValueError, match=r"base_camera \(sensor\)"):
-        judge_camera(env, ("sensor", "nothing"), 0)
+        measure_camera(env, ("sensor", "nothing"), 0)
     with pytest.raises(IndexError, match="out of range for 3"):
-        judge_camera(env, SENSOR, N)
+        measure_camera(env, SENSOR, N)
     with pytest.raises(ValueError, match="near plane"):
-        judge_placement(env, 0, Placement(looking(FAR_FLOOR, near=2.0, far=1.0)))
+        measure_placement(env, 0, Placement(looking(FAR_FLOOR, near=2.0, far=1.0)))
     assert {c.name for c in list_cameras(env)} == {"base_camera", "render_camera"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from workbench.core.capture.recorded_state import apart
+from workbench.core.capture.recorded_state import state_distance
 
 
 def test_a_state_is_as_far_as_its_furthest_body_and_joint() -> None:
@@ -13,14 +13,14 @@ def test_a_state_is_as_far_as_its_furthest_body_and_joint() -> None:
     cube[3] = arm[3] = 1
     was = {"actors/cube": cube, "articulations/arm": arm}
     now = {name: state.copy() for name, state in was.items()}
-    assert apart(now, was) == (0, 0)
+    assert state_distance(now, was) == (0, 0)
     now["actors/cube"][1] = 0.25
     now["articulations/arm"][14] = -0.5
     now["articulations/arm"][16] = 9  # a velocity
-    assert apart(now, was) == pytest.approx((0.25, 0.5))
+    assert state_distance(now, was) == pytest.approx((0.25, 0.5))
 
 
 @pytest.mark.parametrize("count", [12, 13, 20])
 def test_the_state_of_a_controller_is_no_pose(count: int) -> None:
     name = "controller/arm"
-    assert apart({name: np.ones(count)}, {name: np.zeros(count)}) == (0, 0)
+    assert state_distance({name: np.ones(count)}, {name: np.zeros(count)}) == (0, 0)

@@ -14,7 +14,7 @@ import sapien
 import torch
 from mani_skill.utils.structs import Actor
 
-from tests.core.single_env_judge import Bare, batch_of, single
+from tests.core.stock_env import Bare, batch_of, single
 
 
 class Drawing(Bare):

@@ -242,7 +242,7 @@ def test_steps_and_judgements_tell_both_halves(odd_task: Path) -> None:
     task = TaskEnv(open_env(env))
     task.reset(seed=0)
     step = task.step(np.zeros((3, 8), np.float32))
-    for told in (step, task.judge(np.zeros((3, 8), np.float32))):
+    for told in (step, task.rescore(np.zeros((3, 8), np.float32))):
         assert told.others["phase"].texts == ("reach",) and told.others["stage"].numbers == 2
         assert told.others["best"].what == "None" and told.others["words"].texts[2] == "cube 2"
         progress: Any = told.others["progress"].numbers

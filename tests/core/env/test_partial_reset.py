@@ -15,7 +15,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 
-from tests.core.single_env_judge import Bare, batch_of, single
+from tests.core.stock_env import Bare, batch_of, single
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.env.partial_reset import active_controllers
 from workbench.core.env.task_env import TaskEnv

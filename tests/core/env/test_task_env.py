@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from tests.core.single_env_judge import Bare
+from tests.core.stock_env import Bare
 from tests.drive.envs import PUSH_CUBE, batched, stock
 from workbench.core import backends
 from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
@@ -141,7 +141,7 @@ def test_judging_the_present_moment_leaves_nothing_behind() -> None:
     env = TaskEnv(batched(DrawsWhenAsked, 3), 50)
     env.reset(seed=0)
     env.step(np.zeros((3, 8), np.float32))
-    first, again = env.judge(), env.judge(np.zeros((3, 8), np.float32))
+    first, again = env.rescore(), env.rescore(np.zeros((3, 8), np.float32))
     assert not first.reward.any() and first.action is None and again.reward.all()
     for name in ("drawn", "looks"):
         assert np.array_equal(first.evaluate[name], again.evaluate[name]), name
@@ -166,7 +166,7 @@ class TellsOfEach(PUSH_CUBE):
 @pytest.mark.parametrize("obs_mode", ["state", "state_dict"])
 def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None:
     env = TaskEnv(batched(TellsOfEach, 4, obs_mode=obs_mode), 50)
-    for step in (env.reset(seed=0), env.step(np.zeros((4, 8), np.float32)), env.judge()):
+    for step in (env.reset(seed=0), env.step(np.zeros((4, 8), np.float32)), env.rescore()):
         assert step.terminated.tolist() == [False, True, True, False]
         assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
         assert not step.truncated.any()
@@ -345,11 +345,11 @@ def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.Mo
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
     taken = {wanted: choose_backend(wanted, render=False).simulation for wanted in get_args(backends.Backend)}
     assert taken == {"auto": "cpu", "cpu": "cpu", "gpu": "gpu"}
-    told = backends.gpu_left_alone("auto")
+    told = backends.unused_gpu_text("auto")
     assert told is not None and "--backend gpu" in told and "passed its tests on no machine" in told
-    assert backends.gpu_left_alone("cpu") is backends.gpu_left_alone("gpu") is None
+    assert backends.unused_gpu_text("cpu") is backends.unused_gpu_text("gpu") is None
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
-    assert backends.gpu_left_alone("auto") is None
+    assert backends.unused_gpu_text("auto") is None
 
 
 @pytest.mark.parametrize(

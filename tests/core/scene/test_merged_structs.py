@@ -16,7 +16,7 @@ from mani_skill.utils.structs import Actor, Articulation, Link
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import box, by_hand
-from tests.core.single_env_judge import Bare, batch_of, follow
+from tests.core.stock_env import Bare, batch_of, follow
 from workbench.core.capture.inspect_env import list_contacts
 
 

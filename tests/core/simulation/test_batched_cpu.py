@@ -19,7 +19,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
-from tests.core.single_env_judge import put_in_same_state
+from tests.core.stock_env import put_in_same_state
 from workbench.core.env.cpu_scene import batched_class
 from workbench.core.rules import Degree
 

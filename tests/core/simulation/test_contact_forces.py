@@ -17,7 +17,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import box
-from tests.core.single_env_judge import Bare, batch_of, put_in_same_state, single
+from tests.core.stock_env import Bare, batch_of, put_in_same_state, single
 from workbench.core.capture.inspect_env import Contact, list_contacts
 from workbench.core.scene.scene_index import scene_index
 

@@ -21,7 +21,7 @@ import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.cameras.render import step_pictures, take_pictures
 from workbench.core.cameras.report import join_reports
-from workbench.core.cameras.visibility import judge_placement, placement_of
+from workbench.core.cameras.visibility import measure_placement, placement_of
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.scene.scene_index import read_poses, scene_index
 
@@ -134,7 +134,7 @@ def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
         (human,) = take_pictures(hiding, e, [HUMAN])
         np.testing.assert_array_equal(human.rgb, people[e])
     report = join_reports(
-        [judge_placement(hiding, e, placement_of(hiding, ("sensor", "base_camera"), e)) for e in range(N)]
+        [measure_placement(hiding, e, placement_of(hiding, ("sensor", "base_camera"), e)) for e in range(N)]
     )
     cube = next(seen for seen in report.objects if seen.name == "cube")
     assert (cube.pixels > 0).tolist() == [True, False]

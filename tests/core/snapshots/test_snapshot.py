@@ -29,8 +29,8 @@ from workbench.core.snapshots.gpu_state import read_gpu_state, write_gpu_state
 from workbench.core.snapshots.snapshot import (
     begin_anew,
     in_this_state,
-    only_these_move,
     restore_snapshot,
+    step_only,
     take_snapshot,
 )
 
@@ -407,7 +407,7 @@ def test_while_some_envs_move_the_others_stay_as_they_are_and_the_processs_gener
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 3, 0))
     before, cubes = packs(pick), pick.cube.pose.raw_pose.clone()
-    with only_these_move(pick, [1, 4], take_snapshot(pick, [0, 2, 3, 5])):
+    with step_only(pick, [1, 4], take_snapshot(pick, [0, 2, 3, 5])):
         pick.cube.set_pose(
             Pose.create(cubes + torch.tensor([0, 0, 0.1, 0, 0, 0, 0]) * (torch.arange(N) == 2)[:, None])
         )
@@ -422,7 +422,7 @@ def test_while_some_envs_move_the_others_stay_as_they_are_and_the_processs_gener
         i not in (1, 4) for i in range(N)
     ]
     now = packs(pick)
-    with only_these_move(pick, [0], None):
+    with step_only(pick, [0], None):
         after(pick, random_actions(pick, 1, 2))
     assert [pack == was for pack, was in zip(packs(pick), now, strict=True)] == [i > 0 for i in range(N)]
     now = packs(pick)

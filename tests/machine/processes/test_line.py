@@ -16,14 +16,14 @@ from typing import get_args
 import pytest
 
 from tests.drive.waiting import until
-from workbench.machine.processes.wire import MOST_BYTES, Line, Unreadable, pack, pack_message
+from workbench.machine.processes.wire import MOST_BYTES, MessageSocket, Unreadable, pack, pack_message
 from workbench.session.protocol.messages import Event, Loading
 
 
 class Ends:
     def __init__(self) -> None:
         self.ours, self.theirs = socket.socketpair()
-        self.line = Line(self.ours, get_args(Event))
+        self.line = MessageSocket(self.ours, get_args(Event))
 
     def close(self) -> None:
         self.ours.close()
@@ -47,7 +47,7 @@ def test_messages_come_as_they_were_sent_whatever_their_size(ends: Ends, by_conn
 
     def send() -> None:
         """As a pool's process does, too: what is sent to it are not messages."""
-        line, connection = Line(ends.theirs), Connection(os.dup(ends.theirs.fileno()))
+        line, connection = MessageSocket(ends.theirs), Connection(os.dup(ends.theirs.fileno()))
         for event in sent:
             connection.send_bytes(pack_message(event)) if by_connection else line.send(event)
         connection.close()

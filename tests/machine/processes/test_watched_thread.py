@@ -7,7 +7,7 @@ import pytest
 
 from tests.drive.waiting import until
 from workbench.authoring.loading.watch import SourceWatcher
-from workbench.machine.processes.watched_thread import listen, say_failure, stop_listening, watched_thread
+from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening, watched_thread
 from workbench.session.process.job_lane import Job, Lane
 
 
@@ -47,7 +47,7 @@ def test_a_listener_that_fails_stops_nobody(said: list[str], caplog: pytest.LogC
 
     listen(closed_terminal)
     try:
-        say_failure("Something failed", ValueError("so"))
+        report_failure("Something failed", ValueError("so"))
     finally:
         stop_listening(closed_terminal)
     assert said and said[0].startswith("Something failed: ValueError: so.")

@@ -223,7 +223,7 @@ def test_a_version_that_fails_leaves_everything_as_it_was(desk: Desk, old: str, 
     assert failure.value.problem.file == str(desk.file)
     assert desk.task.env is env and state_of(desk.task) == state
     assert task_class(env) is cls
-    np.testing.assert_array_equal(desk.task.judge(before.action).reward, before.reward)
+    np.testing.assert_array_equal(desk.task.rescore(before.action).reward, before.reward)
     desk.step()
 
 

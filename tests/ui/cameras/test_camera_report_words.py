@@ -53,7 +53,7 @@ def report_of(*objects: ObjectSeen) -> CameraReport:
     return CameraReport(
         camera=("sensor", "base_camera"),
         size=(128, 128),
-        judged_size=(64, 64),
+        measured_size=(64, 64),
         envs=tuple(range(envs)),
         objects=objects,
         depth=depth_of({20: 10, 30: 5}, envs),

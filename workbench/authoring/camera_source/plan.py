@@ -18,7 +18,7 @@ from workbench.authoring.camera_source.write_pose import ANGLE_STEP, POSITION_ST
 from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.numbers import matrix_text, number_text
 from workbench.authoring.source.text import Refused, Replacement
-from workbench.core.camera_data import CameraKey, CameraSettings, in_words
+from workbench.core.camera_data import CameraKey, CameraSettings, setting_text
 from workbench.core.cameras.conventions import angle_between
 
 
@@ -189,6 +189,6 @@ def _differs(name: str, written: CameraSettings, has: CameraSettings) -> str:
         (*s.position, *s.quaternion) if name == "pose" else getattr(s, name) for s in (written, has)
     )
     return (
-        f"{name} is {in_words(there)} in the file and {in_words(here)} in the env, so something else changes it: an argument of "
+        f"{name} is {setting_text(there)} in the file and {setting_text(here)} in the env, so something else changes it: an argument of "
         "gym.make, a class that inherits, or code that runs later"
     )

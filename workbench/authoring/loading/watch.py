@@ -26,7 +26,7 @@ from pathlib import Path
 
 from workbench.authoring.loading.modules import decode
 from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
-from workbench.machine.processes.watched_thread import say_failure, watched_thread
+from workbench.machine.processes.watched_thread import report_failure, watched_thread
 
 LOOK_S = 0.04
 """Time between two looks."""
@@ -111,7 +111,7 @@ class SourceWatcher:
                 try:
                     self._on_change(changed)
                 except Exception as error:
-                    say_failure("What follows a saved file failed, and the file is watched further", error)
+                    report_failure("What follows a saved file failed, and the file is watched further", error)
 
     def _looks_new(self) -> bool:
         """Whether a file that is looked at this time is not as it was."""

@@ -21,7 +21,7 @@ from workbench.core.simulation.cpu_system import batched_system
 
 
 @dataclass
-class _Placed:
+class _PlacedCamera:
     camera: Any
     """ManiSkill's."""
     config: Any
@@ -42,7 +42,7 @@ class PlacedCameras:
     """
 
     def __init__(self) -> None:
-        self._placed: dict[CameraKey, _Placed] = {}
+        self._placed: dict[CameraKey, _PlacedCamera] = {}
 
     def forget(self) -> None:
         """The cameras that were placed are gone, with their env or without it."""
@@ -78,7 +78,7 @@ class PlacedCameras:
             else known.poses
         )
         changed = _set(env, key, camera, _config(config, settings), [_pose(settings)] * len(poses))
-        self._placed[key] = _Placed(camera, config, poses, settings)
+        self._placed[key] = _PlacedCamera(camera, config, poses, settings)
         return changed
 
     def put_back(self, env: Any) -> None:

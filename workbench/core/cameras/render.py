@@ -105,7 +105,7 @@ def take_pictures(
 
 
 @dataclass(frozen=True)
-class BegunPictures:
+class PendingPictures:
     """Pictures that the renderer is at work on; see `begin_pictures`."""
 
     _taken: tuple[tuple[Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
@@ -117,7 +117,7 @@ class BegunPictures:
 
 def begin_pictures(
     env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
-) -> BegunPictures:
+) -> PendingPictures:
     """Set the renderer to work on the cameras asked for, and return at once.
 
     SAPIEN hands a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
@@ -140,7 +140,7 @@ def begin_pictures(
     for name, kind, modalities in requests:
         _check(name, kind, modalities, cameras)
     if not requests:
-        return BegunPictures(())
+        return PendingPictures(())
     scene = env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
@@ -161,7 +161,7 @@ def begin_pictures(
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
             taken.append((cameras[kind, name], name, kind, env_index, tuple(modalities), where))
-    return BegunPictures(tuple(taken))
+    return PendingPictures(tuple(taken))
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:

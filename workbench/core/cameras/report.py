@@ -148,7 +148,7 @@ class CameraReport:
     camera: CameraKey
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
-    judged_size: tuple[int, int]
+    measured_size: tuple[int, int]
     """Of the pictures that were judged. Where they are smaller, what is less than a pixel in them is not seen."""
     envs: tuple[int, ...]
     """(E,) an env may come several times: at several moments, or with several seeds."""
@@ -256,7 +256,7 @@ def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
         raise ValueError("there is no report to join")
     first = reports[0]
     for other in reports[1:]:
-        if (other.camera, other.size, other.judged_size) != (first.camera, first.size, first.judged_size):
+        if (other.camera, other.size, other.measured_size) != (first.camera, first.size, first.measured_size):
             raise ValueError(
                 "reports of different cameras, or of pictures of different sizes, cannot be joined"
             )
@@ -283,7 +283,7 @@ def _end_to_end(parts: Sequence[_Part]) -> _Part:
     )
 
 
-def in_words(report: CameraReport, objects: tuple[str, ...]) -> str:
+def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
     """What was measured of these objects, for a person: ``cube: in 8 of 8 envs, about 210 pixels``."""
     told = []
     for thing in report.wanted_objects(objects):

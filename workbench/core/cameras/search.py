@@ -20,7 +20,13 @@ from workbench.core.cameras.conventions import (
     triple,
     with_pose,
 )
-from workbench.core.cameras.report import CameraReport, OfferedPlacement, SearchSpace, in_words, join_reports
+from workbench.core.cameras.report import (
+    CameraReport,
+    OfferedPlacement,
+    SearchSpace,
+    join_reports,
+    report_text,
+)
 from workbench.core.cameras.temporary import temporary_camera, undrawn
 from workbench.core.cameras.visibility import (
     Placement,
@@ -144,7 +150,7 @@ class _Search:
 
     def run(self) -> Iterator[OfferedPlacement]:
         drawn = [self._draw() for _ in range(self.space.candidates)]
-        self._look_at_best_of(drawn, self.keep)
+        self._measure_best_of(drawn, self.keep)
         for round_ in range(ROUNDS):
             chosen = self._chosen()
             if len(chosen) == self.space.best and chosen[-1][0] >= GOOD_ENOUGH:
@@ -152,12 +158,12 @@ class _Search:
             centres = [candidate for _, candidate, _ in chosen]
             reach = 0.12 / (round_ + 1)
             near = [self._draw_near(centre, reach) for centre in centres for _ in range(8)]
-            self._look_at_best_of(near, 2 * len(centres))
+            self._measure_best_of(near, 2 * len(centres))
         self.progress(self.total, self.total)
         for score, candidate, report in self._chosen():
             yield self._suggestion(score, candidate, report)
 
-    def _look_at_best_of(self, candidates: list[_Candidate], keep: int) -> None:
+    def _measure_best_of(self, candidates: list[_Candidate], keep: int) -> None:
         """Score all without the robot, which only hides and so bounds the score, and the best `keep` of them with it."""
         bare = self._measure(candidates)
         scores = [score_of(join_reports(row), self.space.objects) for row in bare]
@@ -281,7 +287,7 @@ class _Search:
             settings=settings,
             target=triple(candidate[1]),
             score=score,
-            words=in_words(report, self.space.objects),
+            words=report_text(report, self.space.objects),
             report=report,
             picture=picture_of(self.env, e, placement),
         )

@@ -149,7 +149,7 @@ def placement_of(env: Any, camera: CameraKey, e: int, settings: CameraSettings |
     return Placement(settings or settings_of(found, e), kind, mount_of(env, found), name)
 
 
-def judge_placement(
+def measure_placement(
     env: Any,
     e: int,
     placement: Placement,
@@ -181,7 +181,7 @@ def picture_of(
     poses: NDArray[np.float32] | None = None,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """What a camera that does not exist sees of one env, in its own size or another; raises as `judge_placement`."""
+    """What a camera that does not exist sees of one env, in its own size or another; raises as `measure_placement`."""
     pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
     with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         segmentation, depth = view.look(pose)
@@ -305,7 +305,7 @@ def measure(
     return CameraReport(
         camera=camera,
         size=(settings.width, settings.height),
-        judged_size=(width, height),
+        measured_size=(width, height),
         envs=(e,),
         objects=tuple(found),
         depth=_depths(depth, segmentation != 0, _mask(segmentation, here & counted)),

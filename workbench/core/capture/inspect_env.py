@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
 from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Section, Touching
-from workbench.core.capture.state_columns import apart, env_states, names_of_flat
+from workbench.core.capture.state_columns import env_states, flat_names, split_flat
 from workbench.core.env.evaluate_entries import flat_entries
 from workbench.core.env.task_env import TaskEnv, to_numpy
 from workbench.core.env_numbers import require_env
@@ -65,15 +65,15 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
 
 
 def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
-    """The last observation; a flattened one (N, D) taken apart by the names of what it was made of."""
+    """The last observation; a flattened one (N, D) split by the names of what it was made of."""
     leaves: list[Leaf] = []
     for name, value in flat_entries({} if task.obs is None else task.obs):
         # "state" is what ManiSkill calls the flattened part beside the pictures.
-        names = names_of_flat(task, value) if name in ("", "state") else None
+        names = flat_names(task, value) if name in ("", "state") else None
         if names is None:
             leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
         else:
-            leaves += [_leaf(*part) for part in apart(names, to_numpy(value[env]))]
+            leaves += [_leaf(*part) for part in split_flat(names, to_numpy(value[env]))]
     return tuple(leaves)
 
 
@@ -132,7 +132,7 @@ def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
     pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
     for contact in list_contacts(task.env, env):
         first, second = contact.bodies
-        # Shapes that are near have a contact too; without a push and a gap apart they do not touch.
+        # Shapes that are near have a contact too; without an impulse and with a gap they do not touch.
         if not contact.impulses.any() and not (contact.separations <= 0).any():
             continue
         ordered = (first, second) if first <= second else (second, first)

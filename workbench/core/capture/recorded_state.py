@@ -22,7 +22,7 @@ from workbench.core.snapshots.cpu_state import renew_physics
 _POSE = 7
 
 
-def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
+def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
     """What of a recorded state cannot be put into this env, and what of the env is in no such state: name and reason.
 
     Args:
@@ -47,12 +47,12 @@ def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, s
 
 
 def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
-    """Put a recorded state into each of these envs, except its `misfits`; the other envs are not touched.
+    """Put a recorded state into each of these envs, except its `state_mismatches`; the other envs are not touched.
 
     The env may be of other code (an actor gone, an arm with another joint), so states are matched by name and shape and
     written by ManiSkill's own setters. Fetches the tensors.
     """
-    missed = {i: misfits(env, i, state) for i, state in states.items()}
+    missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
     for name, struct in scene_index(env).states.items():
         fitting = [
             i for i in maniskill_private.envs_of(struct).tolist() if i in states and name not in missed[i]
@@ -99,7 +99,7 @@ def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
     return {name: to_numpy(state) for name, state in present_states(env).items()}
 
 
-def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
+def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
     """How far one env's state is from a recorded one: metres of the body that is furthest, and radians of the body
     or joint (of a sliding joint: metres) that is turned most. What only one of them has does not count.
 

@@ -35,7 +35,7 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     Raises:
         Exception: whatever a ``get_state_dict`` of the author's own raises.
     """
-    return read_states(task).columns()
+    return copy_states(task).columns()
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,16 @@ class StateReading:
             if parts is None:
                 columns[name] = column
             else:
-                columns.update({OBS + part: numbers for part, numbers, _ in apart(parts, column)})
+                columns.update({OBS + part: numbers for part, numbers, _ in split_flat(parts, column)})
         return columns
 
 
-def read_states(task: TaskEnv) -> StateReading:
+def copy_states(task: TaskEnv) -> StateReading:
     """Of the present moment, for who has time for `read_state_columns` later. Raises as it does."""
     rows, asked = _read(task.env)
     values: dict[str, Any] = {STATE + name: value for name, value in asked.items()}
     values.update(_observed(task))
-    flat = {name: names_of_flat(task, values[name]) for name in (OBS, OBS + "state") if name in values}
+    flat = {name: flat_names(task, values[name]) for name in (OBS, OBS + "state") if name in values}
     for name, value in values.items():
         if isinstance(value, torch.Tensor):
             values[name] = to_numpy(value) if value.is_cpu else value.clone()
@@ -137,7 +137,7 @@ _layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...
 )
 
 
-def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
+def flat_names(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
     """Name, shape and dtype of each part of a flattened observation (N, D), or None if they are not known.
 
     ManiSkill drops the names, so the env is observed once more without flattening. That runs the author's hooks, which
@@ -154,10 +154,10 @@ def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], 
     return known[2]
 
 
-def apart(
+def split_flat(
     names: list[tuple[str, tuple[int, ...], str]], numbers: NDArray
 ) -> Iterator[tuple[str, NDArray, str]]:
-    """Name, numbers (..., *shape) and dtype of each part, as `names_of_flat` has them, of a flattened observation (..., D)."""
+    """Name, numbers (..., *shape) and dtype of each part, as `flat_names` has them, of a flattened observation (..., D)."""
     at = 0
     for name, shape, dtype in names:
         width = math.prod(shape)

@@ -30,13 +30,13 @@ from workbench.core.broken_rule import (
 )
 from workbench.core.env.partial_reset import (
     KeptControllers,
+    explain_reset_errors,
     in_ascending_order,
     others,
     seeded,
-    told_whose_fault,
 )
 from workbench.core.env.strict import StrictMixin
-from workbench.core.maniskill_private import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
+from workbench.core.maniskill_private import asks_for_a_gpu, install_row_lookups, substeps_are_unwatched
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
@@ -224,7 +224,7 @@ class BatchedCpuMixin:
         self._kept_controllers = KeptControllers(self, untouched) if untouched else None
         self._to_begin = [] if self.begins_anew else None
         try:
-            with told_whose_fault(self, untouched), given:
+            with explain_reset_errors(self, untouched), given:
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
         except BaseException:
             self.drop_writes()
@@ -307,7 +307,7 @@ def batched_class(
         rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
         on_finding: called with each place where a rule is broken that does not stop the task, the first time.
     """
-    install_index_seams(batched_system)
+    install_row_lookups(batched_system)
     install_struct_access()
     namespace = {
         "__module__": task.__module__,

@@ -121,7 +121,7 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 
 
 @contextmanager
-def told_whose_fault(env: Any, untouched: list[int]) -> Iterator[None]:
+def explain_reset_errors(env: Any, untouched: list[int]) -> Iterator[None]:
     """Add a note with the task's line, and the buffers that shrank, to an exception that a reset raises.
 
     A hook that makes ``num_envs`` rows instead of ``len(env_idx)``, or replaces a buffer of N rows by the subset's, raises a

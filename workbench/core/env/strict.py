@@ -103,7 +103,7 @@ class StrictMixin:
     def _clear_sim_state(self) -> None:
         reset = self.scene._reset_mask
         if not bool(reset.all()):
-            self._strict_system.refuse_standing_writes(reset)
+            self._strict_system.refuse_unapplied_writes(reset)
         super()._clear_sim_state()  # type: ignore[misc]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
@@ -112,7 +112,7 @@ class StrictMixin:
             return super()._initialize_episode(env_idx, options)  # type: ignore[misc]
         state = system.copy_of_state()
         system.being_reset, system.stepped_in_reset = reset, False
-        system.told_elsewhere.clear()
+        system.reported_elsewhere.clear()
         system.hook_of_reset = place_of_hook(self._workbench_task, "_initialize_episode")
         watch = self._watch
         if not watch.looks:
@@ -158,9 +158,9 @@ class StrictMixin:
             if self._wrong_obs is None or isinstance(error, BrokenRule):
                 raise
             # ManiSkill cannot put it together ("Sizes of tensors must match"): the rule's words are the better ones.
-            hook, said = self._wrong_obs  # type: ignore[misc]
+            hook, problem = self._wrong_obs  # type: ignore[misc]
             place = place_of_hook(self._workbench_task, hook)
-            raise WrongReturn(said, hook, "observation-rows", place) from error
+            raise WrongReturn(problem, hook, "observation-rows", place) from error
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
@@ -169,11 +169,11 @@ class StrictMixin:
         return obs
 
     def _observed(self, hook: str, obs: Any) -> None:
-        said = wrong_observation(obs, self.num_envs)
-        if said is not None:
-            self._wrong_obs = hook, said
-            self._returned("observation-rows", hook, said)
+        problem = wrong_observation(obs, self.num_envs)
+        if problem is not None:
+            self._wrong_obs = hook, problem
+            self._returned("observation-rows", hook, problem)
 
-    def _returned(self, rule: str, hook: str, said: str | None) -> None:
-        if said is not None:
-            self.broken_rules.returned(rule, hook, said, place_of_hook(self._workbench_task, hook))
+    def _returned(self, rule: str, hook: str, problem: str | None) -> None:
+        if problem is not None:
+            self.broken_rules.returned(rule, hook, problem, place_of_hook(self._workbench_task, hook))

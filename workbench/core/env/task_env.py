@@ -226,9 +226,9 @@ class TaskEnv:
         The step's reward is zero, as after a reset: a reward is for an action, and none was made.
         """
         report = restore_snapshot(self.env, snapshot, env_idx, source, fresh_physics)
-        return self.judge(), report
+        return self.rescore(), report
 
-    def judge(self, action: NDArray[np.float32] | None = None) -> StepResult:
+    def rescore(self, action: NDArray[np.float32] | None = None) -> StepResult:
         """What the task says of the present moment: evaluate, observation, reward. Nothing moves.
 
         Args:

@@ -37,7 +37,7 @@ _X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
-class Part:
+class MeshPart:
     """One mesh with one material on one body of one env, not read yet."""
 
     key: Hashable
@@ -59,7 +59,7 @@ def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_
     walk = _RenderWalk(max_faces, max_texels)
     rendered = env.scene.can_render()
     instances: dict[Hashable, list[tuple[int, int]]] = {}
-    first: dict[Hashable, Part] = {}
+    first: dict[Hashable, MeshPart] = {}
     for body, kind in enumerate(index.kinds):
         for env_index, entity in enumerate(index.entities[:, body]):
             if entity is None:
@@ -94,7 +94,7 @@ def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_
     )
 
 
-def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[Part]:
+def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
     body = entity.find_component_by_type(physx.PhysxRigidBaseComponent)
     grey = _GREY[kind]
     material = Material((grey, grey, grey, 1.0), roughness=0.8)
@@ -105,7 +105,7 @@ def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[Part]:
         def read(make: Callable[[], Mesh] = make, place: _Placement = place) -> tuple[Mesh, Material]:
             return place.apply(with_normals(make())), material
 
-        yield Part((key, place.key, kind), read)
+        yield MeshPart((key, place.key, kind), read)
 
 
 class _RenderWalk:
@@ -115,7 +115,7 @@ class _RenderWalk:
         self._max_faces, self._max_texels = max_faces, max_texels
         self._textures: list[tuple[Any, NDArray[np.uint8] | None]] = []
 
-    def parts(self, entity: Any) -> Iterator[Part]:
+    def parts(self, entity: Any) -> Iterator[MeshPart]:
         body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
         if body is None:
             return
@@ -127,7 +127,7 @@ class _RenderWalk:
                 material, texture = self._material(part.material, visibility)
                 source = _source(shape, part, index)
                 key = (source.key, place.key, _material_key(material), texture)
-                yield Part(key, lambda s=source, p=place, m=material, t=texture: self._read(s, p, m, t))
+                yield MeshPart(key, lambda s=source, p=place, m=material, t=texture: self._read(s, p, m, t))
 
     def _read(
         self, source: _Source, place: _Placement, material: Material, texture: int | None

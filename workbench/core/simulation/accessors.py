@@ -57,11 +57,11 @@ def install_struct_access() -> None:
     """
     for owner, name, group in STATE_PROPERTIES:
         stock: property = owner.__dict__[name]
-        getter = _told_reads(stock.fget, name, group)  # type: ignore[arg-type]
-        setter = None if stock.fset is None else _told_writes(stock.fset, name, group)
+        getter = _checked_reads(stock.fget, name, group)  # type: ignore[arg-type]
+        setter = None if stock.fset is None else _checked_writes(stock.fset, name, group)
         setattr(owner, name, property(getter, setter, doc=stock.__doc__))
     for name in TARGET_SETTERS:
-        setattr(Articulation, name, _told_writes(Articulation.__dict__[name], "drive targets", "targets"))
+        setattr(Articulation, name, _checked_writes(Articulation.__dict__[name], "drive targets", "targets"))
 
 
 def _rows(struct: Any, group: Group) -> torch.Tensor:
@@ -72,7 +72,7 @@ def _rows(struct: Any, group: Group) -> torch.Tensor:
     return struct._data_index
 
 
-def _told_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Callable[[Any], Any]:
+def _checked_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Callable[[Any], Any]:
     velocity = name.endswith("velocity")
 
     def get(self: Any) -> Any:
@@ -88,7 +88,7 @@ def _told_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Callabl
     return get
 
 
-def _told_writes(stock: Callable[..., None], name: str, group: Group) -> Callable[..., None]:
+def _checked_writes(stock: Callable[..., None], name: str, group: Group) -> Callable[..., None]:
     # "targets" is what an author may call the value of `set_joint_drive_targets`.
     def put(self: Any, targets: Any, *args: Any, **kwargs: Any) -> None:
         system = batched_system(self.scene)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from workbench.core.simulation.contact_queries import ContactReader, CpuArray, ImpulseQuery
 from workbench.core.simulation.drawn_poses import Places, bodies_elsewhere
 from workbench.core.simulation.mirrors import Group, Mirror, Mirrors, refuse_nan
-from workbench.core.simulation.state_layout import Layout, check_layout, lay_out
+from workbench.core.simulation.state_layout import StateLayout, check_layout, lay_out
 from workbench.core.simulation.stepping import Stepper
 
 _TOO_EARLY = (
@@ -78,7 +78,7 @@ class BatchedCpuSystem:
         self.systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]  # pyright: ignore
         self.stepper = Stepper(self.systems, self.scenes, threads)
         self.contacts = ContactReader(self.systems)
-        self._layout: Layout | None = None
+        self._layout: StateLayout | None = None
         self._found: Mirrors | None = None
         self._packed: NDArray[np.float32] | None = None
         self._posed: NDArray[np.float32] | None = None
@@ -131,11 +131,11 @@ class BatchedCpuSystem:
         if self.stepper.step():
             self._stepped()
 
-    def hold_still(self, envs: Collection[int]) -> None:
+    def freeze_envs(self, envs: Collection[int]) -> None:
         """From now on PhysX does not step these envs; the others and the task's hooks go on."""
         self._catch_up()
         self.stepper.forget()
-        self.stepper.still = frozenset(envs)
+        self.stepper.frozen = frozenset(envs)
 
     def keep_drives(self, envs: Sequence[int], flags: Sequence[NDArray[np.bool_]]) -> None:
         """Forget drive targets that were written for these envs while they stood still.
@@ -214,7 +214,7 @@ class BatchedCpuSystem:
         return self._layout is not None
 
     @property
-    def _laid_out(self) -> Layout:
+    def _laid_out(self) -> StateLayout:
         self._catch_up()
         if self._layout is None:
             raise RuntimeError(_TOO_EARLY)
@@ -334,7 +334,7 @@ class BatchedCpuSystem:
         self._moved()
 
     def _stepped(self) -> None:
-        self.contacts.stepped(self.stepper.still)
+        self.contacts.stepped(self.stepper.frozen)
         self._moved()
 
     def _moved(self) -> None:

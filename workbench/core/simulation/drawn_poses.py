@@ -11,7 +11,7 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 
-from workbench.core.simulation.state_layout import Layout
+from workbench.core.simulation.state_layout import StateLayout
 
 Places = Mapping[int, tuple[Any, NDArray[np.float32]]]
 """Entities and where to draw them (7,), by the ``id`` of the entity, which the value holds."""
@@ -19,7 +19,7 @@ NOWHERE_ELSE: Places = {}
 
 
 def bodies_elsewhere(
-    scenes: Sequence[sapien.Scene], layout: Layout, data: NDArray[np.float32], envs: Sequence[int]
+    scenes: Sequence[sapien.Scene], layout: StateLayout, data: NDArray[np.float32], envs: Sequence[int]
 ) -> dict[int, Places]:
     """By env, the bodies that the tensor has elsewhere than SAPIEN, and where; envs without such are left out.
 

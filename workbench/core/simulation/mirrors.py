@@ -9,7 +9,7 @@ import numpy as np
 import sapien
 from numpy.typing import NDArray
 
-from workbench.core.simulation.state_layout import BODY, Layout
+from workbench.core.simulation.state_layout import BODY, StateLayout
 
 Group = Literal["bodies", "links", "joints", "targets", "forces"]
 """What one ``gpu_fetch_*`` and its ``gpu_apply_*`` carry together."""
@@ -156,7 +156,7 @@ class Mirrors:
 
     def __init__(
         self,
-        layout: Layout,
+        layout: StateLayout,
         pack: Callable[[], Floats],
         link_poses: Callable[[], Floats],
         setter: Callable[[Any, str], Callable[[float], None]],

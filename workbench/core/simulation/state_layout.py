@@ -21,7 +21,7 @@ _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
 
 
 @dataclass(frozen=True)
-class Layout:
+class StateLayout:
     """Rows in the tensors, and positions in the concatenated packs.
 
     ``PhysxCpuSystem.pack()`` gives float32: each dynamic or kinematic body as quaternion wxyz, position, linear and angular
@@ -60,7 +60,7 @@ class Layout:
     index_of: dict[int, int]
 
 
-def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> Layout:
+def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> StateLayout:
     rows: list[Any] = []  # the component of each
     entity_at, env_of_row, body_at, joints_at = [], [], [], []
     roots: dict[int, tuple[int, Any]] = {}  # row and articulation of the first link of each
@@ -89,7 +89,7 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         return np.where(each < dof, start + at, packed)  # one zero behind all packs, which the padding reads
 
     entities = [component.entity for component in rows]
-    return Layout(
+    return StateLayout(
         bodies=[rows[row] for row in np.flatnonzero(~is_link)],
         body_rows=np.flatnonzero(~is_link),
         links=[rows[row] for row in np.flatnonzero(is_link)],
@@ -118,7 +118,7 @@ def _numbers(values: list[int]) -> NDArray[np.int64]:
 
 
 def check_layout(
-    layout: Layout, packed: NDArray[np.float32], link_poses: Callable[[], NDArray[np.float32]]
+    layout: StateLayout, packed: NDArray[np.float32], link_poses: Callable[[], NDArray[np.float32]]
 ) -> None:
     """Compare the packs with the getters, since SAPIEN documents neither their order nor their size.
 

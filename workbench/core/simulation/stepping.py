@@ -53,7 +53,7 @@ class Stepper:
         self._writes: list[Callable[[int], None]] = []
         self._packs: list[bytes] | None = None
         self._pose_packs: list[bytes] | None = None
-        self.still: frozenset[int] = frozenset()
+        self.frozen: frozenset[int] = frozenset()
         """Envs that are neither stepped nor given drive targets; their numbers stay."""
 
     def renew(self, env: int) -> None:
@@ -91,7 +91,7 @@ class Stepper:
         """Make the writes that were put off."""
         writes, self._writes = self._writes, []
         for env in range(len(self._systems)) if writes else ():
-            for write in writes if env not in self.still else ():
+            for write in writes if env not in self.frozen else ():
                 write(env)
 
     def catch_up(self) -> None:
@@ -106,7 +106,7 @@ class Stepper:
         packing = count > 1
 
         def advance(env: int) -> None:
-            if env not in self.still:
+            if env not in self.frozen:
                 for write in writes:
                     write(env)
                 step = self.step_once[env]

@@ -108,7 +108,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     def __init__(self, scenes: Sequence[sapien.Scene], *args: Any, **kwargs: Any) -> None:
         self._writes = Writes()
         self._stale: set[Group] = set()
-        self.told_elsewhere: set[str] = set()
+        self.reported_elsewhere: set[str] = set()
         """Of other envs, in the partial reset under way: the names of what was told already."""
         self._applying = 0
         self._outdated: set[int] = set()
@@ -135,7 +135,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             envs = struct._scene_idxs.long()
             others = struct.scene._reset_mask[envs] & ~self.being_reset[envs]
             if bool(others.any()):
-                self.told_elsewhere.add(struct.name)
+                self.reported_elsewhere.add(struct.name)
                 self.rules.breaks(
                     "other-env-written",
                     f"'{struct.name}' is written in {envs_named(envs[others])}, which "
@@ -280,7 +280,7 @@ class StrictCpuSystem(BatchedCpuSystem):
 
     # --- partial resets --------------------------------------------------------------------------------
 
-    def refuse_standing_writes(self, reset: torch.Tensor) -> None:
+    def refuse_unapplied_writes(self, reset: torch.Tensor) -> None:
         """Break the rule if a write to an env that is not in the mask `reset` (N,) was never applied."""
         for mirror in self._mirrors.all:
             if mirror.group == "targets":
@@ -315,7 +315,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             changed = mirror.rows[differs.any(axis=1)]
             changed = changed[~reset.numpy()[mirror.envs[changed]]]
             for name, mine in _by_name(changed, mirror.names):
-                if name in self.told_elsewhere:
+                if name in self.reported_elsewhere:
                     continue
                 self.rules.breaks(
                     "other-env-written",

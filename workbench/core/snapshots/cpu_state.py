@@ -28,7 +28,7 @@ _FAR = np.float32(99999)
 
 
 @dataclass(frozen=True)
-class Part:
+class PackedPart:
     """A body or an articulation in the packed state of an env."""
 
     name: str
@@ -44,7 +44,7 @@ class Part:
         return f"{'actor' if self.joints is None else 'articulation'} {self.name}"
 
 
-Contents = tuple[Part, ...]
+Contents = tuple[PackedPart, ...]
 """What the packed state of one env holds, in its order: bodies, then articulations."""
 
 
@@ -143,7 +143,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
                 plan.offsets[scene.slot_of[id(body.entity)]] = index, sum(part.size for part in parts)
             if not body.kinematic:
                 sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
-            parts.append(Part(name_of(body), None))
+            parts.append(PackedPart(name_of(body), None))
         roots = [link for link in links if link.is_root]
         for root in roots:
             articulation: Any = root.articulation
@@ -152,7 +152,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
             # SAPIEN's "scene-0_panda" has joints that are called "scene-0-panda_panda_joint1".
             prefix = articulation.name.replace("_", "-", 1) + "_"
             joints = tuple(joint.name.removeprefix(prefix) for joint in articulation.active_joints)
-            parts.append(Part(name, joints))
+            parts.append(PackedPart(name, joints))
         contents = tuple(parts)
         plan.contents.append(alike.setdefault(contents, contents))
         plan.sleepers.append(sleepers)
@@ -246,7 +246,7 @@ def write_cpu_state(
     return carried, missed
 
 
-def begin_cpu_state_anew(env: Any, env_idx: list[int]) -> None:
+def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
     """Give these envs a PhysX scene without a past, and the state that they have.
 
     What follows can then be had again to the last bit, from a snapshot of now and the same actions. A root of an
@@ -447,7 +447,7 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
     px: BatchedCpuSystem = scene.px
     px.packs()  # substeps that are still owed are made by the old systems
     default = physx.get_scene_config()
-    left = [i for i in env_idx if not _is_numbered_anew_alike(px.scenes[i])]
+    left = [i for i in env_idx if not _keeps_entity_ids(px.scenes[i])]
     try:
         for i in sorted(set(env_idx) - set(left)):
             old = px.systems[i]
@@ -463,7 +463,7 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
     return left
 
 
-def _is_numbered_anew_alike(scene: sapien.Scene) -> bool:
+def _keeps_entity_ids(scene: sapien.Scene) -> bool:
     return [entity.per_scene_id for entity in scene.entities] == [*range(1, len(scene.entities) + 1)]
 
 

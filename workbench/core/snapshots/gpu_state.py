@@ -52,7 +52,7 @@ def write_gpu_state(
     position, structs = dict(zip(env_idx, positions, strict=True)), scene_index(env).states
     for name, rows in state.states.items():
         if name not in structs and not np.isnan(rows[positions]).all():
-            missed[_words(name)] = "this env has none of this name"
+            missed[_plain_name(name)] = "this env has none of this name"
     for name, struct in structs.items():
         width = maniskill_private.joints_of(struct)
         kept = state.states.get(name, np.zeros((0, 0), np.float32))
@@ -61,10 +61,10 @@ def write_gpu_state(
         fits = kept.shape[1] == BODY + (2 + len(_JOINT_TENSORS)) * width
         fitting = [i for i in targets if fits and not np.isnan(kept[position[i]]).any()]
         if len(fitting) < len(targets):
-            missed[_words(name)] = "the snapshot has none of this name and shape: left as it is"
+            missed[_plain_name(name)] = "the snapshot has none of this name and shape: left as it is"
         if not fitting:
             continue
-        carried[_words(name)] = None
+        carried[_plain_name(name)] = None
         values = torch.from_numpy(kept[[position[i] for i in fitting]]).to(env.device)
         struct.set_state(values[:, : BODY + 2 * width], torch.tensor(fitting, device=env.device))
         if width:
@@ -77,7 +77,7 @@ def write_gpu_state(
     return carried, missed
 
 
-def _words(name: str) -> str:
+def _plain_name(name: str) -> str:
     kind, _, own = name.partition("/")
     return f"{kind.removesuffix('s')} {own}"
 

@@ -38,7 +38,7 @@ class WholeSnapshot:
 
 
 @dataclass
-class _Kept:
+class _SentPart:
     """A part as it was last: the value for identity, its bytes for equality, its number."""
 
     value: Any
@@ -60,7 +60,7 @@ class SnapshotPacker:
     1.4 ms. A reset of one env adds 5 KB.
     """
 
-    _kept: dict[Any, _Kept] = field(default_factory=dict)
+    _kept: dict[Any, _SentPart] = field(default_factory=dict)
     """The parts of the last snapshot, by name."""
     _buffers: dict[str, Buffer] = field(default_factory=dict)
     """The buffers of the last snapshot, by path."""
@@ -73,7 +73,7 @@ class SnapshotPacker:
         new: dict[int, bytes] = {}
         places: dict[int, int] = {}
         before, self._kept = self._kept, {}
-        for name, value in self._what_stays(snapshot).items():
+        for name, value in self._parts_of(snapshot).items():
             places[id(value)] = len(self._kept)
             self._kept[name] = self._part(before.get(name), value, new)
         self._buffers = snapshot.memory.task.buffers
@@ -85,7 +85,7 @@ class SnapshotPacker:
         pickler.dump(snapshot)
         return PackedSnapshot(body.getvalue(), None if same else keys, new)
 
-    def _what_stays(self, snapshot: Snapshot) -> dict[Any, Any]:
+    def _parts_of(self, snapshot: Snapshot) -> dict[Any, Any]:
         """What mostly stays, by name."""
         memory, task = snapshot.memory, snapshot.memory.task
         stays: dict[Any, Any] = {"contents": getattr(snapshot.simulation, "contents", ())}
@@ -98,7 +98,7 @@ class SnapshotPacker:
                 stays["buffer", path] = buffer
         return {name: value for name, value in stays.items() if value is not None}
 
-    def _part(self, kept: _Kept | None, value: Any, new: dict[int, bytes]) -> _Kept:
+    def _part(self, kept: _SentPart | None, value: Any, new: dict[int, bytes]) -> _SentPart:
         """The part with this value: that of the snapshot before, or a new one.
 
         Never an older one: the server drops what no kept moment needs, and only the newest is sure to be kept.
@@ -107,10 +107,10 @@ class SnapshotPacker:
             return kept
         pickled = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
         if kept is not None and kept.pickled == pickled:
-            return _Kept(value, pickled, kept.key)
+            return _SentPart(value, pickled, kept.key)
         self._next_key += 1
         new[self._next_key] = pickled
-        return _Kept(value, pickled, self._next_key)
+        return _SentPart(value, pickled, self._next_key)
 
 
 def unpack_snapshot(body: bytes, parts: Sequence[bytes]) -> Snapshot:

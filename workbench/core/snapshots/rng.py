@@ -34,7 +34,7 @@ class SharedRng(NamedTuple):
 
 
 @dataclass
-class _Seen:
+class _ReadStates:
     generators: list[np.random.RandomState]
     """Held: an address is somebody else's once its owner is gone."""
     memory: list[ctypes.Array[ctypes.c_char]]
@@ -55,7 +55,7 @@ class RngReader:
     """
 
     def __init__(self) -> None:
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, _ReadStates] = {}
 
     def read(self, purpose: str, generators: list[np.random.RandomState]) -> list[RngState]:
         """What ``get_state()`` of each gives. `purpose` tells one list of generators from another."""
@@ -69,7 +69,7 @@ class RngReader:
         if all(isinstance(b, np.random.MT19937) for b in bit_generators):
             memory = [_MEMORY.from_address(b.ctypes.state_address) for b in bit_generators]
             settled = not any(state[_HAS_GAUSS] for state in states)
-            self._seen[purpose] = _Seen(list(generators), memory, b"".join(memory), states, settled)
+            self._seen[purpose] = _ReadStates(list(generators), memory, b"".join(memory), states, settled)
         return states
 
     def write(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from workbench.core import maniskill_private
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.simulation.cpu_system import batched_system
-from workbench.core.snapshots.cpu_state import CpuState, begin_cpu_state_anew, read_cpu_state, write_cpu_state
+from workbench.core.snapshots.cpu_state import CpuState, make_cpu_exact_point, read_cpu_state, write_cpu_state
 from workbench.core.snapshots.gpu_state import GpuState, read_gpu_state, write_gpu_state
 from workbench.core.snapshots.rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
 from workbench.core.snapshots.task_state import TaskState, read_task_state, write_task_state
@@ -158,7 +158,7 @@ def begin_anew(env: Any, env_idx: list[int]) -> None:
     Args:
         env: batched on the CPU and reset at least once; wrappers are looked through.
     """
-    begin_cpu_state_anew(maniskill_private.open_env(env), env_idx)
+    make_cpu_exact_point(maniskill_private.open_env(env), env_idx)
 
 
 def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
@@ -262,7 +262,7 @@ def _pairs(
 
 
 @contextmanager
-def only_these_move(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
+def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
     """Within this, control steps move these envs only.
 
     The task's hooks run for all envs or for none, but on the CPU PhysX has a scene an env, and the others are not stepped. What
@@ -283,12 +283,12 @@ def only_these_move(env: Any, env_idx: Sequence[int], others: Snapshot | None) -
         return
     before = px.packs()
     flags = [flag.copy() for flag in px.drive_flags]
-    px.hold_still(set(range(env.num_envs)) - {int(i) for i in env_idx})
+    px.freeze_envs(set(range(env.num_envs)) - {int(i) for i in env_idx})
     try:
         yield
     finally:
         now = px.packs()
-        px.hold_still(())
+        px.freeze_envs(())
         if others is not None:
             still = [i for i in others.env_idx if now[i] == before[i]]
             moved = [i for i in others.env_idx if now[i] != before[i]]

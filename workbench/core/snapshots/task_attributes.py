@@ -38,7 +38,7 @@ _DEEPEST = 8
 
 
 @dataclass
-class Found:
+class TaskValue:
     """A value at the end of a path, and how to put another in its place."""
 
     path: str
@@ -53,7 +53,7 @@ class Walk:
     env: BaseEnv
     author: str
     """Module of the task's class: what is defined beside it is entered."""
-    leaves: list[Found] = field(default_factory=list)
+    leaves: list[TaskValue] = field(default_factory=list)
     omitted: dict[str, str] = field(default_factory=dict)
     entered: dict[int, Any] = field(default_factory=dict)
     """Objects that were met, by ``id``: held, and not entered a second time."""
@@ -82,7 +82,7 @@ def look_over(env: BaseEnv) -> Walk:
 
 def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth: int) -> None:
     if isinstance(value, PLAIN):
-        walk.leaves.append(Found(path, value, put))
+        walk.leaves.append(TaskValue(path, value, put))
         return
     if isinstance(value, (torch.Tensor, np.ndarray)):
         if isinstance(value, torch.Tensor) and value.untyped_storage().data_ptr() in walk.simulation:
@@ -90,11 +90,11 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
         if isinstance(value, np.ndarray) and value.dtype == object:
             walk.omitted[path] = "a numpy array of objects"
         else:
-            walk.leaves.append(Found(path, value, put))
+            walk.leaves.append(TaskValue(path, value, put))
         return
     if isinstance(value, tuple) and all(isinstance(item, PLAIN) for item in value):
         # As plain as its items. A list of them is one leaf too, but can be an env's each.
-        walk.leaves.append(Found(path, value, put))
+        walk.leaves.append(TaskValue(path, value, put))
         return
     if id(value) in walk.entered:
         return
@@ -110,7 +110,7 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
                 _enter(walk, item, f"{path}[{key!r}]", _putter(value, key), depth + 1)
     elif isinstance(value, list):
         if all(isinstance(item, PLAIN) for item in value):
-            walk.leaves.append(Found(path, value, put))
+            walk.leaves.append(TaskValue(path, value, put))
         else:
             for i, item in enumerate(value):
                 if not _is_ignored(type(item), walk.author):

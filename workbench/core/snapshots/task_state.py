@@ -11,7 +11,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.core.scene.scene_index import once_a_scene
-from workbench.core.snapshots.task_attributes import PLAIN, Found, look_over
+from workbench.core.snapshots.task_attributes import PLAIN, TaskValue, look_over
 
 _LARGEST_OF_BATCH = 1 << 16
 """Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
@@ -73,7 +73,7 @@ class _Scene:
     marks: dict[str, _Mark] = field(default_factory=dict)
     paths: frozenset[str] = frozenset()
 
-    def add(self, env: BaseEnv, leaves: list[Found]) -> None:
+    def add(self, env: BaseEnv, leaves: list[TaskValue]) -> None:
         for leaf in leaves:
             version = version_of(leaf.value) if isinstance(leaf.value, torch.Tensor) else 0
             self.marks[leaf.path] = _Mark(leaf.value, version, _kept(leaf.value, env.num_envs))

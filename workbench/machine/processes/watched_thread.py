@@ -28,14 +28,14 @@ def watched_thread(name: str, work: Callable[[], None]) -> threading.Thread:
             try:
                 return work()
             except Exception as error:
-                say_failure(f"The thread '{name}' failed and is started again", error)
+                report_failure(f"The thread '{name}' failed and is started again", error)
             threading.Event().wait(pause)
             pause = min(2 * pause, LONGEST_PAUSE)
 
     return threading.Thread(target=keep_at_it, name=name, daemon=True)
 
 
-def say_failure(what: str, error: BaseException) -> None:
+def report_failure(what: str, error: BaseException) -> None:
     """Tell whoever listens, or else the log, that part of the workbench itself failed.
 
     Args:

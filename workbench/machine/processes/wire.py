@@ -67,7 +67,7 @@ def value_type(question: type[Question[Any]]) -> Any:
 # --- lines -----------------------------------------------------------------------------------------
 
 
-class Line:
+class MessageSocket:
     """One end of a socket. Another thread than the one that receives may send.
 
     The author's code runs in the worker: it may write anything into the socket, and end in the middle of a message. So what

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 
 from workbench.machine.processes.confinement import confine
 from workbench.machine.processes.family import end_with_parent
-from workbench.machine.processes.wire import Line, Unpacker, pack, pack_message
+from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
 from workbench.recording.episode.encoded_pictures import EncodedPictures
 from workbench.recording.episode.episode import CameraTrack
 from workbench.recording.episode.row import text
@@ -94,7 +94,7 @@ def _be_a_reader(end: socket.socket, wanted: NewReader, nursery: int) -> None:
             confine(wanted.paths, MOST_MEMORY)
         else:
             confine(wanted.paths, MOST_MENDING, [wanted.writes])
-        serve(Line(end, get_args(Request)))
+        serve(MessageSocket(end, get_args(Request)))
     finally:
         os._exit(0)
 
@@ -106,7 +106,7 @@ def warm_up() -> None:
     """Import what reads an episode."""
 
 
-def serve(line: Line) -> None:
+def serve(line: MessageSocket) -> None:
     """Answer one request after the other, until nobody asks any more."""
     reader = _Reader()
     while True:

@@ -17,7 +17,7 @@ from typing import get_args
 
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import describe_exit
-from workbench.machine.processes.wire import Line, Unpacker, Unreadable, pack
+from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack
 from workbench.recording.reader.requests import Answer, Ended, Forget, NewReader, Request
 
 START_SECONDS = 60.0
@@ -67,7 +67,7 @@ class _Nursery:
         with self._lock:
             self._start()
 
-    def new_reader(self, wanted: NewReader) -> tuple[int, Line]:
+    def new_reader(self, wanted: NewReader) -> tuple[int, MessageSocket]:
         """Its process id and the line to it. Raises OSError."""
         ours, theirs = socket.socketpair()
         message = pack(wanted)
@@ -76,7 +76,7 @@ class _Nursery:
                 control = self._start()
                 try:
                     socket.send_fds(control, [message], [theirs.fileno()])
-                    return self._answer(control), Line(ours, get_args(Answer))
+                    return self._answer(control), MessageSocket(ours, get_args(Answer))
                 except (OSError, Unreadable):
                     self._end()  # somebody ended it: once more, with another
         ours.close()
@@ -152,7 +152,7 @@ class Reader:
         """Further files: what links in the folder lead to."""
         self._turns = _Turns()
         self._pid = 0
-        self._line: Line | None = None
+        self._line: MessageSocket | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
         """What those and the folder were when the present process began."""
         self._forgotten: deque[tuple[int, int]] = deque()
@@ -235,7 +235,7 @@ class Reader:
         with self._turns.turn(None):
             self._kill()
 
-    def _started(self) -> Line:
+    def _started(self) -> MessageSocket:
         paths = (self._folder, *sorted(self._allowed))
         # It may read what was there when it began: a folder that was made anew is another one.
         there = tuple(map(_identity, paths))
@@ -248,7 +248,7 @@ class Reader:
             self.process, self._there = next(self._numbers), there
         return self._line
 
-    def _send_forgotten(self, line: Line) -> None:
+    def _send_forgotten(self, line: MessageSocket) -> None:
         gone = []
         while self._forgotten:
             process, opened = self._forgotten.popleft()

@@ -21,7 +21,7 @@ from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.loading.copy_task import NoCopy, copy_task
 from workbench.authoring.loading.modules import read_exactly
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_data import CameraInfo, CameraKey, CameraSettings, differences, in_words
+from workbench.core.camera_data import CameraInfo, CameraKey, CameraSettings, differences, setting_text
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.view import Change, Wish, Writing
 
@@ -205,7 +205,7 @@ def not_as_written(wanted: CameraSettings, now: CameraSettings) -> str:
     """The numbers that are not as wanted, with both; empty where all are."""
 
     def said(settings: CameraSettings, what: str) -> str:
-        return in_words(vars(settings)["quaternion" if what == "orientation" else what])
+        return setting_text(vars(settings)["quaternion" if what == "orientation" else what])
 
     apart = differences(wanted, now)
     return "; ".join(f"{what}: {said(now, what)}, not {said(wanted, what)}" for what in apart)

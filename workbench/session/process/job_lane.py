@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import count
 
 from workbench.authoring.problem import Problem, shorten
-from workbench.machine.processes.watched_thread import say_failure, watched_thread
+from workbench.machine.processes.watched_thread import report_failure, watched_thread
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Lane:
                 self._on_failure(job, failure)
             except Exception as error:
                 # Of the workbench's own. Whoever shows the job must hear that it is over.
-                say_failure(f"The job '{job.progress.what}' failed", error)
+                report_failure(f"The job '{job.progress.what}' failed", error)
                 why = f"it failed within the workbench ({type(error).__name__}: {shorten(str(error))})"
                 self._on_failure(job, JobFailed(why))
             finally:

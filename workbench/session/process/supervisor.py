@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from workbench.authoring.problem import shorten
 from workbench.jobs.pool import Answer
 from workbench.machine.processes.family import describe_exit
-from workbench.machine.processes.watched_thread import say_failure
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Call, Unreadable
 from workbench.session.process.heartbeat import Beat, Busy, Doing, busy_at, fatal_error
 from workbench.session.process.memory_limit import in_words
@@ -279,7 +279,7 @@ class KeptWorker:
             return self._one_life()
         except Exception as error:
             # On this thread all the same: the kernel ends a worker with the thread that started it.
-            say_failure("The thread that minds the worker failed and is started again", error)
+            report_failure("The thread that minds the worker failed and is started again", error)
             with self._condition:
                 worker, self._worker = self._worker, None
                 self._deaths += 1
@@ -290,7 +290,7 @@ class KeptWorker:
         try:
             self._on_death(Death(why, False, False, None, "", gives_up))
         except Exception as failure:
-            say_failure("The page cannot be told that the worker was lost", failure)
+            report_failure("The page cannot be told that the worker was lost", failure)
         with self._condition:
             # A moment even for the first: what fails at once would use up all attempts.
             self._condition.wait_for(
@@ -324,10 +324,10 @@ class KeptWorker:
             try:
                 self._take_the_last_events(worker)
             except Exception as error:
-                say_failure("The last that a worker sent could not be taken", error)
+                report_failure("The last that a worker sent could not be taken", error)
         except Exception as error:
             # What it sent is an event, and not one that fits what is known: as bad as no event.
-            say_failure("What the worker sent could not be taken, so it is ended", error)
+            report_failure("What the worker sent could not be taken, so it is ended", error)
             life.why = (
                 f"sent what cannot be used ({type(error).__name__}: {shorten(str(error))}) and was ended"
             )

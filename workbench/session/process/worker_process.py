@@ -27,8 +27,8 @@ from typing import get_args
 
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import end_family, main_thread_ended
-from workbench.machine.processes.watched_thread import say_failure
-from workbench.machine.processes.wire import Line
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.processes.wire import MessageSocket
 from workbench.session.process.heartbeat import Beat, PulseReader, make_pulse
 from workbench.session.process.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.process.memory_limit import FamilyMemory
@@ -90,7 +90,7 @@ class WorkerProcess:
         finally:
             theirs.close()
             os.close(pulse)
-        self._line = Line(ours, get_args(Event))
+        self._line = MessageSocket(ours, get_args(Event))
         self._memory = FamilyMemory(self._process.pid)
         self._output = output
         self._waiting: deque[Request] = deque()
@@ -238,7 +238,7 @@ class WorkerProcess:
             except OSError:
                 return  # it is gone, and `receive` says so
             except Exception as error:
-                say_failure(f"A {type(request).__name__} could not be sent to the worker", error)
+                report_failure(f"A {type(request).__name__} could not be sent to the worker", error)
 
     def _read_output(self, name: str, stream: object) -> None:
         with stream as pipe:  # type: ignore[attr-defined]
@@ -256,7 +256,7 @@ class WorkerProcess:
                     # Such as a terminal that is closed. It is read on: a worker whose pipe is full stands still.
                     too_fast = False
                     if not failed:
-                        say_failure("What the task printed could not be shown", error)
+                        report_failure("What the task printed could not be shown", error)
                     failed = True
                 if not piece:
                     return

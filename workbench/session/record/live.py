@@ -19,7 +19,7 @@ from pathlib import Path
 
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer
 from workbench.jobs.task import Stepped, TaskDescription
-from workbench.machine.processes.watched_thread import say_failure, watched_thread
+from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.recording.reader.reading import mend, recovered_in_words
 from workbench.recording.writing.publish import RecordingError
 from workbench.session.record.status import RecordingStatus
@@ -155,7 +155,7 @@ class LiveRecorder:
         except Exception as error:
             # A disk that is full, an entry of evaluate() that is no number, a step that was lost; else it is ours.
             if not isinstance(error, (RecordingError, ValueError)):
-                say_failure("A step could not be recorded", error)
+                report_failure("A step could not be recorded", error)
             self._gather_with(None)
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from workbench.core.scene.shapes import SharedShapes
 from workbench.machine.processes.family import allocated_memory
-from workbench.machine.processes.watched_thread import say_failure
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryRow
 from workbench.recording.episode.source import UnreadableRecording
@@ -299,7 +299,7 @@ class Review:
             return
         except Exception as error:
             # What that process sent may fit nothing; a page that stays on "making" says nothing.
-            say_failure("Scenes of recordings could not be made", error)
+            report_failure("Scenes of recordings could not be made", error)
             for one in wanted:
                 say(one, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
 

@@ -22,7 +22,13 @@ from workbench.core.cameras.place import PlacedCameras
 from workbench.core.cameras.render import take_pictures
 from workbench.core.cameras.report import CameraReport
 from workbench.core.cameras.search import suggest_cameras
-from workbench.core.cameras.visibility import Placement, judge_placement, picture_of, placement_of, small_size
+from workbench.core.cameras.visibility import (
+    Placement,
+    measure_placement,
+    picture_of,
+    placement_of,
+    small_size,
+)
 from workbench.core.env.hot_swap import put_class, undone
 from workbench.jobs.open_task import OpenedTask, blamed
 from workbench.session.protocol.questions import CameraQuestion, DrawCamera, JudgeCamera, RunCameras
@@ -102,7 +108,7 @@ def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
     env = opened.env.env
     placement = placement_of(env, question.key, question.env, question.settings)
     size = small_size(placement.settings.width, placement.settings.height, JUDGED_SIDE)
-    return judge_placement(env, question.env, placement, question.poses, size)
+    return measure_placement(env, question.env, placement, question.poses, size)
 
 
 # --- the hooks of another text ---------------------------------------------------------------------

@@ -24,7 +24,7 @@ from workbench.core.camera_data import CameraKey, Picture
 from workbench.core.cameras.place import PlacedCameras
 from workbench.core.cameras.render import (
     KINDS,
-    BegunPictures,
+    PendingPictures,
     begin_pictures,
     list_cameras,
     recorded_pictures,
@@ -57,7 +57,7 @@ _PAUSE_SHARE = 0.3
 class _Begun:
     """Pictures of one kind that the renderer is at work on."""
 
-    pictures: BegunPictures
+    pictures: PendingPictures
     asked: tuple[CameraRequest, ...]
     number: int
     """Of the moment that they show."""
@@ -302,5 +302,5 @@ class WorkerCameras:
 def _observe_again(opened: OpenedTask) -> None:
     """A policy must not be given pictures of the size that was."""
     with blamed("step", opened.loaded, opened.env):
-        opened.env.judge()
+        opened.env.rescore()
     keep_observation_space(opened.env.env, opened.env.obs)

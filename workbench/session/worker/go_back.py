@@ -24,9 +24,9 @@ from workbench.core.snapshots.snapshot import (
     RestoreReport,
     Snapshot,
     in_this_state,
-    only_these_move,
     restore_memory,
     restore_snapshot,
+    step_only,
 )
 from workbench.jobs.from_recording import changed_since
 from workbench.jobs.open_task import OpenedTask, blamed, restore_checked, step_checked
@@ -66,7 +66,7 @@ def go_back(
             whole = own and snapshot.num_envs == env.num_envs == len(every)
             _, missed = restore_memory(env, snapshot.memory, every, positions, whole)
             report = RestoreReport((), {**missed, **_of_simulation(report)})
-        step = task.judge()
+        step = task.rescore()
     steps = max((len(request.ways[i].actions) for i in lived), default=0)
     return step, Restored(
         request.env_idx,
@@ -98,7 +98,7 @@ def _live_through(
     total = max(len(way.actions) for way in ways.values())
     began = time.monotonic()
     try:
-        with only_these_move(env, [*ways], task.snapshot(others) if others else None):
+        with step_only(env, [*ways], task.snapshot(others) if others else None):
             for done in count():
                 # The shorter ways begin later, so that all end with the same step.
                 for number, start in starts.items():
@@ -110,7 +110,7 @@ def _live_through(
                 if done == total:
                     break
                 waiting = [i for i, way in ways.items() if total - len(way.actions) > done]
-                px.hold_still({*others, *waiting})
+                px.freeze_envs({*others, *waiting})
                 at = {i: max(0, done - total + len(way.actions)) for i, way in ways.items()}
                 rows = {i: way.actions[at[i]] for i, way in ways.items()}
                 step_checked(task, opened.loaded, actions.action_of(task.parts, task.num_envs, rows))

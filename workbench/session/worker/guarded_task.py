@@ -19,7 +19,7 @@ from workbench.authoring.loading.modules import is_own_file
 from workbench.authoring.problem import Interrupted, Problem, TaskError, problem_from_exception
 from workbench.core.snapshots.snapshot import restore_snapshot
 from workbench.jobs.open_task import OpenedTask
-from workbench.machine.processes.wire import Line, Unreadable
+from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.session.process.heartbeat import Doing, PulseWriter
 from workbench.session.process.interrupts import Interrupts
 from workbench.session.protocol.messages import Event, Failed, Load, Request, is_a_step
@@ -35,7 +35,7 @@ class ServerLine:
     """
 
     def __init__(self, connection: int, interrupts: Interrupts) -> None:
-        self._line = Line(socket.socket(fileno=connection), get_args(Request), QUESTIONS)
+        self._line = MessageSocket(socket.socket(fileno=connection), get_args(Request), QUESTIONS)
         self._interrupts = interrupts
         self._queue: deque[Request] = deque()
         """What has come and was not carried out."""

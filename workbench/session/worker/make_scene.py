@@ -104,7 +104,7 @@ def make(wanted: MakeScene) -> TaskEnv:
 
 def scene_of(env: TaskEnv, wanted: MakeScene, tell: Callable[[int, int, str], None]) -> SceneMade:
     """Its geometry, and the poses of every body at each recorded state."""
-    from workbench.core.capture.recorded_state import misfits, write_states
+    from workbench.core.capture.recorded_state import state_mismatches, write_states
     from workbench.core.scene.read_scene import read_geometry
     from workbench.core.scene.scene_index import read_poses
 
@@ -115,7 +115,9 @@ def scene_of(env: TaskEnv, wanted: MakeScene, tell: Callable[[int, int, str], No
     count = min(len(values) for values in states.values())
     poses: list[Any] = []
     say = now_and_then(tell, _SAY_EVERY)
-    missed = misfits(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
+    missed = (
+        state_mismatches(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
+    )
     for row in range(count):
         say(row, count, f"putting it into state {row} of {count - 1}")
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})

@@ -280,7 +280,7 @@ def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) 
     action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
     try:
         with blamed("step", loaded, task):
-            judged = task.judge(action)
+            judged = task.rescore(action)
     except TaskError as error:
         if change.hooks & RESET_HOOKS:
             raise _MustRebuild(
@@ -337,4 +337,4 @@ def _restore(
     fits = action is not None and action.shape == (task.num_envs, actions.width(task.parts))
     with blamed("reset", opened.loaded, task):
         report = restore_snapshot(task.env, snapshot, there)
-        return task.judge(action if fits else None), report
+        return task.rescore(action if fits else None), report

@@ -160,7 +160,7 @@ class CameraVerdict:
                 f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; press a step to go there",
                 "steps",
             )
-        width, height = report.judged_size
+        width, height = report.measured_size
         return render(
             "camera_report",
             stale=studio.report_stale,

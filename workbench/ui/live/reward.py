@@ -17,7 +17,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.core.env.step_result import OtherEntry, StepResult
-from workbench.machine.text import lost_text, mean_text, number_text
+from workbench.machine.text import mean_text, nonfinite_text, number_text
 from workbench.session.history.curves import MOST, Curves
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.line_chart import LONGEST, YES_OR_NO, Line, LineChart
@@ -80,7 +80,7 @@ class CurvesPanel(PagePart[SessionView]):
 
 def said_of(reward: NDArray[np.float32]) -> str:
     """What the curve does not show of a step: in how many envs its reward is no finite number. Empty for none."""
-    lost = lost_text(reward)
+    lost = nonfinite_text(reward)
     if not lost:
         return ""
     rest = ": no curve goes on there." if not np.isfinite(reward).any() else "; the mean is of the others."
@@ -218,10 +218,10 @@ def _batch(values: NDArray) -> str:
         # Of a vector the envs are counted that have one anywhere in it.
         rows = values.reshape(len(values), -1)
         infinite = np.where(np.isinf(rows).any(axis=1), np.inf, 0.0)
-        return lost_text(np.where(np.isnan(rows).any(axis=1), np.nan, infinite))
+        return nonfinite_text(np.where(np.isnan(rows).any(axis=1), np.nan, infinite))
     if values.ndim == 1 and values.dtype.kind in "iuf" and len(values):
         if not np.isfinite(values).any():
-            return lost_text(values)
+            return nonfinite_text(values)
         return f"mean {mean_text(values, _float if values.dtype.kind == 'f' else lambda mean: f'{mean:.1f}')}"
     return ""
 
