@@ -17,7 +17,7 @@ from workbench.session.cameras.view import StudioCamera
 from workbench.ui.cameras.compare import what_differs
 from workbench.ui.cameras.export import as_lists, file_name, matrices_html
 from workbench.ui.cameras.suggest import box_edges, choices_of
-from workbench.ui.widgets.inputs import Arrival
+from workbench.ui.widgets.inputs import NewResult
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),
@@ -97,7 +97,7 @@ def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves()
 
 
 def test_what_was_asked_for_is_brought_into_sight_when_it_comes_and_only_then() -> None:
-    before, after, arrival = (object(),), (object(),), Arrival()
+    before, after, arrival = (object(),), (object(),), NewResult()
     assert not arrival.just_came(before), "nobody asked"
     arrival.asked(before)
     assert not arrival.just_came(before) and not arrival.just_came(())

@@ -10,15 +10,15 @@ import pytest
 from workbench.ui.server.access import (
     Admitted,
     Asked,
+    Decision,
     Entered,
     Gate,
-    Refused,
-    Verdict,
+    RefusedRequest,
     Why,
     cookie_name,
+    decide,
     host_is_ours,
     is_loopback,
-    judge,
     split_authority,
 )
 
@@ -27,8 +27,8 @@ GATE = Gate(TOKEN)
 KNOWN = Asked(path="/", host=["localhost:8080"], cookie=["workbench-token-8080=right"])
 
 
-def why(verdict: Verdict) -> Why | None:
-    return verdict.why if isinstance(verdict, Refused) else None
+def why(verdict: Decision) -> Why | None:
+    return verdict.why if isinstance(verdict, RefusedRequest) else None
 
 
 @pytest.mark.parametrize(
@@ -88,13 +88,13 @@ def test_the_host_is_quoted_as_it_was_sent() -> None:
     for websocket in (False, True):
         for gate in (GATE, Gate(None)):
             asked = replace(KNOWN, host=["LocalHost:8080"], websocket=websocket)
-            assert judge(gate, asked) == Admitted("LocalHost:8080")
+            assert decide(gate, asked) == Admitted("LocalHost:8080")
 
 
 @pytest.mark.parametrize("host", [[], [""], ["evil.example"], ["localhost:8080", "localhost:8080"]])
 def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list[str]) -> None:
     for websocket in (False, True):
-        assert why(judge(GATE, replace(KNOWN, host=host, websocket=websocket))) is Why.NAME
+        assert why(decide(GATE, replace(KNOWN, host=host, websocket=websocket))) is Why.NAME
 
 
 @pytest.mark.parametrize(
@@ -122,15 +122,15 @@ def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list
     ],
 )
 def test_an_origin_is_ours_where_scheme_host_and_port_lead_here(host: str, origin: str, ours: bool) -> None:
-    assert judge(Gate(None), Asked("/", [host], origin=[origin])) == (
-        Admitted(host) if ours else Refused(Why.SITE, "It came from a page of another site.")
+    assert decide(Gate(None), Asked("/", [host], origin=[origin])) == (
+        Admitted(host) if ours else RefusedRequest(Why.SITE, "It came from a page of another site.")
     )
 
 
 def test_an_origin_that_is_sent_twice_is_refused() -> None:
     ours = "http://localhost:8080"
-    assert why(judge(GATE, replace(KNOWN, origin=[ours]))) is None
-    assert why(judge(GATE, replace(KNOWN, origin=[ours, ours]))) is Why.SITE
+    assert why(decide(GATE, replace(KNOWN, origin=[ours]))) is None
+    assert why(decide(GATE, replace(KNOWN, origin=[ours, ours]))) is Why.SITE
 
 
 NAVIGATES, DOCUMENT = {"fetch_mode": ["navigate"]}, {"fetch_dest": ["document"]}
@@ -138,7 +138,7 @@ NAVIGATES, DOCUMENT = {"fetch_mode": ["navigate"]}, {"fetch_dest": ["document"]}
 
 @pytest.mark.parametrize("site", ["same-origin", "none"])
 def test_what_the_page_itself_asks_for_is_let_in(site: str) -> None:
-    assert why(judge(GATE, replace(KNOWN, fetch_site=[site]))) is None
+    assert why(decide(GATE, replace(KNOWN, fetch_site=[site]))) is None
 
 
 @pytest.mark.parametrize("site", [["cross-site"], ["same-site"], [""], ["none", "cross-site"]])
@@ -147,24 +147,24 @@ def test_what_a_foreign_page_loads_is_refused_and_a_link_that_a_person_followed_
 ) -> None:
     foreign = replace(KNOWN, fetch_site=site)
     for loaded in (foreign, replace(foreign, **NAVIGATES), replace(foreign, **DOCUMENT)):
-        assert why(judge(GATE, loaded)) is Why.SITE
+        assert why(decide(GATE, loaded)) is Why.SITE
     framed = replace(foreign, **NAVIGATES, fetch_dest=["iframe"])
-    assert why(judge(GATE, framed)) is Why.SITE
-    assert why(judge(GATE, replace(foreign, **NAVIGATES, **DOCUMENT))) is None
+    assert why(decide(GATE, framed)) is Why.SITE
+    assert why(decide(GATE, replace(foreign, **NAVIGATES, **DOCUMENT))) is None
     # Browsers differ in what they say of a handshake, which carries an Origin anyway.
-    assert why(judge(GATE, replace(foreign, websocket=True))) is None
+    assert why(decide(GATE, replace(foreign, websocket=True))) is None
 
 
 def test_the_cookie_is_the_one_of_the_port_that_the_browser_sees() -> None:
     assert cookie_name(8080) == "workbench-token-8080"
     for host, port in (("localhost", 80), ("localhost:80", 80), ("localhost:9000", 9000)):
         name = cookie_name(port)
-        assert why(judge(GATE, Asked("/", [host], cookie=[f"{name}={TOKEN}"]))) is None
+        assert why(decide(GATE, Asked("/", [host], cookie=[f"{name}={TOKEN}"]))) is None
         assert (
-            why(judge(GATE, Asked("/", [host], cookie=[f"{cookie_name(port + 1)}={TOKEN}"]))) is Why.NO_TOKEN
+            why(decide(GATE, Asked("/", [host], cookie=[f"{cookie_name(port + 1)}={TOKEN}"]))) is Why.NO_TOKEN
         )
-        assert why(judge(GATE, Asked("/", [host], cookie=[f"{name}=wrong"]))) is Why.OTHER_TOKEN
-        entered = judge(GATE, Asked(f"/?token={TOKEN}", [host]))
+        assert why(decide(GATE, Asked("/", [host], cookie=[f"{name}=wrong"]))) is Why.OTHER_TOKEN
+        entered = decide(GATE, Asked(f"/?token={TOKEN}", [host]))
         assert isinstance(entered, Entered)
         assert entered.set_cookie == f"{name}={TOKEN}; Path=/; HttpOnly; SameSite=Strict"
 
@@ -176,9 +176,9 @@ def test_a_wrong_cookie_hides_no_right_one() -> None:
         [f"a=b;{name}={TOKEN};  {name}=wrong"],
         [f"{name}=wrong", f"{name}={TOKEN}"],
     ):
-        assert why(judge(GATE, replace(KNOWN, cookie=cookies))) is None
+        assert why(decide(GATE, replace(KNOWN, cookie=cookies))) is None
     # A token may hold the sign that ends a cookie's name.
-    assert why(judge(Gate("a=b"), replace(KNOWN, cookie=[f"{name}=a=b"]))) is None
+    assert why(decide(Gate("a=b"), replace(KNOWN, cookie=[f"{name}=a=b"]))) is None
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_a_wrong_cookie_hides_no_right_one() -> None:
 )
 def test_the_right_token_in_the_address_goes_on_to_the_same_page_without_it(path: str, location: str) -> None:
     for cookie in ([], KNOWN.cookie):
-        entered = judge(GATE, replace(KNOWN, path=path, cookie=cookie))
+        entered = decide(GATE, replace(KNOWN, path=path, cookie=cookie))
         assert isinstance(entered, Entered)
         assert (entered.location, entered.by_page) == (location, False)
 
@@ -205,7 +205,7 @@ def test_the_right_token_in_the_address_goes_on_to_the_same_page_without_it(path
 def test_a_link_on_another_site_with_the_token_goes_on_by_a_page() -> None:
     followed = replace(KNOWN, path="/?token=right", **NAVIGATES, **DOCUMENT)
     for site, by_page in (("cross-site", True), ("same-site", True), ("none", False)):
-        entered = judge(GATE, replace(followed, fetch_site=[site]))
+        entered = decide(GATE, replace(followed, fetch_site=[site]))
         assert isinstance(entered, Entered) and entered.by_page is by_page
 
 
@@ -213,32 +213,32 @@ def test_a_link_on_another_site_with_the_token_goes_on_by_a_page() -> None:
     "query", ["token=wrong", "token=righ", "token=rightt", "token=right&token=right", f"token={quote('é')}"]
 )
 def test_a_wrong_or_doubled_token_in_the_address_is_refused_even_with_the_cookie(query: str) -> None:
-    assert why(judge(GATE, replace(KNOWN, path=f"/?{query}"))) is Why.OTHER_TOKEN
+    assert why(decide(GATE, replace(KNOWN, path=f"/?{query}"))) is Why.OTHER_TOKEN
 
 
 def test_the_token_in_a_handshakes_address_counts_for_nothing() -> None:
     handshake = replace(KNOWN, path="/?token=right", websocket=True)
-    assert judge(GATE, handshake) == Admitted("localhost:8080")
-    assert why(judge(GATE, replace(handshake, cookie=[]))) is Why.NO_TOKEN
+    assert decide(GATE, handshake) == Admitted("localhost:8080")
+    assert why(decide(GATE, replace(handshake, cookie=[]))) is Why.NO_TOKEN
 
 
 def test_another_word_of_the_address_is_no_token() -> None:
-    assert why(judge(GATE, replace(KNOWN, path="/?other=right", cookie=[]))) is Why.NO_TOKEN
-    assert why(judge(GATE, replace(KNOWN, path="/?other=right"))) is None
+    assert why(decide(GATE, replace(KNOWN, path="/?other=right", cookie=[]))) is Why.NO_TOKEN
+    assert why(decide(GATE, replace(KNOWN, path="/?other=right"))) is None
 
 
 def test_an_empty_token_in_the_address_is_none() -> None:
-    assert why(judge(GATE, replace(KNOWN, path="/?token="))) is None
-    assert why(judge(GATE, replace(KNOWN, path="/?token=", cookie=[]))) is Why.NO_TOKEN
+    assert why(decide(GATE, replace(KNOWN, path="/?token="))) is None
+    assert why(decide(GATE, replace(KNOWN, path="/?token=", cookie=[]))) is Why.NO_TOKEN
 
 
 def test_where_no_token_is_asked_for_one_in_the_address_is_a_word_like_others() -> None:
-    assert judge(Gate(None), replace(KNOWN, path="/?token=right")) == Admitted("localhost:8080")
+    assert decide(Gate(None), replace(KNOWN, path="/?token=right")) == Admitted("localhost:8080")
 
 
 @pytest.mark.parametrize("cookie", ["workbench-token-8080", f"workbench-token-8080=\udc80{TOKEN}"])
 def test_a_cookie_without_a_value_or_with_bytes_that_are_no_text_is_another_token(cookie: str) -> None:
-    assert why(judge(GATE, replace(KNOWN, cookie=[cookie]))) is Why.OTHER_TOKEN
+    assert why(decide(GATE, replace(KNOWN, cookie=[cookie]))) is Why.OTHER_TOKEN
 
 
 def test_each_refusal_is_a_sentence_without_the_requests_words() -> None:
@@ -250,7 +250,7 @@ def test_each_refusal_is_a_sentence_without_the_requests_words() -> None:
         replace(KNOWN, path=f"/?token={evil}"),
         replace(KNOWN, cookie=[f"other={evil}"]),
     ]
-    reasons = [verdict.reason for one in asked if isinstance(verdict := judge(GATE, one), Refused)]
+    reasons = [verdict.reason for one in asked if isinstance(verdict := decide(GATE, one), RefusedRequest)]
     assert len(set(reasons)) == len(asked)
     for reason in reasons:
         assert evil not in reason and reason[0].isupper() and reason.endswith(".")

@@ -41,15 +41,15 @@ from workbench.ui.server.access import (
     Asked,
     Entered,
     Gate,
-    Refused,
+    RefusedRequest,
     cookie_name,
+    decide,
     host_is_ours,
-    judge,
 )
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.server.gated_server import Door, DoorOptions, open_door
 from workbench.ui.server.page_guard import PageGuard
-from workbench.ui.server.strangers import ToldRarely
+from workbench.ui.server.strangers import RareLog
 from workbench.ui.server.viser_private import element_id
 
 # A busy machine is no failure, and one door is for all that is tried on it.
@@ -272,23 +272,23 @@ def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, c
     gate = Gate(token="x" * 43, any_address=True)
     for websocket in (False, True):
         asked = Asked(path=path, host=[host], origin=[f"http://{host}"], cookie=[cookie], websocket=websocket)
-        assert isinstance(judge(gate, asked), Refused)
+        assert isinstance(decide(gate, asked), RefusedRequest)
 
 
 @unhurried
 @given(hosts)
 def test_without_a_token_only_loopback_hosts_are_let_in(host):
-    verdict = judge(Gate(token=None), Asked(path="/", host=[host]))
+    verdict = decide(Gate(token=None), Asked(path="/", host=[host]))
     name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
     loopback = name.lower() == "localhost" or name.startswith(("127.", "["))
-    assert isinstance(verdict, Refused) or loopback
+    assert isinstance(verdict, RefusedRequest) or loopback
 
 
 @unhurried
 @given(st.text(max_size=60))
 def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
     gate = Gate(token="right")
-    verdict = judge(gate, Asked(path=f"{path}?token=right", host=["localhost:8080"]))
+    verdict = decide(gate, Asked(path=f"{path}?token=right", host=["localhost:8080"]))
     if isinstance(verdict, Entered):
         assert verdict.location.startswith("/")
         assert verdict.location[1:2] not in ("/", "\\")
@@ -319,7 +319,7 @@ def test_a_link_from_another_site_with_the_token_goes_on_by_a_page():
         fetch_mode=["navigate"],
         fetch_dest=["document"],
     )
-    verdict = judge(gate, link)
+    verdict = decide(gate, link)
     assert isinstance(verdict, Entered) and verdict.by_page
     assert '"' not in verdict.location and ">" not in verdict.location
 
@@ -331,7 +331,7 @@ def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
         assert both(door, Cookie=None, Origin="https://evil.example") == (403, 403)
         assert both(door, Cookie=None, Host="evil.example", Origin="http://evil.example") == (403, 403)
         assert ask(door, Cookie=None, Sec_Fetch_Site="cross-site", **LOADED_BY)[0] == 403
-        assert isinstance(judge(Gate(token=None), Asked("/", [f"localhost:{door.port}"])), Admitted)
+        assert isinstance(decide(Gate(token=None), Asked("/", [f"localhost:{door.port}"])), Admitted)
     finally:
         door.close()
 
@@ -511,11 +511,11 @@ def test_any_bytes_are_admitted_dropped_or_called_malformed(door, raw):
 
 
 def judged(door: Door, raw: bytes) -> None:
-    """Let the guard of a page that is on no connection judge a frame; any other error fails the test."""
+    """Let the guard of a page that is on no connection check a frame; any other error fails the test."""
     page = viser_private.ViserPage(None, [door.server])  # type: ignore[arg-type]
 
     async def judge_it() -> None:
-        guard = PageGuard(page, ToldRarely(lambda line: None))
+        guard = PageGuard(page, RareLog(lambda line: None))
         with contextlib.suppress(MalformedMessage):
             assert guard.admits(raw) in (True, False)
         guard.close()

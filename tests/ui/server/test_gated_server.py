@@ -267,9 +267,9 @@ def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):
 
 def test_a_gate_that_hangs_loose_opens_no_door(monkeypatch):
     monkeypatch.setattr(
-        door_module.access, "judge", lambda gate, asked: door_module.access.Admitted(asked.host[0])
+        door_module.access, "decide", lambda gate, asked: door_module.access.Admitted(asked.host[0])
     )
-    with pytest.raises(DoorError, match="does not hold"):
+    with pytest.raises(DoorError, match="is not protected"):
         open_door(DoorOptions(port=0))
 
 

@@ -18,7 +18,7 @@ from tests.ui.knocking import ask, both, client, cookie_of, knock, token_of
 from workbench.ui.server import strangers
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.gated_server import Door, DoorOptions, open_door
-from workbench.ui.server.strangers import ToldRarely
+from workbench.ui.server.strangers import RareLog
 
 LONG = 300
 
@@ -208,7 +208,7 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
     now = [1000.0]
     monkeypatch.setattr(strangers.time, "monotonic", lambda: now[0])
     said: list[str] = []
-    told = ToldRarely(said.append, pause=60.0)
+    told = RareLog(said.append, pause=60.0)
     for _ in range(4 * 3600):
         told.happened("a", "It happened.")
         now[0] += 1.0

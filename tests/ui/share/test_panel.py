@@ -11,7 +11,7 @@ import viser
 
 from tests.drive.panels import Panels
 from workbench.recording.episode.source import Source
-from workbench.ui.server.file_response import Offers
+from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import Door
 from workbench.ui.share.make import EVERY_CAMERA, Made, Making, MakingView, Wanted
 from workbench.ui.share.panel import (
@@ -56,7 +56,7 @@ def panels(door: Door) -> Panels:
 
 @pytest.fixture
 def panel(panels: Panels, door: Door, making: Noted, tmp_path: Path) -> SharePanel:
-    return SharePanel(door.server, Offers(door), making, tmp_path)
+    return SharePanel(door.server, Downloads(door), making, tmp_path)
 
 
 RECORDING = Source(Path("/recordings/Push_seed1.json"))
@@ -166,7 +166,7 @@ def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
 
 
 def test_the_page_is_built_anew_without_a_trace(door: Door, making: Noted, tmp_path: Path) -> None:
-    offers = Offers(door)
+    offers = Downloads(door)
     for _ in range(3):
         SharePanel(door.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
         door.server.gui.reset()

@@ -20,7 +20,7 @@ from workbench.recording.rerun.append_blueprint import add_blueprint, blueprint_
 from workbench.recording.rerun.chunks import static_chunk
 from workbench.recording.rerun.viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.server.access import cookie_name
-from workbench.ui.server.file_response import Offers
+from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import Door
 from workbench.ui.share.rerun_view import RerunPages, RerunView
 
@@ -39,7 +39,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def pages(child_process: None, door: Door) -> RerunPages:
-    return RerunPages(door, Offers(door))
+    return RerunPages(door, Downloads(door))
 
 
 def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
@@ -54,7 +54,7 @@ def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMes
 
 
 def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Door, tmp_path: Path) -> None:
-    offers = Offers(door)
+    offers = Downloads(door)
     big = tmp_path / "big one.rrd"
     big.write_bytes(bytes(range(256)) * 20_000)
     address = offers.address(big)
@@ -75,7 +75,7 @@ def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Doo
 def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(door: Door, tmp_path: Path) -> None:
     big = tmp_path / "big.rrd"
     big.write_bytes(bytes(40_000_000))  # more than the sockets hold
-    address = Offers(door).address(big)
+    address = Downloads(door).address(big)
     connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
     cookie = f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"
     connection.request("GET", address, headers={"Cookie": cookie})

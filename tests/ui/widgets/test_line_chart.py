@@ -6,11 +6,11 @@ import numpy as np
 import viser
 
 from tests.drive.panels import Panels
-from workbench.ui.widgets.line_chart import TAKING_TURNS, YES_OR_NO, Line, LineChart, span_of, with_gaps
+from workbench.ui.widgets.line_chart import TAKING_TURNS, YES_OR_NO, ChartLine, LineChart, span_of, with_gaps
 
 X = np.arange(3.0)
 Y = np.array([0.5, np.nan, 1.0])
-LINES = (Line("one", Y),)
+LINES = (ChartLine("one", Y),)
 
 
 def test_what_is_no_number_is_a_gap() -> None:
@@ -22,15 +22,15 @@ def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.
     chart = LineChart(server, server.gui.add_folder(None), 150)
     chart.draw("reward", X, LINES)
     first = chart.handle
-    chart.draw("reward", X, (Line("one", Y + 1),))
+    chart.draw("reward", X, (ChartLine("one", Y + 1),))
     assert chart.handle is first and first is not None
     np.testing.assert_array_equal(first.data[1], Y + 1)
     for lines, dot, span in (
         (LINES, None, None),
         (LINES, Y, None),
         (LINES, Y, YES_OR_NO),
-        ((Line("one", Y, "#000000"),), Y, YES_OR_NO),
-        ((Line("one", Y, "#000000", 1.0),), Y, YES_OR_NO),
+        ((ChartLine("one", Y, "#000000"),), Y, YES_OR_NO),
+        ((ChartLine("one", Y, "#000000", 1.0),), Y, YES_OR_NO),
     ):
         before = chart.handle
         chart.draw("reward of env 1", X, lines, dot, span)
@@ -39,9 +39,9 @@ def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.
 
 def test_what_has_no_number_or_one_place_alone_is_hidden(panels: Panels) -> None:
     chart = LineChart(panels.server, panels.server.gui.add_folder(None), 150)
-    nothing = Line("two", np.array([np.nan, np.inf, np.nan]))
+    nothing = ChartLine("two", np.array([np.nan, np.inf, np.nan]))
     chart.draw("reward", X, (nothing, *LINES))
-    for x, lines in ((X, ()), (X, (nothing,)), (X[:1], (Line("one", Y[:1]),))):
+    for x, lines in ((X, ()), (X, (nothing,)), (X[:1], (ChartLine("one", Y[:1]),))):
         assert len(panels.charts()) == 1
         chart.draw("reward", x, lines)
         assert panels.charts() == []

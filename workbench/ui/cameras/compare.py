@@ -17,7 +17,7 @@ from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import Answer, refusals_told
+from workbench.ui.widgets.inputs import JobResult, refusals_told
 from workbench.ui.widgets.templates import render
 
 FILE, KEPT = "as in the file", "as kept (A)"
@@ -45,7 +45,7 @@ class CameraCompare:
                 hint="To compare it later, or return to it.",
             )
             self._compare = server.gui.add_button("Show side by side", icon=viser.Icon.COLUMNS_2)
-            self._pair = Answer(server, session)
+            self._pair = JobResult(server, session)
             self._take = server.gui.add_button(
                 "Place it as A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
             )

@@ -23,7 +23,7 @@ from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import Answer
+from workbench.ui.widgets.inputs import JobResult
 from workbench.ui.widgets.templates import counted, render
 
 AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"
@@ -65,11 +65,11 @@ class CameraVerdict:
                 hint="How many, each with a seed of its own.",
             )
             self._judge = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
-            self._report = Answer(server, session)
+            self._report = JobResult(server, session)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
             )
-            self._pictures = Answer(server, session)
+            self._pictures = JobResult(server, session)
             self._presses = Presses(server)
         self._judge.on_click(lambda _: self._ask())
         self._sheet.on_click(lambda _: self._ask_for_sheet())

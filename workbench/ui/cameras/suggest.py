@@ -23,7 +23,7 @@ from workbench.ui.cameras.pose_math import FARTHEST
 from workbench.ui.scene.env_grid import box_corners, line_set
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import Answer, refusals_told
+from workbench.ui.widgets.inputs import JobResult, refusals_told
 from workbench.ui.widgets.templates import render
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1
@@ -91,7 +91,7 @@ class CameraSuggest:
                 hint="Freshly reset envs in which a placement is judged; as many as there are envs at most.",
             )
             self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
-            self._offers = Answer(server, session)
+            self._offers = JobResult(server, session)
             self._presses = Presses(server)
         self._search.on_click(self._ask)
         for corner in (self._low, self._high):

@@ -28,7 +28,7 @@ from workbench.ui.cameras.pose_math import Placing, rounded
 from workbench.ui.server.control_values import limit_text
 from workbench.ui.server.viser_private import element_id
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import Arrival
+from workbench.ui.widgets.inputs import NewResult
 from workbench.ui.widgets.templates import render
 
 LEAVE, CLOSE = "Leave the file as it is", "Close"
@@ -41,7 +41,7 @@ class CameraChange:
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         gui = server.gui
-        self.arrival = Arrival()
+        self.arrival = NewResult()
         self._text = gui.add_html("", visible=False)
         self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
         self._undo = gui.add_button(

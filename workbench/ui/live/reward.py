@@ -20,7 +20,7 @@ from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.machine.text import mean_text, nonfinite_text, number_text
 from workbench.session.history.curves import MOST, Curves
 from workbench.session.live.view import SessionView
-from workbench.ui.widgets.line_chart import LONGEST, YES_OR_NO, Line, LineChart
+from workbench.ui.widgets.line_chart import LONGEST, YES_OR_NO, ChartLine, LineChart
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, short_text
 
@@ -72,7 +72,7 @@ class CurvesPanel(PagePart[SessionView]):
         text = no_curve_text(curves.no_curve) if curves.no_curve else text
         self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
         lines = [
-            Line(name, values[NEWEST, min(env, values.shape[1] - 1)], colour, 1.6)
+            ChartLine(name, values[NEWEST, min(env, values.shape[1] - 1)], colour, 1.6)
             for (name, values), colour in zip(terms.items(), COLOURS, strict=False)
         ]
         self._terms.draw(f"reward terms, env {env}", x, lines)
@@ -91,13 +91,13 @@ def said_of(reward: NDArray[np.float32]) -> str:
     )
 
 
-def env_lines(values: NDArray[np.float32], env: int) -> list[Line]:
+def env_lines(values: NDArray[np.float32], env: int) -> list[ChartLine]:
     """The mean of the batch, where there is one, and an env's own column of `values` (T, N)."""
     env = min(env, values.shape[1] - 1)
-    one = Line(f"env {env}", values[:, env])
+    one = ChartLine(f"env {env}", values[:, env])
     if values.shape[1] == 1:
         return [one]
-    return [Line("mean of the batch", mean_of_numbers(values), BATCH_COLOUR, 1.4), one]
+    return [ChartLine("mean of the batch", mean_of_numbers(values), BATCH_COLOUR, 1.4), one]
 
 
 def mean_of_numbers(values: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from workbench.session.review.view import ReviewView, column_at
 from workbench.ui.live.reward import COLOURS as LINE_COLOURS
 from workbench.ui.live.reward import NumberRow, number_rows
 from workbench.ui.review.scene import shown_together
-from workbench.ui.widgets.line_chart import LONGEST, Line, LineChart, span_of
+from workbench.ui.widgets.line_chart import LONGEST, ChartLine, LineChart, span_of
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import colour, letter, render
 
@@ -119,7 +119,7 @@ class ReviewCurves(PagePart[ReviewView]):
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
         """One entry of all that are compared."""
         group, line = self._offered.get(entry, (entry, ""))
-        drawn: list[Line] = []
+        drawn: list[ChartLine] = []
         cursor = 0
         for index in shown:
             one = view.opened[index]
@@ -131,7 +131,7 @@ class ReviewCurves(PagePart[ReviewView]):
             states, values = lines[line] if line else next(iter(lines.values()))
             name = letter(index) if len(view.opened) > 1 else entry
             over = column_at(states, values, view.anchors[index], axis_of(view))
-            drawn.append(Line(name, over, colour(index), 1.7))
+            drawn.append(ChartLine(name, over, colour(index), 1.7))
         self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
 
     def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
@@ -139,14 +139,19 @@ class ReviewCurves(PagePart[ReviewView]):
         chosen, axis = view.chosen, axis_of(view)
         lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
         drawn = [
-            Line(name, column_at(states, values, view.anchors[view.selected], axis), tone, 1.7)
+            ChartLine(name, column_at(states, values, view.anchors[view.selected], axis), tone, 1.7)
             for (name, (states, values)), tone in zip(lines.items(), LINE_COLOURS, strict=False)
         ]
         whose = f", {letter(view.selected)}" if len(view.opened) > 1 else ""
         self._put(chart, f"{entry}{whose}", view, drawn)
 
     def _put(
-        self, chart: str, title: str, view: ReviewView, drawn: list[Line], dotted: Line | None = None
+        self,
+        chart: str,
+        title: str,
+        view: ReviewView,
+        drawn: list[ChartLine],
+        dotted: ChartLine | None = None,
     ) -> None:
         """Every so-many-th position, and the dot of one line at the position that is shown."""
         axis = axis_of(view)

@@ -1,22 +1,4 @@
-"""Who may come in: the judgement on one HTTP request or websocket handshake, and nothing else.
-
-The page drives the author's machine: it runs their code, reads their files and writes into their
-source. A server on loopback is not private by itself. Any web page that the author has open can send
-requests to ``127.0.0.1`` (browsers do not hold websockets back by the same-origin rule at all), a
-foreign name can be made to resolve to ``127.0.0.1`` after its page was loaded (DNS rebinding), and
-other people on the same machine can simply connect.
-
-So every request is asked four things, in this order. *Host*: was the browser told to go to a name
-that is ours? This is what a rebound name cannot fake. *Origin*: does the page that asks come from
-this very address? *Sec-Fetch-Site*: the same question for requests that carry no Origin (an image or
-script tag in a foreign page). *Token*: 256 random bits, once in the printed address, afterwards in a
-cookie that scripts cannot read and that other sites' pages do not send. The functions here are pure;
-`workbench.ui.server.gated_server` puts them in front of the server.
-
-What this does not stop: cookies know hosts but no ports, so another *server* on the same machine that
-the author visits under the same host name is sent our cookie too. There is no cookie attribute
-against that; a Unix socket (`DoorOptions.socket`) is the way on a machine that others use too.
-"""
+"""Decides whether one HTTP request or websocket handshake is let in. Pure functions."""
 
 from __future__ import annotations
 
@@ -33,20 +15,26 @@ _AUTHORITY = re.compile(r"(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]
 
 @dataclass(frozen=True)
 class Gate:
-    """What is ours."""
+    """The token and the host names of this server.
+
+    The page drives the author's machine: it runs their code, reads their files and writes into their source. A server
+    on loopback is not private: any web page that the author has open can send requests to ``127.0.0.1`` (browsers do
+    not apply the same-origin rule to websockets), a foreign name can be made to resolve there after its page was
+    loaded (DNS rebinding), and other users of the machine can connect.
+    """
 
     token: str | None
-    """None: no token is asked for (loopback only, see `DoorOptions`)."""
+    """None: no token is needed (loopback only, see `DoorOptions`)."""
     names: frozenset[str] = frozenset()
-    """Lower-case host names and addresses, without a port, that are ours besides the loopback ones."""
+    """Lower-case host names and addresses, without a port, that are ours; loopback always is."""
     any_address: bool = False
     """Accept every IP address as Host: for a server that is bound wider than loopback."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The parts of a request that the gate looks at. Each header is the list of all its values, because
-    a header that was sent twice is an attempt to have two programs read two different things."""
+    """The parts of a request that the gate looks at. Each header is the list of all its values: a header that is sent
+    twice tries to make two programs read two different things."""
 
     path: str
     """As sent: percent-encoded, with the query."""
@@ -72,31 +60,30 @@ class Entered:
     location: str
     set_cookie: str
     by_page: bool
-    """True where the browser followed a link on another site. A redirect would carry that site as its
-    initiator, and the browser would not send a Strict cookie with it; a small page that goes on by
-    itself makes us the initiator."""
+    """True where the browser followed a link on another site. A redirect would keep that site as its initiator, and
+    the browser would send no Strict cookie with it; a small page that redirects by itself makes us the initiator."""
 
 
 class Why(Enum):
-    """What was wrong with a request that is refused."""
+    """Why a request is refused."""
 
     NAME = "name"
-    """It was told to go to a host that is not ours."""
+    """Its Host is not ours."""
     SITE = "site"
     """A page of another site made it."""
     NO_TOKEN = "no token"
     OTHER_TOKEN = "other token"
-    """A token that is not, or no longer, this one's."""
+    """A wrong token, or one that was renewed."""
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedRequest:
     why: Why
     reason: str
     """One sentence for the person who reads the 403 page. Holds no text from the request."""
 
 
-Verdict = Admitted | Entered | Refused
+Decision = Admitted | Entered | RefusedRequest
 
 _OTHER_TOKEN = (
     "The token that it showed is not this workbench's. Each start makes a new one, and so does renewing it."
@@ -104,8 +91,10 @@ _OTHER_TOKEN = (
 
 
 def split_authority(text: str) -> tuple[str, int | None] | None:
-    """``host`` or ``host:port`` of a Host header or a URL: the host in lower case (an IPv6 address in
-    its shortest form, without brackets) and the port or None. None if it is not well formed."""
+    """Host and port of ``host`` or ``host:port``; None if malformed.
+
+    The host is in lower case; an IPv6 address is in its shortest form, without brackets.
+    """
     match = _AUTHORITY.fullmatch(text)
     if match is None:
         return None
@@ -135,11 +124,11 @@ def is_loopback(host: str) -> bool:
 
 
 def host_is_ours(gate: Gate, host: str) -> bool:
-    """Whether a browser that was told to go to ``host`` was told to come here.
+    """Whether ``host`` is a name of this server.
 
-    The port is left out on purpose. ``ssh -L 9000:localhost:8080`` makes the browser say
-    ``localhost:9000``, and a container's port map does the same. That is safe: rebinding makes a
-    *foreign name* point here, and ``localhost`` or a bare IP address is nobody's to re-point.
+    The port is not compared: ``ssh -L 9000:localhost:8080`` and a container's port map make the browser say another
+    one. That is safe: rebinding makes a *foreign name* point here, and no attacker can re-point ``localhost`` or a
+    bare IP address.
     """
     if is_loopback(host) or host in gate.names:
         return True
@@ -147,14 +136,14 @@ def host_is_ours(gate: Gate, host: str) -> bool:
 
 
 def cookie_name(port: int) -> str:
-    """The cookie's name for a page that the browser sees on ``port``. Cookies ignore ports, so without
-    the port in the name two workbenches on one machine would log each other out at every load."""
+    """The cookie's name for a page on the browser's ``port``. Cookies ignore ports: without the port in the name two
+    workbenches on one machine would log each other out at every load."""
     return f"workbench-token-{port}"
 
 
 def _cookies(headers: Sequence[str], name: str) -> list[str]:
-    """All values of the cookie ``name``. More than one is possible (another server on the host may set
-    the same name for a narrower path), and none of them may hide the right one."""
+    """All values of the cookie ``name``. Another server on the host may set the same name for a narrower path, and
+    must not hide the right value."""
     pairs = (part.strip().partition("=") for header in headers for part in header.split(";"))
     return [value for key, _, value in pairs if key == name]
 
@@ -174,7 +163,7 @@ def _same_origin(origin: str, host: tuple[str, int | None]) -> bool:
 
 
 def _without_token(path: str) -> str:
-    """``path`` without its token, as a path on this server whatever it looked like."""
+    """``path`` without its token, always as a path on this server."""
     plain, _, query = path.partition("?")
     rest = [(key, value) for key, value in parse_qsl(query, keep_blank_values=True) if key != "token"]
     # "//evil.example" and "/\evil.example" are other hosts to a browser, not paths.
@@ -182,26 +171,35 @@ def _without_token(path: str) -> str:
     return plain + ("?" + urlencode(rest) if rest else "")
 
 
-def judge(gate: Gate, asked: Asked) -> Verdict:
-    """Judge one request or handshake. Never raises on what a client sent."""
+def decide(gate: Gate, asked: Asked) -> Decision:
+    """Decide on one request or handshake. Never raises, for any client input.
+
+    Checked in this order. *Host*: is the name ours? A rebound name cannot fake this. *Origin*: does the asking page
+    come from this very address? *Sec-Fetch-Site*: the same for requests without an Origin (an image or script tag in
+    a foreign page). *Token*: 256 random bits, once in the printed address, afterwards in a cookie that scripts cannot
+    read and that other sites' pages do not send.
+
+    Not stopped: cookies know hosts but no ports, so another *server* that the author visits under the same host name
+    gets our cookie too. No cookie attribute prevents that; on a shared machine use a Unix socket (`DoorOptions.socket`).
+    """
     host = split_authority(asked.host[0]) if len(asked.host) == 1 else None
     if host is None or not host_is_ours(gate, host[0]):
-        return Refused(
+        return RefusedRequest(
             Why.NAME,
             "It asked for this page under a name that the workbench does not know as its own. "
             "Use the machine's address or host name instead.",
         )
 
     if len(asked.origin) > 1 or (asked.origin and not _same_origin(asked.origin[0], host)):
-        return Refused(Why.SITE, "It came from a page of another site.")
+        return RefusedRequest(Why.SITE, "It came from a page of another site.")
 
-    # Requests without an Origin: an <img> or <script> in a foreign page. A person who follows a link
-    # there is let through to the token check. Websocket handshakes always carry an Origin in browsers,
-    # and what browsers say here about ws:// (another scheme than the page's) differs.
+    # Requests without an Origin: an <img> or <script> in a foreign page. A link that a person follows passes on to
+    # the token check. Websocket handshakes of browsers always have an Origin, and browsers disagree about
+    # Sec-Fetch-Site for ws://.
     opened_by_link = list(asked.fetch_mode) == ["navigate"] and list(asked.fetch_dest) == ["document"]
     foreign = any(site not in ("same-origin", "none") for site in asked.fetch_site)
     if foreign and not opened_by_link and not asked.websocket:
-        return Refused(Why.SITE, "It was made by a page of another site.")
+        return RefusedRequest(Why.SITE, "It was made by a page of another site.")
 
     if gate.token is None:
         return Admitted(asked.host[0])
@@ -211,7 +209,7 @@ def judge(gate: Gate, asked: Asked) -> Verdict:
     tokens = [value for key, value in parse_qsl(asked.path.partition("?")[2]) if key == "token"]
     if tokens and not asked.websocket:
         if len(tokens) > 1 or not _equal(tokens[0], gate.token):
-            return Refused(Why.OTHER_TOKEN, _OTHER_TOKEN)
+            return RefusedRequest(Why.OTHER_TOKEN, _OTHER_TOKEN)
         return Entered(
             location=_without_token(asked.path),
             set_cookie=f"{name}={gate.token}; Path=/; HttpOnly; SameSite=Strict",
@@ -221,5 +219,5 @@ def judge(gate: Gate, asked: Asked) -> Verdict:
     if any(_equal(value, gate.token) for value in shown):
         return Admitted(asked.host[0])
     if shown:
-        return Refused(Why.OTHER_TOKEN, _OTHER_TOKEN)
-    return Refused(Why.NO_TOKEN, "This browser has not shown the token of this workbench.")
+        return RefusedRequest(Why.OTHER_TOKEN, _OTHER_TOKEN)
+    return RefusedRequest(Why.NO_TOKEN, "This browser has not shown the token of this workbench.")

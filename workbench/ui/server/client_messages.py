@@ -1,10 +1,4 @@
-"""Reads what a page sends into typed messages: one structure for each kind that a page has to say.
-
-A frame is decoded straight into its structure. What does not fit is refused at the first byte that does not, so
-that eight megabytes of nested lists never become millions of Python objects on the event loop. A value for a
-control is left undecoded (`GuiUpdateMessage.updates`), since what it may be depends on the control; see
-`workbench.ui.server.control_values`.
-"""
+"""Decodes the websocket messages of a page into typed structures."""
 
 from __future__ import annotations
 
@@ -16,9 +10,9 @@ import msgspec
 T = TypeVar("T")
 
 MAX_BYTES = 256 * 1024
-"""The largest thing that a page sends is a text that was pasted. viser's pictures of a view are never asked for."""
+"""The largest message is a pasted text. viser's pictures of a view are never requested."""
 FARTHEST = 1e12
-"""Largest number of a camera, a ray or a gizmo, in whatever unit."""
+"""Largest number of a camera, a ray or a gizmo, in any unit."""
 LARGEST_PICTURE = 100_000
 """Pixels along one side of a page."""
 
@@ -33,20 +27,25 @@ Modifier = Literal[
 
 
 class MalformedMessage(ValueError):
-    """No page of ours sends such a frame; its connection is closed."""
+    """A frame that no page of ours sends; its connection is closed."""
 
 
 class ImpossibleValue(ValueError):
-    """A number that cannot be meant, in a message that is well formed; the message is dropped."""
+    """An impossible number in a well-formed message; the message is dropped."""
 
 
 class ClientMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
-    """One of the kinds below; each has the fields of viser's message of that name."""
+    """One of the kinds below, with the fields of viser's message of that name.
+
+    A frame is decoded straight into its structure and refused at the first byte that does not fit, so that megabytes
+    of nested lists never become millions of Python objects on the event loop. The value of a control stays undecoded
+    (`GuiUpdateMessage.updates`): its type depends on the control (`control_values`).
+    """
 
     def check(self) -> None:
         """
         Raises:
-            ImpossibleValue: A number is not finite, or out of all bounds.
+            ImpossibleValue: A number is not finite, or far out of range.
         """
 
 
@@ -122,7 +121,7 @@ class ViewerCameraMessage(ClientMessage):
 
 
 Value = bool | int | float | str | list[bool | int | float | str]
-"""What any control may hold, as it comes."""
+"""Anything that a control may hold, before it is checked."""
 
 KINDS: dict[str, type[ClientMessage]] = {kind.__name__: kind for kind in ClientMessage.__subclasses__()}
 
@@ -139,13 +138,13 @@ _value_decoder = msgspec.msgpack.Decoder(Value)
 def _decoded(decoder: msgspec.msgpack.Decoder[T], raw: bytes | msgspec.Raw, problem: ValueError) -> T:
     try:
         return decoder.decode(raw)
-    # A ValidationError is a DecodeError; the others are nesting without end and text that is not UTF-8.
+    # A ValidationError is a DecodeError; the others are endless nesting and text that is not UTF-8.
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError):
         raise problem from None
 
 
 def kind_of(raw: object) -> str:
-    """The ``type`` of a frame; the rest is skipped over.
+    """The ``type`` of a frame; the rest is skipped.
 
     Raises:
         MalformedMessage: A text frame, too long, not msgpack, or without a type.
@@ -158,11 +157,11 @@ def kind_of(raw: object) -> str:
 
 
 def read_message(raw: bytes, kind: str) -> ClientMessage:
-    """The message in `raw`, which is of this kind.
+    """Decode `raw`, a message of this kind.
 
     Raises:
         MalformedMessage: Fields are missing, surplus, of another type or of another length.
-        ImpossibleValue: A number in it is not finite, or cannot be meant.
+        ImpossibleValue: A number is not finite, or far out of range.
     """
     message = _decoded(_decoders[kind], raw, MalformedMessage(f"wrong fields in {kind}"))
     message.check()
@@ -170,16 +169,16 @@ def read_message(raw: bytes, kind: str) -> ClientMessage:
 
 
 def read_value(raw: msgspec.Raw) -> Value:
-    """What a page claims that a control holds.
+    """The value that a page sends for a control, not yet checked against it.
 
     Raises:
-        ValueError: It is nested, bytes, or of a kind that no control holds.
+        ValueError: It is nested, bytes, or of a type that no control holds.
     """
     return _decoded(_value_decoder, raw, ValueError("No control holds that."))
 
 
 def _check_numbers(*numbers: float) -> None:
-    # Written so that NaN, of which every comparison is false, is caught as well.
+    # Written so that NaN fails too: every comparison with it is false.
     if not all(abs(number) <= FARTHEST for number in numbers):
         raise ImpossibleValue("a number that is not finite, or too large")
 

@@ -1,11 +1,4 @@
-"""Checks of what a page sends: before viser stores it, against its control; where it is used, against the session.
-
-viser forces the Python type and nothing else: it stores 99999 for a slider from 0 to 10, and an integer that msgpack
-cannot write ends the connection of every page, again at each reconnect. What a control can hold (type, range, options,
-components) is checked once for all controls. What only the session knows (is there still an env 7) is checked by the
-panel that reads the value: it is refused with a sentence, not bent into another value, but for the rounding of a
-browser's arithmetic at the ends of a slider.
-"""
+"""Checks of values that a page sends, against their control and against the session."""
 
 from __future__ import annotations
 
@@ -21,26 +14,26 @@ Choice = TypeVar("Choice")
 
 LARGEST_FLOAT = sys.float_info.max
 ROUNDING = 1e-6
-"""Part of a slider's range by which its value may lie beyond the ends: ``low + n * step``, added up in a
-browser, passes ``high`` by a few units in the last place."""
+"""Part of a slider's range by which a value may lie outside: ``low + n * step``, computed in a browser, passes ``high``
+by a few units in the last place."""
 
 
 def checked_number(value: object, low: float, high: float, name: str) -> float:
     """``value`` as a float in ``[low, high]``.
 
     Args:
-        value: What the control holds: of any type, of any size.
-        low: Least value; -inf where there is none.
-        high: Greatest value; inf where there is none.
-        name: What the sentence calls the value.
+        value: What the control holds, of any type and size.
+        low: Least value, or -inf.
+        high: Greatest value, or inf.
+        name: Name of the value in the error message.
 
     Raises:
-        ValueError: It is not a real number (a bool is none here), is not finite, or lies outside.
+        ValueError: Not a real number (a bool is none here), not finite, or outside.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise ValueError(f"The {name} is not a number.")
     value = value.item() if isinstance(value, np.generic) else value
-    # Compared before it is converted: float() fails on an int of more than 308 digits.
+    # Compared before the conversion: float() fails on an int of more than 308 digits.
     if not -LARGEST_FLOAT <= value <= LARGEST_FLOAT:
         raise ValueError(f"The {name} is not a finite number.")
     slack = 0.0 if math.isinf(high - low) else (high - low) * ROUNDING
@@ -56,10 +49,10 @@ def _range(low: float, high: float) -> str:
 
 
 def checked_int(value: object, low: int, high: int, name: str) -> int:
-    """``value`` as a whole number in ``[low, high]``; 3.0 is 3, as browsers have only one kind of number.
+    """``value`` as a whole number in ``[low, high]``; 3.0 is 3, since browsers have one type of number.
 
     Raises:
-        ValueError: It is not a whole number, or lies outside.
+        ValueError: Not a whole number, or outside.
     """
     if isinstance(value, (float, np.floating)) and float(value).is_integer():
         value = int(value)
@@ -71,7 +64,7 @@ def checked_int(value: object, low: int, high: int, name: str) -> int:
 
 
 def checked_choice(value: object, options: Iterable[Choice], name: str) -> Choice:
-    """The one of ``options`` that equals ``value`` and is of its type (True is not 1).
+    """The option that equals ``value`` and has its type (True is not 1).
 
     Raises:
         ValueError: There is none.
@@ -83,16 +76,16 @@ def checked_choice(value: object, options: Iterable[Choice], name: str) -> Choic
 
 
 LARGEST_INT = 2**53
-"""Up to here a browser counts in ones. msgpack ends at 2 ** 64."""
+"""A browser's whole numbers are exact up to here. msgpack ends at 2 ** 64."""
 LONGEST_LINE = 10_000
 LONGEST_TEXT = 100_000
-"""Characters of a text field with several lines, such as a camera that is pasted as JSON."""
+"""Characters of a text field with several lines, such as a camera pasted as JSON."""
 _NAME, _LONGEST = "name_of_control", "longest_of_control"
-"""Attributes: viser's handles have no other place for them, and cannot be a dictionary's keys."""
+"""Attributes set on viser's handles, which cannot be keys of a dictionary."""
 
 
 def name_control(control: Any, name: str) -> None:
-    """Of a control whose label says nothing: what a sentence calls it, and what it is found by."""
+    """Name a control whose label says nothing, for messages and for tests that look for it."""
     setattr(control, _NAME, name)
 
 
@@ -102,25 +95,31 @@ def name_of(control: Any) -> str:
 
 
 def limit_text(control: Any, longest: int) -> None:
-    """At most so many characters; of a single line all of them printable: no control or direction characters."""
+    """Limit the characters of a text field; a single line then takes printable ones only (no control or direction
+    characters)."""
     setattr(control, _LONGEST, longest)
 
 
 def check_value(control: Any, value: object) -> None:
-    """
+    """Check type, range, options and number of components of a value before viser stores it.
+
+    viser converts to the Python type and checks nothing else: it stores 99999 for a slider from 0 to 10, and an
+    integer that msgpack cannot write ends the connection of every page, again at each reconnect. What only the
+    session knows (is there still an env 7) is checked by the panel that reads the value.
+
     Args:
         control: An input of viser's.
         value: As decoded: a bool, number, text or list of these.
 
     Raises:
-        ValueError: The control cannot hold that; the sentence is for the person at the page.
+        ValueError: The control cannot hold that; the message is for the person at the page.
     """
     name = name_of(control) or "value"
     if isinstance(control, viser.GuiCheckboxHandle):
         if not isinstance(value, bool):
             raise ValueError(f"The {name} is on or off.")
     elif isinstance(control, viser.GuiButtonHandle):
-        # For viser any value of a button is a press.
+        # viser takes any value of a button as a press.
         if value is not True:
             raise ValueError(f"The {name} can be pressed, and no more.")
     elif isinstance(control, (viser.GuiDropdownHandle, viser.GuiButtonGroupHandle)):

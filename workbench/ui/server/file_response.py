@@ -1,16 +1,4 @@
-"""An answer that is read from its file while it is sent, and the files that a page may fetch so.
-
-A recording may be gigabytes, and `websockets`, whose server the page is served by, knows answers only as one
-string of bytes. Read whole, a file that is opened in three tabs is in memory three times, and all of it at once on
-its way through the event loop. But the hook that makes the answer is a coroutine with the connection in its hand:
-so the head and the blocks of the file are written from there, each when the one before is nearly gone, and what is
-given back to `websockets` at the end has nothing left to say.
-
-A browser never says a path. It is given an address with a random part, made here for one file, and what it asks for is
-looked up by that part alone; the name behind it is for people (and for rerun, which tells a recording by its end).
-
-A file may be kept as gzip (rerun's viewer: 43 MB, 14 packed) and is sent so to browsers that take it.
-"""
+"""Sends a file block by block as an HTTP response, and keeps the table of files that a page may download."""
 
 from __future__ import annotations
 
@@ -35,24 +23,24 @@ if TYPE_CHECKING:
     from workbench.ui.server.gated_server import Door
 
 BLOCK = 1 << 18
-"""Bytes that are read and handed on at a time."""
+"""Bytes read and sent at a time."""
 
 
 @dataclass(frozen=True)
 class FileReply:
-    """What a route answers with instead of bytes."""
+    """A route's answer that is a file instead of bytes."""
 
     path: Path
     kind: str
     """Content type of what the browser gets."""
     gzipped: bool = False
-    """The file holds the gzip of it."""
+    """The file holds the gzip of it (rerun's viewer: 43 MB, 14 packed); it is sent packed where the browser takes that."""
     download_as: str | None = None
     """The browser saves it under this name instead of showing it."""
 
 
 class _Sent(Response):
-    """For `websockets`: an answer of which every byte was written already."""
+    """For `websockets`: a response whose bytes were all written already."""
 
     def serialize(self) -> bytes:
         return b""
@@ -65,14 +53,17 @@ async def send_file(
     accepts_gzip: bool,
     not_found: Callable[[], Response],
 ) -> Response:
-    """Send the file over the connection, a block at a time.
+    """Send the file over the connection, a block at a time, each when the one before is nearly gone.
+
+    A recording may be gigabytes, and `websockets` takes a response as one string of bytes only: a file that is open in
+    three tabs would be in memory three times. So head and blocks are written to the connection here.
 
     Args:
-        headers: Of the answer, without those that say what it is and how long.
-        not_found: Makes the answer where the file is gone or may not be read.
+        headers: Of the response, without content type, length and encoding.
+        not_found: Makes the response where the file is gone or cannot be read.
 
     Returns:
-        What is still to be sent.
+        The response for `websockets`, with nothing left to send.
     """
     try:
         file, length, packed = await asyncio.to_thread(_open, reply, accepts_gzip)
@@ -84,7 +75,7 @@ async def send_file(
     if packed:
         fields["Content-Encoding"] = "gzip"
     if reply.download_as is not None:
-        # RFC 6266: the encoded form is what browsers take, whatever is in the name.
+        # RFC 6266: browsers take the encoded form for any name.
         quoted = urllib.parse.quote(reply.download_as, safe="")
         fields["Content-Disposition"] = f"attachment; filename*=UTF-8''{quoted}"
     sent = _Sent(200, HTTPStatus.OK.phrase, Headers(fields))
@@ -96,7 +87,7 @@ async def send_file(
 
 
 def _open(reply: FileReply, accepts_gzip: bool) -> tuple[BinaryIO, int, bool]:
-    """The file, how many bytes of it are sent, and whether these are still packed."""
+    """The file, the number of bytes to send, and whether they are packed."""
     file = reply.path.open("rb")
     length = os.fstat(file.fileno()).st_size
     if not reply.gzipped or accepts_gzip:
@@ -114,12 +105,12 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
     left = length
     while left:
         try:
-            # Never more than was announced: a recording may grow while it is read.
+            # Never more than announced: a recording may grow while it is read.
             block = await asyncio.to_thread(file.read, min(BLOCK, left))
-        except (OSError, EOFError, zlib.error):  # the disk's, and what gzip says of a file that is torn
+        except (OSError, EOFError, zlib.error):  # of the disk, and of a gzip that is cut short
             block = b""
         if not block:
-            # Shorter than announced. Cut off, so that the browser does not take a piece for the whole.
+            # Shorter than announced: aborted, so that the browser does not take a part for the whole.
             transport.abort()
             return
         left -= len(block)
@@ -132,18 +123,22 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
             return
 
 
-# --- those that the server put into a table, under addresses that nobody can guess ---------------------
+# --- files that the server offers for download, under addresses that cannot be guessed ----------------
 
 PREFIX = "/offered/"
 _POLICY = {
-    # What is offered is data. Opened by itself, an HTML file that somebody recorded runs nothing in our name.
+    # Downloads are data: a recorded HTML file that is opened by itself must not run scripts in our origin.
     "Content-Security-Policy": "default-src 'none'; sandbox; frame-ancestors 'none'",
     "Cache-Control": "no-store",
 }
 
 
-class Offers:
-    """The table. One a door."""
+class Downloads:
+    """The files that a page may fetch. One for each `Door`.
+
+    A browser never sends a path: it gets an address with a random part, made for one file, and the file is looked up
+    by that part alone. The name behind it is for people (and for rerun, which tells a recording by its suffix).
+    """
 
     def __init__(self, door: Door) -> None:
         self._lock = threading.Lock()
@@ -152,7 +147,7 @@ class Offers:
         door.add_route(PREFIX, self._answer, headers=_POLICY)
 
     def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
-        """The address, from the root of the server, of the file at `path`; the same for the same file.
+        """The address of a file, from the root of the server; always the same for the same file.
 
         Args:
             kind: Its content type.

@@ -1,15 +1,4 @@
-"""The one door: everything that the browser gets comes through one port, past one gate.
-
-viser by itself listens on every interface, knows no token, looks at no Origin, moves to another port
-without a word, lets any client publish the page through a tunnel and takes what clients claim as true.
-The page it serves runs the author's code. One port also suits the people who work on a server over
-ssh: one ``ssh -L`` line carries the page, its websocket, recordings and rerun's viewer.
-
-`open_door` binds the socket itself (so that what is printed is what is bound), hands it to viser
-through `workbench.ui.server.viser_private`, and puts `workbench.ui.server.access` in front of every request and every
-websocket handshake. What passes is answered by a route of ours (`Door.add_route`), or by viser.
-Before the address is given to anyone the door tries itself with a request that must be refused.
-"""
+"""Serves the page, its websocket, downloads and rerun's viewer on one port, behind the checks of `access`."""
 
 from __future__ import annotations
 
@@ -37,11 +26,11 @@ from workbench.ui.server.responses import (
     folder_handler,
     refusals,
 )
-from workbench.ui.server.strangers import Connection, ToldRarely, of_peer
+from workbench.ui.server.strangers import Connection, RareLog, of_peer
 
 RESPONSE_SECONDS = 300.0
-"""`websockets` gives 10 s for a request and its whole answer: too little for viser's page over a slow
-line, and far too little for a recording."""
+"""`websockets` gives 10 s for a request and its whole response: too little for viser's page over a slow line, and far
+too little for a recording."""
 
 TURNED_AWAY = {
     access.Why.NAME: "Turned away a request{} for a host name that is not this machine's.",
@@ -53,18 +42,18 @@ TURNED_AWAY = {
 
 @dataclass(frozen=True)
 class DoorOptions:
-    """Where the page is served, and to whom."""
+    """Where the page is served, and who may open it."""
 
     host: str = "127.0.0.1"
-    """Address or name to listen on. Loopback is for this machine (and ``ssh -L``); ``0.0.0.0`` is for
-    everyone who can reach this machine."""
+    """Address or name to listen on: loopback for this machine (and ``ssh -L``), ``0.0.0.0`` for everyone who can reach
+    it."""
     port: int = DEFAULT_PORT
-    """0 takes any free port. If 8080, the default, is taken, the next free one is taken and said."""
+    """0 takes any free port. If 8080, the default, is taken, the next free one is used and printed."""
     socket: Path | None = None
-    """Listen on a Unix socket with this path instead, which only its owner can connect to; `port` is then the
-    one at the other end of ``ssh -L``, and `host` is not used."""
+    """Listen on a Unix socket at this path instead, which only its owner can connect to; `port` is then the one at the
+    other end of ``ssh -L``, and `host` is not used."""
     token: bool = True
-    """Ask for the token of the printed address. Can be left out on a port of loopback only."""
+    """Ask for the token of the printed address. False is allowed on a loopback port only."""
 
     def __post_init__(self) -> None:
         if not self.host:
@@ -89,18 +78,23 @@ class DoorOptions:
 
 @dataclass
 class Door:
-    """An open door. Make it with `open_door`."""
+    """The running server. Make it with `open_door`.
+
+    viser by itself listens on every interface, knows no token, checks no Origin, moves to another port silently, lets
+    any client publish the page through a tunnel and trusts every value of a client. The page it serves runs the
+    author's code. One port suits work over ssh: one ``ssh -L`` line carries all of it.
+    """
 
     options: DoorOptions
     server: viser.ViserServer
     port: int
-    """The port that is bound."""
+    """The bound port."""
     ssh_hint: str
     """What to type on one's own machine to reach the page over ssh."""
     warning: str | None
-    """For the person at the terminal: what a wider binding means. None on loopback."""
+    """For the terminal: what a binding wider than loopback means. None on loopback."""
     notice: str | None
-    """Said once at the start: the page is on another port than usual. None if it is not."""
+    """For the terminal: the page is on another port than usual. None if it is not."""
     _listening: Listening = field(repr=False)
     _doorkeeper: _Doorkeeper = field(repr=False)
     _gated: viser_private.GatedViser = field(repr=False)
@@ -109,18 +103,17 @@ class Door:
 
     @property
     def turned_away(self) -> int:
-        """How many requests were refused so far."""
+        """Number of requests refused so far."""
         return self._doorkeeper.turned_away
 
     def add_route(self, prefix: str, handler: Handler, headers: Mapping[str, str] | None = None) -> None:
-        """Answer GET requests below ``prefix`` (``/recordings/``), behind the same gate. The longest
-        prefix that fits wins.
+        """Answer GET requests below ``prefix`` (``/recordings/``), behind the same checks. The longest prefix wins.
 
         Args:
             prefix: begins and ends with a slash.
-            handler: see `workbench.ui.server.responses.Handler`. If it raises, the browser gets a 500 and the log the traceback.
-            headers: added to every reply, in place of the door's own of the same name (a page with
-                other needs brings its own Content-Security-Policy).
+            handler: see `responses.Handler`. If it raises, the browser gets a 500 and the log the traceback.
+            headers: added to every reply; they replace the server's own of the same name (such as the
+                Content-Security-Policy).
         """
         if len(prefix) < 3 or not prefix.startswith("/") or not prefix.endswith("/"):
             raise ValueError(
@@ -136,20 +129,19 @@ class Door:
         return self.addresses()[0]
 
     def addresses(self, path: str = "/") -> tuple[str, ...]:
-        """The address to open, with the token, for ``path`` (from the root: ``/rerun/...``), and then those for browsers
-        on other machines, none on loopback: which of them leads here depends on the network that the other machine is
-        in."""
+        """The addresses, with the token, of ``path`` (from the root: ``/rerun/...``): for a browser on this machine,
+        then for those on other machines (none on loopback; which of them works depends on their network)."""
         token = self._doorkeeper.gate.token
         shown = f"?token={token}" if token else ""
         hosts = dict.fromkeys((self._listening.host, *self._listening.hosts_elsewhere()))
         return tuple(f"http://{host}:{self.port}{path}{shown}" for host in hosts)
 
     def renew_token(self) -> str:
-        """Make a new token and return the new address: who has the old one, or its cookie, does not get in any more,
-        and every page that is open is closed. From any thread but the event loop's.
+        """Make a new token and return the new address. The old token and its cookies are refused, and every open page
+        is closed. Call it on any thread but the event loop's.
 
         Raises:
-            ValueError: this door asks for no token.
+            ValueError: the server asks for no token.
         """
         if not self.options.token:
             raise ValueError("This page asks for no token; there is none to renew.")
@@ -159,7 +151,7 @@ class Door:
         return self.url
 
     def close(self) -> None:
-        """Close every connection and stop listening. Can be called twice."""
+        """Close every connection and stop listening. May be called twice."""
         if self._closed:
             return
         self._closed = True
@@ -170,9 +162,9 @@ class Door:
 
 
 class _Doorkeeper:
-    """Judges each request, answers it or has it answered, and tells the terminal of those that are refused."""
+    """Decides on each request, answers it, and reports refused ones in the terminal."""
 
-    def __init__(self, the_gate: access.Gate, example: str, told: ToldRarely) -> None:
+    def __init__(self, the_gate: access.Gate, example: str, told: RareLog) -> None:
         self.gate = the_gate
         self.turned_away = 0
         self.tells = False
@@ -187,28 +179,28 @@ class _Doorkeeper:
         request: Request,
     ) -> Response | None:
         asked = asked_of(request)
-        verdict = access.judge(self.gate, asked)
-        if isinstance(verdict, access.Refused):
+        verdict = access.decide(self.gate, asked)
+        if isinstance(verdict, access.RefusedRequest):
             self._count(verdict, connection)
             return self._refuse(verdict.reason)
         if isinstance(connection, Connection):
             connection.admit()
         if asked.websocket and isinstance(verdict, access.Admitted):
             return viser_hook(connection, request)
-        # websockets gives up 10 s after the last byte was handed to the kernel; on a slow line
-        # megabytes are still on their way then.
+        # websockets gives up 10 s after it handed the last byte to the kernel; on a slow line megabytes are still on
+        # their way then.
         connection.close_timeout = RESPONSE_SECONDS
         if isinstance(verdict, access.Entered):
             return entered_reply(verdict)
         return await admitted_reply(routes, viser_hook, connection, request, verdict.authority)
 
     def say_the_rest(self) -> None:
-        """At the end: what was not told yet, and how many were turned away in all."""
+        """At the end: print what was held back, and how many requests were refused in all."""
         self._told.say_the_rest()
         if self.turned_away > 1:
             self._told.happened("total", f"In all {self.turned_away} requests were turned away.")
 
-    def _count(self, refused: access.Refused, connection: ServerConnection) -> None:
+    def _count(self, refused: access.RefusedRequest, connection: ServerConnection) -> None:
         if self.tells:
             self.turned_away += 1
             peer = connection.peer if isinstance(connection, Connection) else ""
@@ -216,14 +208,17 @@ class _Doorkeeper:
 
 
 def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) -> Door:
-    """Serve viser's page behind the gate.
+    """Serve viser's page behind the checks of `access`.
+
+    Binds the socket itself (so that the printed address is the bound one) and tests itself with a request that must be
+    refused before it returns an address.
 
     Args:
         options: where, and to whom.
         label: shown at the top of viser's panel.
 
     Raises:
-        DoorError: the host or port cannot be bound, or the installed viser is not one that can be gated.
+        DoorError: the host or port cannot be bound, or the installed viser is not the known one.
     """
     if options.socket is None:
         listening = listen_on_port(options.host, options.port)
@@ -231,7 +226,7 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         listening = listen_on_file(options.socket, options.port)
     token = secrets.token_urlsafe(32) if options.token else None
     the_gate = access.Gate(token=token, names=_our_names(options), any_address=not listening.loopback)
-    told = ToldRarely()
+    told = RareLog()
     keeper = _Doorkeeper(the_gate, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
 
@@ -263,7 +258,7 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         _gated=gated,
         _routes=routes,
     )
-    # Before viser's own exit handler, which prints "Server stopped" into the author's terminal.
+    # Runs before viser's own exit handler, which prints "Server stopped" into the author's terminal.
     atexit.register(door.close)
     try:
         _try_own_door(listening)
@@ -282,8 +277,11 @@ def _our_names(options: DoorOptions) -> frozenset[str]:
 
 
 def _try_own_door(listening: Listening) -> None:
-    """Knock as a rebound name would. The gate hangs on viser's inside; if it hangs loose, nobody gets
-    the address."""
+    """Send a request as from a rebound name: it must be refused, or the checks are not in front of viser.
+
+    Raises:
+        DoorError: it was not refused.
+    """
     knock = http.client.HTTPConnection("rebound.invalid", timeout=10)
     knock.sock = listening.connect(timeout=10)
     try:
@@ -293,7 +291,7 @@ def _try_own_door(listening: Listening) -> None:
         knock.close()
     if status != 403:
         raise DoorError(
-            f"The page's door does not hold: a request that must be refused got {status}. "
+            f"The page is not protected: a request that must be refused got {status}. "
             f"It is written for viser {viser_private.WRITTEN_FOR} and {viser.__version__} is installed; install "
             f"viser=={viser_private.WRITTEN_FOR}."
         )

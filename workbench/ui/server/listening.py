@@ -1,9 +1,4 @@
-"""The socket that the page is served on: a port of this machine, or a file that only its owner can connect to.
-
-On a machine that others use too, everyone can connect to a port on loopback, and a browser sends its cookies to
-every port of a host. A Unix socket with mode 0600 has neither trouble: the kernel asks who connects, and the way from
-a browser to it is one's own ``ssh -L``.
-"""
+"""The listening socket of the page: a TCP port, or a Unix socket that only its owner can connect to."""
 
 from __future__ import annotations
 
@@ -24,21 +19,21 @@ import psutil
 DEFAULT_PORT = 8080
 PORTS_TO_TRY = 100
 LONGEST_PATH = 107
-"""Bytes of the path of a Unix socket (unix(7)); ssh could not reach a longer one either."""
+"""Bytes of the path of a Unix socket (unix(7)); ssh cannot reach a longer one either."""
 BACKLOG = 100
 
 
 class DoorError(RuntimeError):
-    """The page's door cannot be opened. The message says what to do."""
+    """The page cannot be served. The message says what to do."""
 
 
 @dataclass(frozen=True)
 class Listening:
-    """A socket that listens, and how it is reached."""
+    """A listening socket and how to reach it."""
 
     socket: socket.socket
     host: str
-    """As a browser needs it: a name, or an address with brackets where it is IPv6."""
+    """As a browser needs it: a name or an address, IPv6 in brackets."""
     port: int
     """As a browser on this machine or behind `ssh_hint` needs it."""
     bound_host: str
@@ -54,12 +49,12 @@ class Listening:
 
     @property
     def ssh_hint(self) -> str:
-        """What to type on one's own machine to reach it."""
+        """The ``ssh -L`` command to type on one's own machine."""
         to = f"{self.host if self.loopback else '127.0.0.1'}:{self.port}" if self.path is None else self.path
         return f"ssh -L {self.port}:{to} {_user()}@{socket.gethostname()}"
 
     def hosts_elsewhere(self) -> tuple[str, ...]:
-        """This machine's name and addresses by which others reach the port, as their browsers need them."""
+        """This machine's name and addresses for browsers on other machines."""
         if self.loopback:
             return ()
         address = ipaddress.ip_address(self.bound_host.partition("%")[0])
@@ -68,7 +63,7 @@ class Listening:
         return tuple(dict.fromkeys(host for host in hosts if host and host != "localhost"))
 
     def connect(self, timeout: float) -> socket.socket:
-        """A client's end of it, on this machine."""
+        """A client's connection to it, on this machine."""
         if self.path is None:
             address = ipaddress.ip_address(self.bound_host.partition("%")[0])
             loopback = "::1" if address.version == 6 else "127.0.0.1"
@@ -80,7 +75,7 @@ class Listening:
         return client
 
     def remove(self) -> None:
-        """Take the file of a Unix socket away, if it is still ours."""
+        """Remove the file of a Unix socket, if it is still ours."""
         if self.path is not None:
             with contextlib.suppress(FileNotFoundError):
                 if self.path.lstat().st_ino == self.inode:
@@ -88,15 +83,16 @@ class Listening:
 
 
 def listen_on_port(host: str, port: int) -> Listening:
-    """
+    """Listen on a TCP port.
+
     Args:
         host: An address or a name of this machine.
-        port: 0 takes any free one. If `DEFAULT_PORT` is taken, the next free one is taken.
+        port: 0 takes any free one. If `DEFAULT_PORT` is taken, the next free one is used.
 
     Raises:
         DoorError: The host is not this machine's, or the port is taken or forbidden.
     """
-    # "localhost" may be 127.0.0.1, ::1 or both; the printed address has to be the one that is bound.
+    # "localhost" may be 127.0.0.1, ::1 or both; the printed address has to be the bound one.
     asked = "127.0.0.1" if host.lower() == "localhost" else host
     try:
         family, _, _, _, address = socket.getaddrinfo(
@@ -127,13 +123,17 @@ def listen_on_port(host: str, port: int) -> Listening:
 
 
 def listen_on_file(path: Path, port: int) -> Listening:
-    """
+    """Listen on a Unix socket with mode 0600.
+
+    On a shared machine every user can connect to a loopback port, and a browser sends its cookies to every port of a
+    host. For a Unix socket the kernel checks who connects, and the browser reaches it by its user's ``ssh -L``.
+
     Args:
-        path: Where the socket is to be. What a workbench left there that was killed is taken away.
-        port: On the machine that the browser is on, at the other end of ``ssh -L``.
+        path: Of the socket. The socket of a workbench that was killed is replaced.
+        port: On the browser's machine, at the other end of ``ssh -L``.
 
     Raises:
-        DoorError: Something else is there, or others could put something there in its place.
+        DoorError: Something else is at `path`, or other users may write into its folder.
     """
     folder = path.expanduser().absolute().parent.resolve()
     place = folder / path.name
@@ -143,7 +143,7 @@ def listen_on_file(path: Path, port: int) -> Listening:
     try:
         with _alone_in(folder):
             _make_room(place)
-            # Linux makes the file with the mode of the socket: it is never there with a wider one.
+            # Linux makes the file with the mode of the socket: it never exists with a wider one.
             os.fchmod(made.fileno(), 0o600)
             made.bind(str(place))
             made.listen(BACKLOG)
@@ -160,7 +160,7 @@ def listen_on_file(path: Path, port: int) -> Listening:
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """No other workbench makes or removes a socket in this folder meanwhile."""
+    """Lock the folder: no other workbench makes or removes a socket in it meanwhile."""
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except (FileNotFoundError, NotADirectoryError):
@@ -197,14 +197,14 @@ def _make_room(place: Path) -> None:
         except ConnectionRefusedError:
             place.unlink()
             return
-        except OSError:  # it listens and is too busy to answer
+        except OSError:  # it listens, too busy to answer
             pass
     raise DoorError(f"Another program listens at {place}, a workbench perhaps; give another path.")
 
 
 def _reach(host: str) -> str:
-    """``host`` as a browser needs it: an IPv6 address in brackets, and for "every interface" the
-    address of the one that leads out. Connecting a datagram socket sends nothing."""
+    """``host`` as a browser needs it: IPv6 in brackets, and for "every interface" the address of the one that leads
+    out. Connecting a datagram socket sends nothing."""
     address = ipaddress.ip_address(host.partition("%")[0])
     if not address.is_unspecified:
         return _in_address(address)
@@ -219,7 +219,7 @@ def _reach(host: str) -> str:
 
 
 def _own_addresses(version: int) -> list[str]:
-    """Of the interfaces that are up, but for those that lead nowhere else."""
+    """Addresses of the interfaces that are up, without loopback and link-local ones."""
     up = {name for name, state in psutil.net_if_stats().items() if state.isup}
     hosts: list[str] = []
     for name, given in psutil.net_if_addrs().items():

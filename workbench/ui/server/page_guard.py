@@ -1,11 +1,4 @@
-"""Decides for each message of a page whether it goes on to viser, and how fast a page may speak.
-
-What no page of ours sends ends its connection. A value that a control cannot hold is dropped: viser does not store
-it, no other page hears of it, and the page that sent it is told and shown the true value again once its hand is off
-the control. That is no attack: the ends of a slider or a list of options may have changed between the click and its
-arrival. (What is typed into a number field is looked at in the page first, ``web_assets/typed_numbers.js``.) A page that speaks faster than a page can is slowed down, so that the
-others keep their share of the event loop.
-"""
+"""Filters the messages of a page before viser sees them, and limits their rate."""
 
 from __future__ import annotations
 
@@ -26,46 +19,52 @@ from workbench.ui.server.client_messages import (
     read_value,
 )
 from workbench.ui.server.control_values import check_value
-from workbench.ui.server.strangers import ToldRarely
+from workbench.ui.server.strangers import RareLog
 
 HANDS_OFF = 1.2
-"""Seconds without another value after which a control shows the true one again: a hand may still be on it."""
+"""Seconds without another value until a control shows the true one again: a hand may still be on it."""
 RATE = 200.0
-"""Messages in a second that a page may send for long; a drag sends about twenty."""
+"""Sustained messages a second of a page; a drag sends about twenty."""
 BURST = 400.0
 BYTES_EACH = 2048
-"""A message of so many bytes counts as one, of twice as many as two."""
+"""A message counts once for each block of this many bytes."""
 PATIENCE = 5.0
-"""Seconds for which a page may be slowed down in one go; then its connection ends, and what waits in it goes unread."""
+"""Seconds for which a page may be slowed down without a pause; then its connection is closed."""
 TURN = 16
-"""Messages after which the other pages have their turn."""
+"""Messages after which the event loop serves the other pages."""
 
 
 class ServedPage(Protocol):
-    """What viser has for one connection; see `workbench.ui.server.viser_private`."""
+    """viser's side of one connection (`viser_private.ViserPage`)."""
 
     def control(self, uuid: str) -> Any | None:
-        """The input with this id, of all pages or of this one alone."""
+        """The input with this id, of all pages or of this one; None if there is none."""
 
     def has_form(self, uuid: str) -> bool:
         """Whether a form has this id."""
         ...
 
     def is_from_server(self, kind: str) -> bool:
-        """Whether it is a kind of message that viser knows."""
+        """Whether viser has a message of this kind."""
         ...
 
     def show_again(self, control: Any) -> None:
-        """Send this page alone what the control holds."""
+        """Send the control's value to this page only."""
 
     def tell(self, sentence: str) -> None:
         """Show this page a notification."""
 
 
 class PageGuard:
-    """Of one connection, on its event loop."""
+    """The filter of one connection, on its event loop.
 
-    def __init__(self, page: ServedPage, told: ToldRarely) -> None:
+    A message that no page of ours sends closes the connection. A value that a control cannot hold is dropped: viser
+    does not store it, and the page is told and shown the true value. That is no attack: the ends of a slider or a list
+    of options may have changed since the click. (Number fields are checked in the page first, ``typed_numbers.js``.) A
+    page that sends faster than a page can is slowed down, so that the others keep their share of the event loop.
+    """
+
+    def __init__(self, page: ServedPage, told: RareLog) -> None:
         self._page, self._told = page, told
         self._level, self._at = BURST, time.monotonic()
         self._slowed, self._turns = 0.0, 0
@@ -75,7 +74,7 @@ class PageGuard:
         """Wait until the page may speak again, after a message of `size` bytes.
 
         Raises:
-            MalformedMessage: It does not stop; the connection is to be closed.
+            MalformedMessage: It keeps sending too fast; close the connection.
         """
         now = time.monotonic()
         self._level = min(BURST, self._level + (now - self._at) * RATE) - 1 - size // BYTES_EACH
@@ -94,7 +93,7 @@ class PageGuard:
         """Whether a frame goes on to viser; False drops it.
 
         Raises:
-            MalformedMessage: The connection is to be closed.
+            MalformedMessage: Close the connection.
         """
         kind = kind_of(raw)
         if kind not in KINDS:
@@ -119,13 +118,13 @@ class PageGuard:
         if isinstance(message, GuiUpdateMessage):
             return self._admits_update(message)
         if isinstance(message, (GuiFormDirtyMessage, GuiFormSubmitMessage)):
-            # viser sends it on to all pages and keeps it for later ones, whatever the id.
+            # viser sends it to all pages and keeps it for later ones, for any id.
             return self._page.has_form(message.uuid)
         return True
 
     def _admits_update(self, message: GuiUpdateMessage) -> bool:
         control = self._page.control(message.uuid)
-        # Of a control that went a moment ago. viser would set any attribute that it has, ``removed`` too.
+        # None: removed a moment ago. viser would set any attribute of a control, ``removed`` too.
         if control is None or set(message.updates) != {"value"}:
             return False
         try:

@@ -1,25 +1,4 @@
-"""What the door answers: the headers of every reply, and the files and routes that are not viser's.
-
-`workbench.ui.server.gated_server` decides who gets which reply, and `workbench.ui.server.responses` what a browser may do with it; here is
-how each is made.
-
-`PAGE` is the Content-Security-Policy of viser's page. Nothing is allowed there but what is listed, and each exception
-is needed: `tests/ui/server/test_page_policy.py` takes them away one by one and finds the page broken.
-
-- ``script-src``: our own files and viser's program, the latter by the hashes of its two scripts (one unpacks the
-  other). Not ``unsafe-inline``: a name, a note or a file from elsewhere that came into the page as HTML in spite of all
-  escaping would still not run. ``unsafe-hashes`` allows the few fixed handlers in our templates and no others.
-  ``wasm-unsafe-eval`` is for the program that unpacks what the server sends. JavaScript's own ``eval`` stays forbidden:
-  viser needs it for Gaussian splats and Plotly, and the workbench has neither (``web_assets/no_eval.js``).
-- ``worker-src blob:``: viser's connection and its sorting run in workers that are made from texts.
-- ``style-src 'unsafe-inline'``: viser's widgets and our HTML have styles in their tags. A style runs no code, and the
-  next lines leave it nowhere to send anything.
-- ``img-src data: blob:``: pictures that come over the websocket, and viser's own icons.
-- ``connect-src``: this server alone. viser's page takes the address of another one from its own address
-  (``?websocket=``, ``?playbackPath=``), and obeys it. ``data:`` and ``blob:`` are textures and programs that the page
-  has already. The websocket is named with its scheme for browsers to which ``'self'`` does not mean ``ws:`` as well.
-- ``frame-src 'self'``: rerun's viewer beside the recordings.
-"""
+"""Builds the HTTP responses: headers, refusals, files, and viser's page with our scripts in its head."""
 
 from __future__ import annotations
 
@@ -46,9 +25,8 @@ from workbench.ui.server import access, viser_private
 from workbench.ui.server.file_response import FileReply, send_file
 
 Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
-"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
-status, the content type and the body, or a file to be sent without reading it whole. Runs in a thread
-of its own, so it may read files."""
+"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type
+and body, or a file. Runs in a thread, so it may read files."""
 
 SCRIPTS = (
     "no_eval.js",
@@ -65,19 +43,20 @@ SCRIPTS = (
     "steady_resolution.js",
     "tab_title.js",
 )
-"""Of ``web_assets/``, run by the page; each says what it is for."""
+"""Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"
-"""Of ``web_assets/``. In the page's head, since an HTML element of viser's is gone while the panel that it is in is folded."""
+"""Of ``web_assets/``. In the page's head: viser removes an HTML element while its panel is folded."""
 
 LONGEST_NAME = 255
-"""Bytes of a file's name in every usual file system, and `LONGEST_PATH` of a whole path, some of which is the folder's."""
+"""Bytes of a file's name, in every usual file system."""
 LONGEST_PATH = 3000
+"""Bytes of a path below a folder."""
 
 _log = logging.getLogger("workbench.door")
 
 
 def asked_of(request: Request) -> access.Asked:
-    """What the gate wants to know of a request."""
+    """The parts of a request that `access` checks."""
     get = request.headers.get_all
     return access.Asked(
         path=request.path,
@@ -87,13 +66,13 @@ def asked_of(request: Request) -> access.Asked:
         fetch_site=get("Sec-Fetch-Site"),
         fetch_mode=get("Sec-Fetch-Mode"),
         fetch_dest=get("Sec-Fetch-Dest"),
-        # Exactly viser's own question, so that what it takes for a handshake is what was judged as one.
+        # Exactly viser's own test: what viser takes for a handshake must have been checked as one.
         websocket=get("Upgrade") == ["websocket"],
     )
 
 
 def refusals(example: str) -> Callable[[str], Response]:
-    """Makes 403 replies that say why, and what to do: open an address like ``example``."""
+    """Returns a function that makes 403 replies with a reason; ``example`` is the address that they tell to open."""
     folder = web_assets_folder()
     page = (folder / "refused.html").read_text(encoding="utf-8")
     page = page.replace("{{logo}}", (folder / "logo.svg").read_text(encoding="utf-8"))
@@ -128,18 +107,18 @@ async def admitted_reply(
     authority: str,
 ) -> Response:
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
-    # Decoded once, as viser does; what is still encoded after that is part of a file's name.
+    # Decoded once, as viser does: what is still encoded is part of a file's name.
     path = unquote(request.path.partition("?")[0]).replace("\\", "/")
     if not _is_path_of_files(path):
         return _no_such_file(page)
     prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
     if prefix is None:
         response = viser_hook(connection, request)
-        if response is None:  # viser took for a handshake what was not judged as one
+        if response is None:  # viser took for a handshake what was not checked as one
             return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
         if response.headers.get("Content-Type", "").startswith("text/html"):
             zipped = response.headers.get("Content-Encoding") == "gzip"
-            # In a thread: packing viser's page anew takes a while, at the first time.
+            # In a thread: packing viser's page takes a while, the first time.
             response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
@@ -161,7 +140,7 @@ async def admitted_reply(
         zip_it = accepts_gzip and len(body) > 1024 and _compresses(kind)
         return reply(status, kind, gzip.compress(body, 6) if zip_it else body, {**page, **headers}, zip_it)
 
-    # In a thread: reading and compressing would hold up every page's websocket.
+    # In a thread: reading and compressing would block every page's websocket.
     made = await asyncio.to_thread(work)
     if isinstance(made, Response):
         return made
@@ -170,7 +149,7 @@ async def admitted_reply(
 
 
 def _is_path_of_files(path: str) -> bool:
-    """Whether a file could have this path: the system raises on a name that is too long, and on a NUL in it."""
+    """Whether a file could have this path: the system raises on a name that is too long or holds a NUL."""
     parts = path.encode("utf-8", "surrogatepass").split(b"/")
     return (
         b".." not in parts
@@ -189,7 +168,7 @@ def with_our_head(page: bytes, zipped: bool) -> bytes:
     """viser's page with `STYLES` and `SCRIPTS` in its head; viser itself offers no way to add one.
 
     Raises:
-        ValueError: it has no head; viser is not the one that this was written for.
+        ValueError: it has no head, so this is another version of viser.
     """
     plain = gzip.decompress(page) if zipped else page
     before, head_end, after = plain.partition(b"</head>")
@@ -214,7 +193,7 @@ def _compresses(kind: str) -> bool:
 
 
 def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
-    """A handler that serves the files below ``folder``, and nothing that a link there points out to."""
+    """A handler that serves the files below ``folder``, but no target of a link that lies outside."""
     root = folder.resolve()
 
     def handle(path: str) -> tuple[int, str, bytes]:
@@ -230,8 +209,7 @@ def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
 
 
 def content_type(name: str) -> str:
-    """Content type by the end of a file's name. Not left to the system's table alone, which may call
-    JavaScript plain text, and browsers then refuse to run it."""
+    """Content type by suffix. The system's table may call JavaScript plain text, which browsers refuse to run."""
     known = {
         ".css": "text/css; charset=utf-8",
         ".html": "text/html; charset=utf-8",
@@ -243,14 +221,14 @@ def content_type(name: str) -> str:
     return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-# --- The headers that tell a browser what it may do with what the door serves -----------------
+# --- The headers that tell a browser what a served page may do --------------------------------
 
 
 VISERS_SCRIPTS = (
     "sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=",
     "sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE=",
 )
-"""Of viser 1.1.1: the script in its page, and the one that this unpacks."""
+"""Of viser 1.1.1: the script in its page, and the one that it unpacks."""
 HANDLERS = (
     "wb.press(event)",
     "wb.choose(event,this)",
@@ -259,7 +237,7 @@ HANDLERS = (
     "wb.intoSight(this)",
     "wb.follow(this)",
 )
-"""Every handler in ``web_assets/panels``; what they do is in ``web_assets/pressed.js``."""
+"""Every handler in ``web_assets/panels``, defined in ``web_assets/pressed.js``."""
 
 
 def hash_of(script: str) -> str:
@@ -271,6 +249,18 @@ def _quoted(*hashes: str) -> str:
     return " ".join(f"'{one}'" for one in hashes)
 
 
+# Everything is forbidden that is not listed, and each exception is needed: `tests/ui/server/test_page_policy.py` removes
+# them one by one and finds the page broken.
+# - script-src: our own files and viser's program, by the hashes of its two scripts. Not unsafe-inline: HTML from a name,
+#   a note or a file that slipped past escaping still would not run. unsafe-hashes allows the handlers of our templates
+#   and no others. wasm-unsafe-eval is for the program that unpacks the server's messages. eval stays forbidden: viser
+#   needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/no_eval.js).
+# - worker-src blob: viser's connection and its sorting run in workers made from texts.
+# - style-src 'unsafe-inline': viser's widgets and our HTML have styles in their tags; a style runs no code.
+# - img-src data: blob: pictures from the websocket, and viser's icons.
+# - connect-src: this server only. viser's page obeys another one in its address (?websocket=, ?playbackPath=). data: and
+#   blob: are textures and programs of the page. The websocket is named for browsers where 'self' excludes ws:.
+# - frame-src 'self': rerun's viewer.
 DIRECTIVES: dict[str, str] = {
     "default-src": "'none'",
     "script-src": f"'self' 'wasm-unsafe-eval' 'unsafe-hashes' {_quoted(*VISERS_SCRIPTS, *map(hash_of, HANDLERS))}",
@@ -286,7 +276,7 @@ DIRECTIVES: dict[str, str] = {
 
 
 def page_policy(authority: str) -> str:
-    """Content-Security-Policy for viser's page as seen on ``authority`` (``host:port``, known to be ours)."""
+    """Content-Security-Policy of viser's page on ``authority`` (``host:port``, known to be ours)."""
     parts = (f"{name} {sources}" for name, sources in DIRECTIVES.items())
     return "; ".join(parts).replace("{authority}", authority)
 
@@ -316,11 +306,10 @@ EVERY_REPLY = {
     + ", clipboard-write=(self), fullscreen=(self)",
     "Connection": "close",
 }
-"""Of a refusal too: no guessing of types, no address passed on, no other site that frames, opens or embeds this one,
-and none of the machine's devices."""
+"""Of refusals too: no guessing of types, no referrer, no framing, opening or embedding by other sites, no devices."""
 PAGE_OF_OURS = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'",
     "Cache-Control": "no-store",
 }
-"""Of a refusal and of the step that sets the cookie."""
+"""Headers of a refusal and of the reply that sets the cookie."""

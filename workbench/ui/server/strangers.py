@@ -1,28 +1,4 @@
-"""Connections that have not shown the token yet: how long, how many and how much is taken from them.
-
-A connection costs a task and its buffers before anything is known of it. So it has some seconds to send a whole
-request that shows the token, the head of that request has a bound, and there are only so many such connections at
-a time. When there are too many the oldest goes, not the one that just came: a browser sends its request with the
-first packet, and someone who holds idle sockets must not lock it out. (Chromium holds some itself; it opens others
-when they are closed.)
-
-A connection reads little at once for another reason: `websockets` takes all that was read apart before anything
-else runs, and a quarter of a megabyte of frames of six bytes holds the event loop for a third of a second.
-
-A client that is connected and reads nothing is let go after a while. A browser that was stopped, a laptop that fell
-asleep at the other end of an ``ssh -L``: its connection stays open for hours and takes nothing. What waits for it is bounded, since viser makes the next batch of messages only
-when the last one was taken, and keeps one value for each property. But for as long as it is there it counts as
-a page that somebody looks at, for which pictures are rendered, and it keeps viser from forgetting what was
-removed (a removal is kept until every client has heard of it). `websockets` would notice by its own ping, which
-however waits behind what is unsent, for ever.
-
-So the bytes on their way to each client are looked at, in the connection's own buffer and in the kernel's. If
-there are some, and for `READ_WITHIN` seconds no look finds fewer than the one before, the connection is ended. That
-new ones are written meanwhile does not count. A slow line is not a deaf client: it takes some now and then. A page
-that wakes up finds its connection closed, opens another, and gets everything as it is by then.
-
-What they cause in the log is said at once, then rarely, with how often it happened meanwhile.
-"""
+"""Limits for connections without a token, detection of stalled clients, and rate-limited log lines about both."""
 
 from __future__ import annotations
 
@@ -50,10 +26,12 @@ log = logging.getLogger("workbench.door")
 PATIENCE = 10.0
 """Seconds until a connection must have shown the token."""
 MOST = 64
-"""Connections at a time that have not. A browser has about ten to one host."""
+"""Connections without a token at a time. A browser has about ten to one host."""
 LONGEST_HEAD = 64 * 1024
-"""Bytes of a request. Cookies of other programs on the same host name come with it, up to 4 kB each."""
+"""Bytes of a request's head. It carries cookies of other programs on the same host name, up to 4 kB each."""
 READ_AT_ONCE = 16 * 1024
+"""Bytes. `websockets` parses everything that was read before anything else runs, and a quarter of a megabyte of frames
+of six bytes holds the event loop for a third of a second."""
 
 _TOO_LONG = Response(
     431,
@@ -64,9 +42,15 @@ _TOO_LONG = Response(
 
 
 class Strangers:
-    """All of them, on the event loop that serves them."""
+    """All connections that have not shown the token yet, on their event loop.
 
-    def __init__(self, told: ToldRarely) -> None:
+    A connection costs a task and its buffers before anything is known of it, so its time, the size of its head and the
+    number of such connections are limited. When there are too many the oldest is closed, not the newest: a browser
+    sends its request with the first packet, and idle sockets of an attacker must not lock it out. (Chromium holds some
+    idle sockets itself, and opens others when they are closed.)
+    """
+
+    def __init__(self, told: RareLog) -> None:
         self._told = told
         self._waiting: dict[Connection, str] = {}
 
@@ -79,7 +63,7 @@ class Strangers:
 
     def arrived(self, connection: Connection, peer: str) -> None:
         if len(self._waiting) >= MOST:
-            # Of the machine that has the most of them, the one that has waited longest.
+            # The oldest connection of the machine that has the most.
             busiest = Counter(self._waiting.values()).most_common(1)[0][0]
             oldest = next(one for one, its_peer in self._waiting.items() if its_peer == busiest)
             self.left(oldest)
@@ -109,7 +93,7 @@ class Connection(ServerConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        # asyncio has no public way; 256 kB is what its transports read otherwise.
+        # asyncio has no public way to set this; its default is 256 kB.
         transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]
         address = transport.get_extra_info("peername")
         self.peer = address[0] if isinstance(address, tuple) else ""
@@ -117,7 +101,7 @@ class Connection(ServerConnection):
         self._strangers.arrived(self, self.peer)
 
     def admit(self) -> None:
-        """It has shown the token."""
+        """The connection has shown the token."""
         self.admitted = True
         self._strangers.left(self)
         if self._deadline is not None:
@@ -147,33 +131,41 @@ def of_peer(peer: str) -> str:
     return f" (from {peer})" if peer else ""
 
 
-# --- clients that read nothing -----------------------------------------------------------------------
+# --- stalled clients ---------------------------------------------------------------------------------
 
 READ_WITHIN = 30.0
-"""Seconds. A page that is busy (a large scene that the processor draws) reads nothing for some of them."""
+"""Seconds. A busy page (a large scene drawn by the processor) reads nothing for some seconds."""
 _LOOKS = 30
-"""How often in that time the bytes are looked at."""
+"""Number of looks at the unsent bytes in that time."""
 
 
 def unsent(connection: ServerConnection) -> int:
-    """Bytes that were written for this client, and that its machine has not acknowledged."""
+    """Bytes that were written for this client and not acknowledged by its machine."""
     waiting = connection.transport.get_write_buffer_size()
     sock = connection.transport.get_extra_info("socket")
     if sock is None or sock.fileno() < 0:
         return waiting
-    # For a socket this is SIOCOUTQ (tcp(7)). Without it a slow line would look deaf: the kernel takes some
-    # megabytes at once, and then nothing from us until a third of them has gone.
+    # For a socket this is SIOCOUTQ (tcp(7)). Without it a slow line would look stalled: the kernel takes some megabytes
+    # at once, and then nothing until a third of them has gone.
     (in_kernel,) = struct.unpack("i", fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, bytes(4)))
     return waiting + in_kernel
 
 
-async def let_go_when_deaf(connection: ServerConnection) -> None:
-    """Runs beside a connection's handler, on its loop; ends the connection, or is cancelled with it."""
+async def close_when_stalled(connection: ServerConnection) -> None:
+    """Close the connection when its client has read nothing for `READ_WITHIN` seconds. A task of the connection.
+
+    A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. What waits for it is
+    bounded, but it counts as a viewer, for whom pictures are rendered, and viser remembers every removal until each
+    client has read it. The ping of `websockets` would wait behind the unsent bytes.
+
+    The client is stalled if bytes wait and no look finds fewer than the one before; new bytes written meanwhile do not
+    matter. A slow line takes some now and then. A page that wakes up reconnects and gets the present state.
+    """
     before = silent = 0
     while silent < _LOOKS:
         await asyncio.sleep(READ_WITHIN / _LOOKS)
         left = unsent(connection)
-        # Looks are counted, not seconds: after a machine's sleep no client has had its time.
+        # Looks are counted, not seconds: while this machine sleeps no client can read.
         silent = 0 if left == 0 or left < before else silent + 1
         before = left
     log.warning(
@@ -183,19 +175,19 @@ async def let_go_when_deaf(connection: ServerConnection) -> None:
     connection.transport.abort()
 
 
-# --- what is said of them ----------------------------------------------------------------------------
+# --- log lines about them ----------------------------------------------------------------------------
 
 PAUSE = 60.0
-"""Seconds in which the same thing is said once, at first."""
+"""Seconds between two lines of the same kind, at first."""
 LONGEST_PAUSE = 3600.0
-"""A tab that was left open knocks once a second for as long as it is there."""
+"""Seconds. A tab that was left open reconnects once a second."""
 MOST_KINDS = 256
 LONGEST_LINE = 300
 """Characters of a line."""
 
 
-class ToldRarely:
-    """Says each kind of thing at once, and again after `pause` seconds, twice that, and so on. From any thread.
+class RareLog:
+    """Logs each kind of event at once, again after `pause` seconds, after twice that, and so on. Thread-safe.
 
     Args:
         say: Prints one line.
@@ -206,14 +198,15 @@ class ToldRarely:
         self._silent_until: dict[Hashable, float] = {}
         self._pauses: dict[Hashable, float] = {}
         self._untold: dict[Hashable, tuple[int, str]] = {}
-        """How often, and what was to be said the last time."""
+        """Number of lines held back, and the last of them."""
         self._lock = threading.Lock()
 
     def happened(self, kind: Hashable, sentence: str) -> None:
-        """
+        """Log an event, or count it if its kind was logged recently.
+
         Args:
-            kind: What counts as the same thing.
-            sentence: What is said, with a full stop; controls are shown escaped.
+            kind: Events of equal kind count as the same.
+            sentence: The line, with a full stop; control characters are shown escaped.
         """
         now = time.monotonic()
         with self._lock:
@@ -232,7 +225,7 @@ class ToldRarely:
             self._say(line)
 
     def say_the_rest(self) -> None:
-        """What happened since each was last said: at the end, when nothing further comes that would say it."""
+        """Log all that was held back; for the end of the program."""
         with self._lock:
             rest = self._forget()
         for line in rest:

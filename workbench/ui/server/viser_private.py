@@ -1,18 +1,4 @@
-"""The only place that reaches into viser's private names; written for viser 1.1.1.
-
-viser serves its page and its websocket from one ``websockets`` server that it starts in
-``viser/infra/_infra.py``, and offers no way to look at a request first, to choose the socket, to
-refuse a message from a client, or to keep quiet. All four are needed (see `workbench.ui.server.gated_server`), so
-while a `viser.ViserServer` is being made, the name ``websockets`` in that one viser module stands for
-a look-alike whose ``serve`` is ours. Ours gives the real one the same arguments, with three changed:
-the socket (ours, already bound), ``process_request`` (viser's own hook, handed to the caller to wrap)
-and the handler (viser's own, but every message from a client is looked at before viser sees it, and a
-client that reads nothing is let go, see `workbench.ui.server.strangers`).
-
-Two nets below that: `missing_names` lists what an upgrade of viser took away, and is asked before
-anything starts; and `workbench.ui.server.gated_server` sends a request that must be refused through the finished
-server before it tells anyone the address.
-"""
+"""The only module that uses private names of viser, written for viser 1.1.1: its server behind our checks."""
 
 from __future__ import annotations
 
@@ -47,7 +33,7 @@ from websockets.http11 import Request, Response
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.server.listening import DoorError
 from workbench.ui.server.page_guard import PageGuard
-from workbench.ui.server.strangers import Connection, Strangers, ToldRarely, let_go_when_deaf
+from workbench.ui.server.strangers import Connection, RareLog, Strangers, close_when_stalled
 
 WRITTEN_FOR = "1.1.1"
 
@@ -55,14 +41,14 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 PAGE_SHA256 = "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
-"""Of viser's page as it is installed: `workbench.ui.server.responses` allows the scripts of this one and no others."""
+"""Of viser's page: `responses` allows the scripts of this one and no others."""
 
 REFUSED_FROM_CLIENTS = (
-    "ShareUrlRequest",  # opens a tunnel that makes the page public, whoever asks
+    "ShareUrlRequest",  # opens a tunnel that makes the page public, for any client
     "ShareUrlDisconnect",
-    "FileTransferStartUpload",  # no size limit, file name taken verbatim; nothing here takes uploads
+    "FileTransferStartUpload",  # no size limit, file name taken as sent; we take no uploads
     "FileTransferPart",
-    "SceneNodeClickMessage",  # nothing of ours takes a click, a drag or a press that is held, so no page has them to say
+    "SceneNodeClickMessage",  # no node of ours takes clicks or drags, no button is held
     "SceneNodeDragMessage",
     "GuiButtonHoldMessage",
 )
@@ -98,20 +84,20 @@ PRIVATE_ATTRIBUTES = (
 """Attributes of a `viser.ViserServer` that this module relies on."""
 
 STOP_SECONDS = 1.0
-"""How long a page gets to answer the closing handshake."""
+"""Time for a page to answer the closing handshake."""
 
 _making = threading.Lock()
 
-# A page that is told something may have gone a moment ago; nobody can know before.
+# A page may have closed a moment before a message is queued for it.
 warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
-# Any: the checker rightly says that viser does not export these names.
+# Any: viser does not export these names.
 infra: Any = viser.infra._infra
 
 
 def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
-    """What a page calls it; the ``id`` of its element there too, where it is a button or a number (viser's
-    ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
+    """The control's id in the page; for a button or a number also the ``id`` of its element (viser's ``Button.tsx``,
+    ``NumberInput.tsx``)."""
     return handle._impl.uuid
 
 
@@ -120,20 +106,20 @@ def send_lines(
     data: tuple[NDArray[np.float64], ...],
     sent: tuple[NDArray[np.float64] | list[float | None], ...],
 ) -> None:
-    """Give a chart these data, and its browsers `sent`, in which None is a gap: viser's property makes NaN of it."""
+    """Set a chart's data, and send `sent` to the browsers, with None for gaps: viser's property would send NaN."""
     props: Any = handle._impl.props
     props.data = data
     handle._queue_update("data", sent)
 
 
 def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
-    """Return when all that was written so far is in a batch on its way to each page, or after `patience` seconds.
+    """Return when all messages so far are in a batch on the way to each page, or after `patience` seconds.
 
-    A page takes a batch as a whole, so what is written after this does not hold up what was written before.
+    A page takes a batch as a whole: messages written after this do not delay those before.
     """
     buffer = server._websock_server._broadcast_buffer
     written, end = buffer.message_counter - 1, time.monotonic() + patience
-    # A page that reads slowly is behind by more than this wait; it must not keep the others waiting.
+    # A slow page is behind by more than this wait, and must not delay the others.
     while any(taken < written for taken in list(buffer.generator_cursors.values())):
         if time.monotonic() > end:
             return
@@ -141,7 +127,7 @@ def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
 
 
 def remove_nodes_but(server: viser.ViserServer, kept: tuple[str, ...]) -> None:
-    """Remove every node of the 3-D view but those at and below these names, as ``scene.reset`` removes all."""
+    """Remove every node of the 3-D view except those at and below these names."""
     for name, handle in list(server.scene._handle_from_node_name.items()):
         stays = name == "/WorldAxes" or any(name == root or name.startswith(f"{root}/") for root in kept)
         # A child goes with its parent.
@@ -174,14 +160,14 @@ def _page_is_known() -> bool:
 
 def _moved(what: str) -> DoorError:
     return DoorError(
-        f"The page cannot be made safe: {what}. workbench/ui/viser_seam.py is written for viser {WRITTEN_FOR} "
-        f"and viser {viser.__version__} is installed; install viser=={WRITTEN_FOR}."
+        f"The page cannot be made safe: {what}. The workbench needs viser {WRITTEN_FOR}, and viser {viser.__version__} is "
+        f"installed; install viser=={WRITTEN_FOR}."
     )
 
 
 @dataclass
 class ViserPage:
-    """What viser has for one connection: a `workbench.ui.server.page_guard.ServedPage`."""
+    """viser's side of one connection: a `page_guard.ServedPage`."""
 
     connection: ServerConnection
     served: list[viser.ViserServer]
@@ -229,7 +215,7 @@ class ViserPage:
 
 
 def _watched(
-    handler: Callable[[ServerConnection], Awaitable[None]], served: list[viser.ViserServer], told: ToldRarely
+    handler: Callable[[ServerConnection], Awaitable[None]], served: list[viser.ViserServer], told: RareLog
 ) -> Callable[[ServerConnection], Awaitable[None]]:
     async def watched(connection: ServerConnection) -> None:
         receive = connection.recv
@@ -243,14 +229,14 @@ def _watched(
                     return raw
 
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
-        listening = asyncio.create_task(let_go_when_deaf(connection))
+        listening = asyncio.create_task(close_when_stalled(connection))
         try:
             await handler(connection)
         except MalformedMessage as error:
-            # Without this the connection is closed as well, but with a traceback of websockets in the
-            # author's terminal for every frame that a stranger cares to send.
+            # Else websockets closes the connection too, but prints a traceback into the author's terminal for every
+            # such frame.
             told.happened("malformed", f"Closed a page's connection: it sent {error}.")
-            # It may still be sending, and never come to the answer.
+            # It may keep sending and never answer the closing handshake.
             connection.close_timeout = STOP_SECONDS
             await connection.close(1008, "malformed message")
         finally:
@@ -262,8 +248,8 @@ def _watched(
 
 @contextlib.contextmanager
 def _quiet_viser() -> Iterator[None]:
-    """Drop what viser prints of its own accord; ``verbose=False`` does not stop its start and stop
-    lines. Only calls that come from viser are dropped, so that others may print meanwhile."""
+    """Drop what viser prints: ``verbose=False`` does not stop its start and stop lines. Only calls from viser are
+    dropped, others may print meanwhile."""
     print_rich = rich.print
 
     def print_unless_viser(*things: Any, **options: Any) -> None:
@@ -279,12 +265,14 @@ def _quiet_viser() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class GatedViser:
+    """A `viser.ViserServer` on our socket and behind our checks. Make it with `make_viser`."""
+
     server: viser.ViserServer
     _serving: websockets.asyncio.server.serve
     _closing: set[asyncio.Task[None]] = field(default_factory=set)
 
     def close_pages(self, reason: str) -> None:
-        """Close every page, and every answer that is on its way; returns when that has begun."""
+        """Close every page and every response in progress; returns when that has begun."""
         listening = self._serving.server
         begun = threading.Event()
 
@@ -305,8 +293,8 @@ class GatedViser:
     def stop(self) -> None:
         """Stop viser and close every connection, within about a second.
 
-        `websockets` would wait for each socket on which a browser has not asked anything yet (Chromium
-        holds such sockets open), and ten seconds for a page that does not answer the closing handshake.
+        `websockets` would wait for each idle socket (Chromium holds some open), and ten seconds for a page that does
+        not answer the closing handshake.
         """
         listening = self._serving.server
         loop = listening.get_loop()
@@ -321,7 +309,7 @@ class GatedViser:
             loop.call_later(0.02, drop)
 
         if not loop.is_closed():
-            with contextlib.suppress(RuntimeError):  # closed since: then nothing is left to drop
+            with contextlib.suppress(RuntimeError):  # closed since: nothing is left to drop
                 loop.call_soon_threadsafe(drop)
         with _making, _quiet_viser():
             self.server.stop()
@@ -332,20 +320,25 @@ def make_viser(
     wrap: Callable[[Hook], AsyncHook],
     label: str | None,
     response_seconds: float,
-    told: ToldRarely,
+    told: RareLog,
 ) -> GatedViser:
-    """Make a `viser.ViserServer` that serves on ``listening`` only, behind the hook that ``wrap`` makes
-    of viser's own.
+    """Make a `viser.ViserServer` that serves on ``listening`` only, behind the hook that ``wrap`` makes of viser's own.
+
+    viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, with no
+    way to check a request first, choose the socket, refuse a message or keep quiet. So while the server is made, the
+    name ``websockets`` in that module is a look-alike whose ``serve`` is ours. It passes viser's arguments on with
+    three changed: the socket, ``process_request``, and the handler, which checks every message first and closes
+    stalled clients. `missing_names` is asked before, and `gated_server` tests the result with a forbidden request.
 
     Args:
         listening: bound and listening; the server owns it from here on.
         wrap: gets viser's ``process_request`` (files for plain requests, None for a handshake).
         label: shown at the top of viser's panel.
-        response_seconds: longest that one request may take, its whole answer included.
-        told: says what pages did that they should not.
+        response_seconds: longest that one request may take, its whole response included.
+        told: logs what pages did that they should not.
 
     Raises:
-        DoorError: the installed viser has moved. Nothing is left listening.
+        DoorError: the installed viser is not the known one. Nothing is left listening.
     """
     missing = missing_names()
     if missing:
@@ -362,8 +355,8 @@ def make_viser(
     def serve(
         handler: Callable[[ServerConnection], Awaitable[None]], host: str, port: int, **options: Any
     ) -> websockets.asyncio.server.serve:
-        # viser's host and port are left out: it would bind another port without a word if this one
-        # were taken, and let the environment (_VISER_PORT_OVERRIDE) choose it.
+        # Without viser's host and port: it would silently bind another port if this one were taken, or the one of the
+        # environment (_VISER_PORT_OVERRIDE).
         options.update(
             process_request=wrap(options["process_request"]),
             max_size=MAX_BYTES,
@@ -387,7 +380,7 @@ def make_viser(
         infra.websockets = look_alike  # type: ignore[assignment]
         try:
             with _quiet_viser():
-                # If viser ever stops calling our serve, this is where it binds: loopback, any port.
+                # Where viser binds if it ever stops calling our serve: loopback, any port.
                 server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
         finally:
             infra.websockets = real
@@ -406,8 +399,8 @@ def make_viser(
 
 
 def _quiet_logger() -> logging.Logger:
-    """Logger for `websockets`: a port scanner's garbage is no error of ours, nor is a browser that goes away before
-    its answer is all there, and neither must put a traceback into the author's terminal."""
+    """Logger for `websockets`: a port scanner's garbage, or a browser that leaves before its response is complete, must
+    not put a traceback into the author's terminal."""
     logger = logging.getLogger("workbench.door.websockets")
     logger.setLevel(logging.WARNING)
     if not logger.filters:
@@ -421,5 +414,5 @@ def _is_news(record: logging.LogRecord) -> bool:
     error = record.exc_info[1] if record.exc_info else None
     if not isinstance(error, AssertionError):
         return True
-    # `websockets` ends a connection after its answer, and asserts that it has not ended yet: who was answered has gone.
+    # `websockets` ends a connection after its response and asserts that it is still open: here the client has left.
     return traceback.extract_tb(error.__traceback__)[-1].name != "send_eof"

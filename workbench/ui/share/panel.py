@@ -24,7 +24,7 @@ from workbench.recording.lerobot.export import ExportOptions
 from workbench.recording.library.library import Library
 from workbench.session.review.view import ReviewView
 from workbench.ui.library.panel import LibraryPanel
-from workbench.ui.server.file_response import Offers
+from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import Door
 from workbench.ui.share.make import EVERY_CAMERA, Made, Making, MakingView, Wanted, What, file_name
 from workbench.ui.share.rerun_view import RerunPages, RerunView
@@ -69,7 +69,7 @@ class SharePanel:
         folder: Datasets go into a folder of it that is named for them.
     """
 
-    def __init__(self, server: viser.ViserServer, offers: Offers, making: Making, folder: Path) -> None:
+    def __init__(self, server: viser.ViserServer, offers: Downloads, making: Making, folder: Path) -> None:
         self._offers, self._making, self._folder = offers, making, folder
         self._chosen = Chosen()
         self._drawn: object = None
@@ -207,7 +207,7 @@ class Sharing:
     """What is shared of a folder of recordings through a door, whatever page is shown. One a door."""
 
     def __init__(self, door: Door) -> None:
-        self._offers = Offers(door)
+        self._offers = Downloads(door)
         self._rerun = RerunPages(door, self._offers)
         self._making = Making()
 

@@ -32,7 +32,7 @@ import viser
 from workbench.machine.web_assets import web_assets_folder
 from workbench.recording.reader.reading import told_rerun
 from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
-from workbench.ui.server.file_response import FileReply, Offers
+from workbench.ui.server.file_response import Downloads, FileReply
 from workbench.ui.server.gated_server import Door
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.templates import render
@@ -54,7 +54,7 @@ _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 class RerunPages:
     """The addresses under which recordings are shown. One a door."""
 
-    def __init__(self, door: Door, offers: Offers) -> None:
+    def __init__(self, door: Door, offers: Downloads) -> None:
         self._offers = offers
         self._lock = threading.Lock()
         self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}

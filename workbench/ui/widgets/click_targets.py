@@ -1,25 +1,4 @@
-"""Parts of our own HTML that can be pressed, as buttons can.
-
-viser's HTML is one-way, and what it has for pressing (a button, a group of them) cannot be a row of a table with
-a curve in it. But each viser button is an element with an id, and pressing it sends what it always sends. So a
-pressable part of a table carries the id of a button that is in the page and not seen (``.wb-presses`` in
-page.css), and two handlers on the table, fixed text of a template (``pressable.html``), press it. Nothing from the
-page becomes more than "this button was pressed", which the server knows how to take.
-
-Where in a picture somebody pressed is a number of the page, and takes another way: ``placeable.html`` writes it into
-a number input of viser's that is not seen either, as if it had been typed. One whole number says both coordinates, in
-ten-thousandths of the picture, and a running part, since an input that is given the value that it has says nothing.
-
-A table of thousands of rows, of which a press with shift or control means another thing, takes that way too
-(``choosable.html``): a row has a number, and the number that is written into the input is eight times that, and what
-was held.
-
-Whoever has no mouse walks to such a part with the Tab key and presses it with Enter or Space (``pressed_by_key.js``): the
-templates write both the id and the stop of the Tab key with the macro ``press`` (``can_be_pressed.html``).
-
-The mouse counts when it goes down: a table that is drawn anew a few times a second would lose the click of a
-person whose finger is still on the button. A touch counts as a click, or scrolling would press.
-"""
+"""HTML elements that can be pressed like viser's buttons, by mouse, touch or keyboard."""
 
 from __future__ import annotations
 
@@ -39,24 +18,24 @@ PARTS = 10_000
 NUMBERS = 10**8
 """What ``choosable.html`` sends is below this."""
 MOST_SECONDS_BEFORE = 0.5
-"""For which what a page asks for waits for what it asked for before."""
+"""How long an action of a page waits for the action before it."""
 _LAST = 1e6
 """viser's order of elements: the hidden ones come after all others of their container."""
 _asked_last: WeakKeyDictionary[object, asyncio.Event] = WeakKeyDictionary()
-"""Of each page: set once it is done. Of the loop of its server alone."""
+"""By page: set when its last action is done. Used on the server's event loop only."""
 
 
 async def in_turn(client: object, do: Callable[[], None]) -> None:
-    """Do on a thread what a page asks for, after what the same page asked for before.
+    """Run an action of a page on a thread, after the action before it of the same page.
 
-    viser's own threads take presses and keys in any order: Enter right after a press on a row opened what had been
-    selected before. To be awaited by what viser calls on its loop, which is in the order of the messages.
+    viser's own threads take presses and keys in any order: Enter right after a press on a row opened the row that had
+    been selected before. Await it in a callback that viser runs on its loop, which keeps the order of the messages.
     """
     before, done = _asked_last.get(client), asyncio.Event()
     _asked_last[client] = done
     try:
         if before is not None:
-            # What takes longer does not keep the page waiting.
+            # A slow action must not block the page.
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(before.wait(), MOST_SECONDS_BEFORE)
         await asyncio.to_thread(do)
@@ -65,7 +44,19 @@ async def in_turn(client: object, do: Callable[[], None]) -> None:
 
 
 class Presses:
-    """The hidden buttons of one container. Make it inside of the container."""
+    """The hidden buttons and inputs of one container. Make it inside the container.
+
+    viser's HTML is one-way, and its buttons cannot be rows of a table. But pressing a viser button sends its message
+    whoever presses it, so a row carries the id of a hidden button (``.wb-presses`` in page.css), and two handlers on
+    the table press that (``pressable.html``). The server learns no more than "this button was pressed".
+
+    A position in a picture (``placeable.html``) and a row of a long table with shift or control (``choosable.html``)
+    are whole numbers written into a hidden number input, with a counter, since an input whose value stays the same
+    sends nothing. The Tab key reaches such parts, and Enter or Space presses them (``pressed_by_key.js``).
+
+    The mouse counts when it goes down: a table that is redrawn a few times a second would lose the click of a person
+    whose finger is still on the button. A touch counts as a click, or scrolling would press.
+    """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -75,10 +66,10 @@ class Presses:
         self._ids: dict[Hashable, str] = {}
 
     def id_of(self, key: Hashable, pressed: Callable[[viser.ClientHandle | None], None]) -> str:
-        """The id to put into ``data-press``; the same key is the same button for good.
+        """The id to put into ``data-press``; the same key always gives the same button.
 
         Args:
-            pressed: called with the page that did it, on a thread, in turn.
+            pressed: called with the page that pressed it, on a thread, in turn.
         """
         if key not in self._ids:
             with self._folder:
@@ -93,16 +84,16 @@ class Presses:
         return self._ids[key]
 
     def when_unfolded(self, unfolded: Callable[[], None]) -> None:
-        """Call this whenever the panel that the container is in comes into a page: by viser's own buttons too.
+        """Call this whenever the container's panel is unfolded, also by viser's own buttons.
 
         Args:
-            unfolded: called on a thread, in turn, once a page; `unfolded.js` says how.
+            unfolded: called on a thread, in turn, once a page (``unfolded.js``).
         """
         pressed = self.id_of("unfolded", lambda _: unfolded())
         self._server.gui.add_html(render("unfolded", id=pressed), order=_LAST + 2)
 
     def number_id(self, key: Hashable, pressed: Callable[[int], None]) -> str:
-        """The id to put into ``data-numbers`` around ``choosable.html``; the same key is the same input for good.
+        """The id to put into ``data-numbers`` around ``choosable.html``; the same key always gives the same input.
 
         Args:
             pressed: called with the number that was pressed, below `NUMBERS`, on a thread, in turn.
@@ -110,23 +101,23 @@ class Presses:
         return self._typed(key, lambda sent: pressed(sent % NUMBERS))
 
     def place_id(self, key: Hashable, pressed: Callable[[float, float], None]) -> str:
-        """The id to put into ``data-place``; the same key is the same input for good.
+        """The id to put into ``data-place``; the same key always gives the same input.
 
         Args:
-            pressed: called with the place in the picture, 0, 0 at its upper left corner and 1, 1 at its lower right
-                one, on a thread, in turn.
+            pressed: called with column and row in the picture, (0, 0) at its upper left corner and (1, 1) at its
+                lower right one, on a thread, in turn.
         """
         return self._typed(key, lambda sent: pressed(*place_of(sent)))
 
     def _typed(self, key: Hashable, take: Callable[[int], None]) -> str:
-        """The id of a hidden input whose number is taken."""
+        """The id of a hidden number input; `take` gets what is written into it."""
         if key not in self._ids:
             with self._folder:
                 number = self._server.gui.add_number("·", 0, min=0)
             name_control(number, _in_words(key))
 
             async def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
-                # Read with its own message: a recording that is pressed twice is selected and opened by three.
+                # Read now, before the next message changes it: a double click on a recording sends three.
                 sent, client = event.target.value, event.client
                 if client is not None:
                     await in_turn(client, lambda: take(sent))
@@ -137,31 +128,31 @@ class Presses:
 
 
 class Paged:
-    """Which page of a long list is shown, of `most` at a time. From any thread."""
+    """Which page of a long list is shown, `most` rows at a time. Thread-safe."""
 
     def __init__(self, most: int) -> None:
         self._most, self.first, self._count = most, 0, 0
 
     def go_to(self, place: int) -> None:
-        """To the page of a place; `places` takes the nearest that there is."""
+        """Show the page that holds this row; `places` clamps it to the list."""
         self.first = max(place, 0) // self._most * self._most
 
     def turn(self, by: int) -> None:
-        """Go on by so many pages."""
+        """Move by this many pages."""
         self.go_to(self.first + by * self._most)
 
     def places(self, count: int) -> range:
-        """What is shown of a list that is so long now."""
+        """The rows to show of a list of this length."""
         self._count = count
         if self.first >= count:
             self.go_to(count - 1)
         return range(self.first, min(self.first + self._most, count))
 
     def shown(self, press: Callable[[str, Callable[[], None]], str]) -> dict[str, object] | None:
-        """For a template: from where to where, of how many, and the ids of the buttons; None where one page has all.
+        """For a template: first, last, count, and the ids of the buttons; None where one page holds all rows.
 
         Args:
-            press: gives what turns the page an id.
+            press: the id of the button that runs a function.
         """
         if self._count <= self._most:
             return None

@@ -1,9 +1,4 @@
-"""Every action that matters, with a key and a name in the command palette (Ctrl+K).
-
-Keys work while no text field has the focus. A slider that has the focus takes the arrows too, and one press would
-count twice, so the commands on arrows ask first whether one did (`Control.took_the_key`). The list is one table, so that the page, the palette and
-the help that is made from it cannot disagree.
-"""
+"""Commands of a page with their keys and their names in the command palette (Ctrl+K)."""
 
 from __future__ import annotations
 
@@ -31,16 +26,22 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Command:
+    """An entry of the palette; its key works while no text field has the focus.
+
+    A slider that has the focus takes the arrow keys too, so commands on arrows ask `Control.took_the_key` first, or
+    one press counts twice.
+    """
+
     label: str
     run: Callable[[], None]
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
     registered: Callable[[viser.CommandHandle], None] | None = None
-    """Gets its handle, for who wants to disable it at times."""
+    """Called with its handle, which can disable the command."""
 
     @property
     def key_name(self) -> str:
-        """For a person: ``Space``, ``Shift R``."""
+        """As the page shows it: ``Space``, ``Shift R``."""
         if self.key is None:
             return ""
         name = _NAMES.get(self.key, self.key)
@@ -49,7 +50,7 @@ class Command:
 
     @property
     def combination(self) -> str:
-        """For the page's scripts: ``arrowdown``, ``cmd/ctrl+a``."""
+        """As the page's scripts compare it: ``arrowdown``, ``cmd/ctrl+a``."""
         return "+".join(part for part in (self.modifier, (self.key or "").lower()) if part)
 
 

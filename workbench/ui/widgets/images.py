@@ -1,8 +1,4 @@
-"""What a camera saw as a picture that a person can read, a line on what its colours mean, and pictures in our own HTML.
-
-Depth, segmentation, positions and normals get colours. viser's own pictures cannot be pressed, and stand one below the
-other; a table with a picture in each row carries them as ``data:`` addresses, 3 to 6 kB for 128 x 128.
-"""
+"""Camera data as RGB pictures with captions, and as ``data:`` addresses for HTML."""
 
 from __future__ import annotations
 
@@ -26,14 +22,14 @@ VIRIDIS = np.array(
     ],
     np.float32,
 )  # fmt: skip
-"""Ten colours of matplotlib's viridis (CC0), near first: bright is near, as on most depth viewers."""
+"""Ten colours of matplotlib's viridis (CC0), reversed: bright is near, as in most depth viewers."""
 NOTHING = np.array((24, 24, 27), np.uint8)
 LONGEST_LEGEND = 10
 
 
 @dataclass(frozen=True)
 class DepthRange:
-    """Metres that the ends of the colour scale stand for."""
+    """Metres at the two ends of the colour scale."""
 
     near: float
     far: float
@@ -43,10 +39,10 @@ class DepthRange:
 
 
 def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
-    """Where most of what was met lies, or None where nothing was met.
+    """The range of most finite positive depths; None where there are none.
 
-    From the 1st to the 98th percentile and no further than three times the median: a floor that runs
-    to the horizon behind a table would otherwise leave the whole table one colour.
+    From the 1st to the 98th percentile, and at most three times the median: a floor that runs to the horizon behind
+    a table would leave the whole table one colour.
     """
     met = depth[np.isfinite(depth) & (depth > 0)]
     if not met.size:
@@ -56,7 +52,7 @@ def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
 
 
 def colour_depth(depth: NDArray[np.float32], span: DepthRange) -> NDArray[np.uint8]:
-    """(H, W) metres as (H, W, 3) RGB; what is out of the span takes the colour of its end."""
+    """(H, W) metres as (H, W, 3) RGB, clamped to the span."""
     met = np.isfinite(depth) & (depth > 0)
     metres = np.where(met, depth, span.near).astype(np.float64)
     place = np.clip((metres - span.near) / (span.far - span.near), 0, 1)
@@ -68,7 +64,7 @@ def colour_depth(depth: NDArray[np.float32], span: DepthRange) -> NDArray[np.uin
 
 
 def colour_position(position: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(H, W, 3) metres of the camera's frame as RGB: x, y and z from the 1st to the 98th percentile of each."""
+    """(H, W, 3) metres in the camera's frame as RGB: x, y and z, each from its 1st to its 98th percentile."""
     met = np.isfinite(position).all(axis=-1) & (position[..., 2] < 0)
     if not met.any():
         return np.broadcast_to(NOTHING, position.shape).copy()
@@ -85,10 +81,9 @@ def colour_normal(normal: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def segment_colour(identity: int) -> tuple[int, int, int]:
-    """A colour of this segmentation id, the same in every picture; 0, the background, is dark.
+    """RGB of a segmentation id, the same in every picture; 0, the background, is dark.
 
-    Hues go round by the golden ratio, so that ids that follow each other differ well; lightness
-    alternates so that many ids stay apart.
+    Hues advance by the golden ratio and lightness alternates, so that ids close to each other differ well.
     """
     if identity == 0:
         return int(NOTHING[0]), int(NOTHING[1]), int(NOTHING[2])
@@ -109,7 +104,7 @@ def colour_segmentation(segmentation: NDArray[np.int32]) -> NDArray[np.uint8]:
 def segments_seen(
     segmentation: NDArray[np.int32], names: dict[int, str]
 ) -> tuple[list[tuple[str, str]], int]:
-    """The legend of a picture: (CSS colour, name) by size, and how many more there are."""
+    """The legend of a picture: (CSS colour, name), largest first, and the number of segments left out."""
     identities, counts = np.unique(segmentation, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     seen = [int(identities[i]) for i in order]
@@ -125,7 +120,7 @@ def data_address(pixels: NDArray[np.uint8], longest: int) -> str:
 
     Args:
         pixels: (H, W, 3) RGB.
-        longest: Pixels that its longer side has at most; what is larger is averaged down.
+        longest: Pixels of its longer side at most; a larger picture is averaged down. 128 takes 3 to 6 kB.
     """
     image = Image.fromarray(np.ascontiguousarray(pixels))
     if max(image.size) > longest:
@@ -148,7 +143,7 @@ _NORMAL = "red, green, blue: right, up, towards the camera"
 
 
 def depth_span(before: DepthRange | None, picture: Picture) -> DepthRange | None:
-    """The depths that the scale is to cover now: only ever widened, or each picture would recolour what stands still."""
+    """The range of the colour scale with this picture: only ever widened, or a body at rest would change its colour."""
     span = None if picture.depth is None else depth_range(picture.depth)
     return before if span is None else span if before is None else before.widened(span)
 
@@ -156,7 +151,7 @@ def depth_span(before: DepthRange | None, picture: Picture) -> DepthRange | None
 def in_colours(
     picture: Picture, modality: str, names: dict[int, str], span: DepthRange | None
 ) -> tuple[NDArray[np.uint8], str] | None:
-    """Pixels (H, W, 3) and a caption, of HTML; None if the picture has no such thing.
+    """Pixels (H, W, 3) and a caption in HTML; None if the picture lacks this modality.
 
     Args:
         names: of the ids in a segmentation.
@@ -182,5 +177,5 @@ def in_colours(
 
 
 def image_format(modality: str) -> Literal["png", "jpeg"]:
-    """Flat colours of a segmentation would get halos from JPEG."""
+    """PNG for a segmentation, whose flat colours would get halos from JPEG."""
     return "png" if modality == "segmentation" else "jpeg"

@@ -1,16 +1,4 @@
-"""One input of the page whose truth is in the session.
-
-Three parties may set a value: the person at the input, a key or a second page, and the session
-itself (a value that it refuses). The input only asks, the session decides, and the page shows what
-the session says. Two things go wrong if that is done plainly. A value that comes back while the
-person still drags would pull the slider out of their hand: so an input that was touched a moment
-ago is left alone. And each key stroke in a text field would be applied: so an input may ask to be
-left to settle first.
-
-Each folder has a bar under its own button, and the one that was pressed last shows what runs: one bar above all would
-push the pressed button away, one at the end is not seen. A result is brought into sight for a moment only (HTML carries
-``into_sight.html`` while it is new): a tab that is opened again draws its HTML anew, and nobody wants to be taken there.
-"""
+"""Inputs whose value is owned by the session, refusals shown to a page, and progress bars with results."""
 
 from __future__ import annotations
 
@@ -31,9 +19,9 @@ T = TypeVar("T")
 Handle = TypeVar("Handle", bound=viser.GuiInputHandle)
 
 KEY_SETTLES = 0.03
-"""Seconds. An input that has the focus takes the arrow keys too, and what it says comes in any order with the key."""
+"""Seconds. A focused input takes the arrow keys too, and its message comes before or after that of the key."""
 HANDS_OFF = 0.5
-"""Seconds after a person touched an input in which it is not written to."""
+"""Seconds after a person touched an input during which it is not written to."""
 
 
 def tell_all(
@@ -43,7 +31,7 @@ def tell_all(
     color: Literal["orange", "red"] | None = "orange",
     seconds: float | None = None,
 ) -> None:
-    """Notify every open page: a key does not tell which one it was pressed on."""
+    """Notify every open page: a key does not tell on which one it was pressed."""
     for client in server.get_clients().values():
         client.add_notification(title, text, color=color, auto_close_seconds=seconds)
 
@@ -54,7 +42,7 @@ def refusals_told(
     title: str = "Not possible",
     then: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
-    """A ValueError within ends what is within, and is shown to the page that asked."""
+    """Catch a ValueError of the block and show it to the page that asked."""
     try:
         yield
     except ValueError as error:
@@ -66,12 +54,16 @@ def refusals_told(
 class Control(Generic[Handle, T]):
     """Ties one viser input to one setting of the session.
 
+    A person, a key, a second page and the session may all change the value: the input asks, the session decides, the
+    page shows what the session has. An input that was touched a moment ago is not written to, or the value that comes
+    back would pull the slider out of the person's hand.
+
     Args:
-        handle: The input. What it cannot hold never comes here (`control_values.check_value`).
+        handle: The input. Values that it cannot hold never come here (`control_values.check_value`).
         send: Asks the session for a value. Must not block. Raises ValueError with a sentence for the person.
         read: The input's value as the session's; raises as `send`.
         shown: The session's value as the input's.
-        settle: Seconds without a change before a value is sent.
+        settle: Seconds without a change before a value is sent, so that a text field does not send each key stroke.
         clock: Of the page.
     """
 
@@ -99,12 +91,12 @@ class Control(Generic[Handle, T]):
 
     @staticmethod
     def took_the_key() -> bool:
-        """For a command of the arrow keys: whether an input that has the focus took the key as well. Sleeps a moment."""
+        """For a command on an arrow key: whether a focused input took the key as well. Sleeps `KEY_SETTLES`."""
         time.sleep(KEY_SETTLES)
         return time.monotonic() - Control._last_touch < 10 * KEY_SETTLES
 
     def show(self, value: T) -> None:
-        """Show what the session says, unless someone has their hand on the input; send what settled."""
+        """Send a value that has settled; else show the session's, unless a person is using the input."""
         idle = self._clock() - self._touched
         with self._lock:
             client = self._waiting if idle >= self._settle else None
@@ -119,11 +111,11 @@ class Control(Generic[Handle, T]):
         self.handle.disabled = not enabled
 
     async def _on_update(self, event: viser.GuiEvent) -> None:
-        # Async, so that it runs with the message itself: in viser's pool of threads it may come so late that `show`
-        # has put the session's value over the new one, which is then what would be sent.
+        # Async, so that it runs with the message itself: in viser's pool of threads it may come after `show` has
+        # overwritten the new value with the session's, and that would be sent.
         if event.client is None:
-            return  # `show` wrote it; sending it back would make an endless exchange.
-        # Keys are of this moment, whatever the clock of the page says.
+            return  # `show` wrote it; sending it back would loop without end.
+        # Real time, also where a test drives the clock of the page: `took_the_key` sleeps.
         self._touched, Control._last_touch = self._clock(), time.monotonic()
         if self._settle:
             with self._lock:
@@ -132,7 +124,7 @@ class Control(Generic[Handle, T]):
             self._apply(event.client)
 
     def _apply(self, client: viser.ClientHandle) -> None:
-        # Callbacks run in a pool of threads and finish in any order: the handle has the newest.
+        # Callbacks run in a pool of threads and finish in any order: the handle has the newest value.
         with refusals_told(client, then=self._let_go):
             self._send(self._read(self.handle.value))
 
@@ -140,38 +132,47 @@ class Control(Generic[Handle, T]):
         self._touched = -1e9
 
 
-# --- How far work in the background is, and the way into sight for what came of it ------------
+# --- Progress bar of a background job, and its result scrolled into view -----------------------
 
 
 JUST = 1.0
 """Seconds."""
 
 
-class Arrival:
+class NewResult:
+    """Notices that a result has just replaced an older one, so that it is scrolled into view once.
+
+    Only for a moment (``into_sight.html``): a tab that is opened again redraws its HTML, and must not scroll then.
+    """
+
     def __init__(self) -> None:
         self._before: object = None
         self._waiting = False
         self._came = -1e9
 
     def asked(self, now: object) -> None:
-        """Something was asked for, which is to come in place of what there is now."""
+        """A new result was asked for; `now` is the one that it will replace."""
         self._before, self._waiting = now, True
 
     def just_came(self, now: object) -> bool:
-        """Whether it came a moment ago. To be asked at every draw, with what there is."""
+        """Whether the result came less than `JUST` ago. Call it at every draw, with the present result."""
         if self._waiting and now is not self._before and now:
             self._waiting, self._came = False, time.monotonic()
         return time.monotonic() - self._came < JUST
 
 
 SHORT = 0.5
-"""Seconds that something may take without a bar."""
+"""Seconds that a job may take without a bar."""
 
 
-class Answer:
-    """What is asked for with the button above, in the present container: a bar while it runs, and then what came of it."""
+class JobResult:
+    """A progress bar with a Stop button, and then the result, in the present container.
 
-    _asked_last: ClassVar[Answer | None] = None
+    Each folder has one under its own button, and only the one that was asked last shows what runs: one bar above all
+    would push the pressed button away, one at the end is not seen.
+    """
+
+    _asked_last: ClassVar[JobResult | None] = None
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         gui = server.gui
@@ -180,24 +181,24 @@ class Answer:
         self._stop.on_click(lambda _: session.studio.judging.stop())
         self._html = gui.add_html("", visible=False)
         self._began: float | None = None
-        self._arrival = Arrival()
+        self._new = NewResult()
         self._drawn: object = None
 
     def asked(self, now: object) -> None:
-        """What runs from now on was asked for here, and is to come in place of what there is now."""
-        Answer._asked_last = self
-        self._arrival.asked(now)
+        """A job was asked for here; its result replaces `now`."""
+        JobResult._asked_last = self
+        self._new.asked(now)
 
     def draw(self, running: Progress | None, came: object, told: object, html: Callable[[bool], str]) -> None:
-        """Draw what is new.
+        """Draw the bar and the result, where they changed.
 
         Args:
-            came: what is to be shown, if anything.
-            told: what else is to be seen in its HTML; compared.
-            html: makes that of it, given whether it came a moment ago.
+            came: the result, if there is one.
+            told: what else its HTML shows; compared.
+            html: renders the result, given whether it came a moment ago.
         """
         self._draw_bar(running)
-        new = self._arrival.just_came(came)
+        new = self._new.just_came(came)
         if (wanted := (id(came), told, new)) != self._drawn:
             self._drawn = wanted
             self._html.visible = bool(came)
@@ -205,7 +206,7 @@ class Answer:
                 self._html.content = html(new)
 
     def _draw_bar(self, running: Progress | None) -> None:
-        if running is None or Answer._asked_last is not self:
+        if running is None or JobResult._asked_last is not self:
             self._began = None
         elif self._began is None:
             self._began = time.monotonic()

@@ -1,11 +1,4 @@
-"""One chart of lines over steps, made when there is something to draw.
-
-viser keeps what part of the x axis one sees as a share of the data's range, and works that out from two charts at
-once when uPlot makes its chart anew, which it does for a change of anything but the data. So after such a change the
-axis shows another part of the data than before, for good, and in the end none of it. And uPlot finds no range for
-data with NaN in it, and draws through it. So all that draw curves have the chart through here: only data are ever
-sent to a chart that is shown, with gaps where there is no number, and for other lines another chart is shown.
-"""
+"""Line charts over steps, with gaps where a value is not finite."""
 
 from __future__ import annotations
 
@@ -20,12 +13,12 @@ from numpy.typing import NDArray
 from workbench.ui.server.viser_private import send_lines
 
 TAKING_TURNS = 3
-"""Charts of which one is shown. Of two, a browser that is busy might see no change where there were two in a row."""
+"""Charts, one of them shown. With two, a busy browser may miss that two changes followed each other."""
 LONGEST = 600
 """Points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
 STEP = uplot.Series(label="step")
-"""What lies along x; the first of every chart's series."""
+"""The x axis; the first of every chart's series."""
 CURSOR = uplot.Series(
     label="shown", stroke="#f08c00", width=0, points={"show": True, "size": 10, "fill": "#f08c00"}
 )
@@ -36,18 +29,24 @@ YES_OR_NO: Span = (-0.05, 1.05)
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """One curve, without its points."""
+class ChartLine:
+    """One curve of a chart."""
 
     name: str
     values: NDArray
-    """(K,) with a gap where it is not finite."""
+    """(K,), with a gap where it is not finite."""
     colour: str = SELECTED_COLOUR
     width: float = 1.8
 
 
 class LineChart:
-    """A chart in a folder, once there is something to draw."""
+    """A chart in a folder, made when there is something to draw.
+
+    viser keeps the visible part of the x axis as a share of the data's range, and computes it from two charts at once
+    when uPlot rebuilds its chart, which it does for a change of anything but the data: from then on the axis shows
+    another part of the data, in the end none. So a chart that is shown gets new data only, and other lines are drawn
+    in another chart. uPlot finds no range for data with NaN, and draws through it: NaN is sent as a gap.
+    """
 
     def __init__(
         self,
@@ -58,12 +57,12 @@ class LineChart:
     ) -> None:
         self._server, self._folder, self._height, self._order = server, folder, height, order
         self._charts: list[viser.GuiUplotHandle] = []
-        """One of them is shown at most; the last one was last."""
+        """At most one is visible: the last."""
         self._made_for: object = None
 
     @property
     def handle(self) -> viser.GuiUplotHandle | None:
-        """The chart that was drawn last; None before there was something to draw."""
+        """The chart that was drawn last, if any."""
         return self._charts[-1] if self._charts else None
 
     def hide(self) -> None:
@@ -74,18 +73,18 @@ class LineChart:
         self,
         title: str,
         x: NDArray,
-        lines: Sequence[Line],
+        lines: Sequence[ChartLine],
         dot: NDArray | None = None,
         span: Span | None = None,
     ) -> None:
-        """Hide it where no line has a number, or there are no two places.
+        """Draw lines; hide the chart where no line has a finite value, or K < 2.
 
         Args:
             title: Over the chart.
             x: (K,) steps.
             lines: Each over all of `x`.
-            dot: (K,) a number where one dot is to be, none elsewhere.
-            span: The range along y; None for that of the data.
+            dot: (K,) finite at the one dot, NaN elsewhere.
+            span: The range of the y axis; None fits the data.
         """
         if len(x) < 2 or not any(np.isfinite(line.values).any() for line in lines):
             self.hide()
@@ -112,9 +111,9 @@ class LineChart:
         series: tuple[uplot.Series, ...],
         span: Span | None,
     ) -> None:
-        """Make a chart that is not in the page the one to draw: there it begins anew, with its x axis too.
+        """Draw in a chart that is not shown: it begins with a fresh x axis.
 
-        It is not removed and added, since a browser that is busy meets the data of before after that, and says so.
+        It is hidden, not removed: a busy browser would report data that arrives for a chart that is gone.
         """
         scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
         self.hide()
@@ -133,7 +132,7 @@ class LineChart:
                 legend=uplot.Legend(show=True),
                 height=self._height,
                 padding=(6, 12, 0, 0),
-                # All in one place.
+                # All of them at the same position of the folder.
                 order=self._order,
                 visible=False,
             )
@@ -141,12 +140,12 @@ class LineChart:
         self._charts.append(chart)
 
 
-def _series(line: Line) -> uplot.Series:
+def _series(line: ChartLine) -> uplot.Series:
     return uplot.Series(label=line.name, stroke=line.colour, width=line.width, points={"show": False})
 
 
 def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float | None]:
-    """A line as uPlot wants it: None where it is not finite, which is a gap to uPlot as NaN is not."""
+    """A line for uPlot: None, which uPlot shows as a gap, where a value is not finite."""
     finite = np.isfinite(values)
     if finite.all():
         return values
@@ -154,12 +153,12 @@ def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float |
 
 
 def part_round(count: int, place: int | None) -> slice:
-    """`LONGEST` of so many points, as far as there are: round a place, or the newest."""
+    """At most `LONGEST` of `count` points: around a place, or the newest."""
     end = count if place is None else min(max(place + LONGEST // 2, LONGEST), count)
     return slice(max(0, end - LONGEST), end)
 
 
 def span_of(lines: Sequence[NDArray[np.float64]]) -> Span | None:
-    """The range of a chart: of a yes or no always the same one, whether it changes or not; else that of the data."""
+    """The y range of a chart: fixed for curves of 0 and 1, else None (that of the data)."""
     values = np.concatenate([[], *lines])
     return YES_OR_NO if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all() else None

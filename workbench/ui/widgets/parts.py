@@ -1,7 +1,4 @@
-"""A page is a list of parts, and each is drawn when there is something new to show and the last drawing could be read.
-
-The clock is given by who draws, so that all parts of a page go by one, and a test lets it pass.
-"""
+"""Parts of a page, each drawn again when what it shows has changed."""
 
 from __future__ import annotations
 
@@ -10,27 +7,27 @@ from collections.abc import Callable, Iterable
 from typing import ClassVar, Generic, TypeVar
 
 Clock = Callable[[], float]
-"""Seconds from some moment on: `time.monotonic`, or what a test says."""
+"""Seconds: `time.monotonic`, or a test's own clock. All parts of a page share one."""
 View = TypeVar("View", contravariant=True)
 
 
 class PagePart(Generic[View]):
     """One part of a page, drawn from an immutable view.
 
-    It is drawn again when its `key` is another, `every` seconds after the last time at the soonest; and at once when
-    what is `urgent` is another. As it stands here every view is drawn: viser sends nothing of what is equal
-    (``tests/ui/test_assigning.py``), so a part needs a key only where it is dear to make what it shows.
+    It is drawn again when its `key` changes, at most once per `every` seconds, and at once when `urgent` changes.
+    By default every view is drawn: viser sends no value that is equal (``tests/ui/test_assigning.py``), so a part
+    needs a key only where what it shows is expensive to make.
     """
 
     every: ClassVar[float] = 0.0
     """Seconds."""
 
     def key(self, view: View) -> object:
-        """What it shows of the view: equal to that of an equal drawing."""
+        """What it shows of the view; equal keys mean equal drawings."""
         return object()
 
     def urgent(self, view: View) -> object:
-        """What of it somebody waits for."""
+        """What a person waits for; a change is drawn at once."""
         return None
 
     def draw(self, view: View) -> None:
@@ -51,7 +48,7 @@ class DrawDue:
         """Key, urgent, and when."""
 
     def is_due(self, key: object, urgent: object = None) -> bool:
-        """Whether to draw now; if so, this is what is drawn from here on."""
+        """Whether to draw now; if so, remembers this as drawn."""
         now = self._clock()
         if self._drawn is not None:
             drawn, was_urgent, at = self._drawn

@@ -1,12 +1,4 @@
-"""The thread that redraws a page, the live one or the review, for as long as it is shown.
-
-What is shown lives by its own clock and the browsers by theirs. Between them is this loop: it waits until there is
-something new, or a moment has passed, and lets the page draw itself. A page that cannot be drawn says so in every
-browser that is open and is tried again: one that stands still and looks alive is worse.
-
-A browser takes a batch of messages as a whole, and a batch with anything of the 3-D view in it waits for the next
-frame of that view, which may take long. Numbers and buttons need not. So they are sent first, in a batch of their own.
-"""
+"""The thread that redraws a page, and the order in which panels and the 3-D view are sent."""
 
 from __future__ import annotations
 
@@ -24,20 +16,24 @@ from workbench.ui.widgets.inputs import tell_all
 log = logging.getLogger(__name__)
 
 FRAME = 1 / 30
-"""Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
+"""Seconds. More pushes make a browser slower (measured: 350 a second leave it 13 to 30 frames a second)."""
 SENT_WITHIN = 0.01
-"""Seconds, of the time for a frame, that the view may wait for the panels to be on their way."""
+"""Seconds of a frame that the 3-D view may wait for the panels to be sent."""
 AGAIN_AFTER = 1.0
 """Seconds until a page that could not be drawn is tried again."""
 
 
 class RedrawLoop:
-    """
+    """Redraws a page whenever there is something new to show.
+
+    A page that cannot be drawn says so in every open browser and is tried again: a page that looks alive and stands
+    still is worse.
+
     Args:
         server: Of viser.
         name: Of the thread.
         wait: Sleeps until there is something newer than a serial, at most some seconds; returns the newest serial.
-        has_viewers: Whether any browser is open; nothing is drawn for nobody.
+        has_viewers: Whether any browser is open; else nothing is drawn.
         draw: Draws the page.
     """
 
@@ -54,7 +50,7 @@ class RedrawLoop:
         self._thread = watched_thread(name, self._run)
 
     def start(self) -> None:
-        """Draw the page, and go on with that in a thread."""
+        """Draw the page, then keep drawing it in a thread."""
         if self._thread.ident is not None:
             raise RuntimeError("The page was started already.")
         if self._has_viewers():
@@ -62,7 +58,7 @@ class RedrawLoop:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop to redraw; returns when the loop has ended."""
+        """Stop redrawing; returns when the loop has ended."""
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join(timeout=5.0)
@@ -93,7 +89,11 @@ class RedrawLoop:
 
 
 def draw_apart(server: viser.ViserServer, panels: Callable[[], None], scene: Callable[[], None]) -> None:
-    """Draw the panels, see them on their way, and then the 3-D view."""
+    """Send the panels first, then the 3-D view in a batch of its own.
+
+    A browser takes a batch as a whole, and one with anything of the 3-D view waits for the next frame of that view,
+    which may take long; numbers and buttons need not.
+    """
     with server.atomic():
         panels()
     server.flush()

@@ -1,4 +1,4 @@
-"""What was judged again, of the past or of recordings: how far it is, a list of what is otherwise, and a chart."""
+"""Shared parts of the two rescoring panels: progress, the list of changed results, and a chart."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from workbench.jobs.verdict import Verdict
 from workbench.session.rescore import verdict_text as words
 from workbench.session.rescore.background import RUNNING, JudgedView
 from workbench.ui.widgets.click_targets import Paged, Presses
-from workbench.ui.widgets.line_chart import Line, LineChart, span_of
+from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
@@ -71,7 +71,7 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
     def _draw_chart(
         self, title: str, x: NDArray, old: NDArray, new: NDArray, dot: NDArray | None = None
     ) -> None:
-        lines = Line("as recorded", old, RECORD_COLOUR, 1.2), Line("judged again", new)
+        lines = ChartLine("as recorded", old, RECORD_COLOUR, 1.2), ChartLine("judged again", new)
         self._chart.draw(title, x, lines, dot, span_of([line.values for line in lines]))
 
     def _row(self, place: int) -> dict[str, Any]:

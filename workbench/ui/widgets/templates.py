@@ -1,11 +1,4 @@
-"""HTML of the panels, made from the templates in ``web_assets/panels``.
-
-viser puts the text of ``add_html`` into the page as it is, so one message of an author's exception
-with a ``<script>`` in it would run there. Everything that is shown as HTML therefore goes through
-`render`, which escapes every value it is given; no other module writes a tag. Characters that are not seen are shown:
-one that turns the direction of writing makes a name look like another, and half of a surrogate pair, as in the name of a
-file that is not UTF-8, cannot be sent to a page at all.
-"""
+"""HTML of the panels, rendered from the templates in ``web_assets/panels`` with every value escaped."""
 
 from __future__ import annotations
 
@@ -20,26 +13,32 @@ from workbench.machine.web_assets import web_assets_folder
 
 
 def render(template: str, **values: Any) -> str:
-    """``web_assets/panels/<template>.html`` with these values, all of them escaped."""
+    """``web_assets/panels/<template>.html`` with these values, all of them escaped.
+
+    viser puts the text of ``add_html`` into the page as it is: an exception message with a ``<script>`` would run
+    there. So all HTML is made here; no other module writes a tag. Invisible characters are shown: one that turns the
+    direction of writing makes a name look like another, and half of a surrogate pair, as in a file name that is not
+    UTF-8, cannot be sent to a page at all.
+    """
     return _environment().get_template(f"{template}.html").render(**values)
 
 
-class _Placed(Protocol):
+class _HasFileLine(Protocol):
     @property
     def file(self) -> str | None: ...
     @property
     def line(self) -> int | None: ...
 
 
-def place(thing: _Placed | None) -> str:
-    """``push.py:88`` of a problem, a finding, a busy worker; empty where no file is known."""
+def place(thing: _HasFileLine | None) -> str:
+    """``push.py:88`` of a problem, a finding or a busy worker; empty where no file is known."""
     if thing is None or not thing.file:
         return ""
     return Path(thing.file).name + (f":{thing.line}" if thing.line else "")
 
 
 def size(count: float) -> str:
-    """Bytes as a person says them: ``640 B``, ``2.5 MB``, ``1.2 GB``, to three digits, by 1000."""
+    """Bytes to three digits: ``640 B``, ``2.5 MB``, ``1.2 GB`` (1 kB is 1000 B)."""
     for unit in ("B", "kB", "MB"):
         if count < 999.5:
             return f"{count:.3g} {unit}"
@@ -48,7 +47,7 @@ def size(count: float) -> str:
 
 
 def percent(done: float, total: float) -> int:
-    """How much of a whole is done; 0 while the whole is not known."""
+    """The done part of a total; 0 while the total is not known."""
     return round(100 * done / total) if total else 0
 
 
@@ -56,12 +55,12 @@ COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 
 
 def letter(index: int) -> str:
-    """What a recording is called on the page: A to D, then numbers."""
+    """Label of a recording on the page: A to D, then numbers."""
     return "ABCD"[index] if index < 4 else str(index + 1)
 
 
 def colour(index: int) -> str:
-    """Of a recording that is compared, in legends, curves and the view."""
+    """Colour of a compared recording, in legends, curves and the view."""
     return COLOURS[index % len(COLOURS)]
 
 
@@ -70,7 +69,7 @@ def short_text(text: str, longest: int = 120) -> str:
 
 
 def sentence(why: str) -> str:
-    """With a capital and a full stop."""
+    """The text with a capital and a full stop."""
     return f"{why[:1].upper()}{why[1:].removesuffix('.')}." if why else ""
 
 
@@ -80,7 +79,7 @@ def counted(count: int, what: str) -> str:
 
 
 def _shown(value: Any) -> Any:
-    # Not Markup: that is a template's own text, whose values have been here.
+    # Not Markup: that is a template's own text, whose values were escaped already.
     return plain_text(value, "\n\t") if type(value) is str else value
 
 
