@@ -14,7 +14,7 @@ from workbench.recording.episode.source import Source
 from workbench.recording.lerobot.export import DoesNotFit, ExportOptions
 from workbench.recording.reader.reading import sources_among
 from workbench.recording.rerun.viewer import has_screen, open_window, recordings_among, web_viewer_folder
-from workbench.ui.share.make import EVERY_CAMERA, Made, Wanted, make
+from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, make
 
 SCENE, CAMERAS = "scene", "cameras"
 
@@ -28,14 +28,18 @@ def share_in_terminal(
 ) -> int:
     """Returns the exit code."""
 
-    def wanted(sources: tuple[Source, ...]) -> list[Wanted]:
+    def wanted(sources: tuple[Source, ...]) -> list[MakeRequest]:
         films = [
-            Wanted("scene", sources, out)
+            MakeRequest("scene", sources, out)
             if name == SCENE
-            else Wanted("film", sources, out, EVERY_CAMERA if name == CAMERAS else name)
+            else MakeRequest("film", sources, out, EVERY_CAMERA if name == CAMERAS else name)
             for name in mp4
         ]
-        return [*films, *[Wanted("page", sources, out)] * html, *[Wanted("sheet", sources, out)] * sheet]
+        return [
+            *films,
+            *[MakeRequest("page", sources, out)] * html,
+            *[MakeRequest("sheet", sources, out)] * sheet,
+        ]
 
     if not (mp4 or html or sheet):
         return refuse("say what to make: --mp4 CAMERA, --mp4 scene, --html or --sheet")
@@ -44,10 +48,10 @@ def share_in_terminal(
 
 def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
     """Returns the exit code."""
-    return _make_all(files, lambda sources: [Wanted("lerobot", sources, folder, export=options)])
+    return _make_all(files, lambda sources: [MakeRequest("lerobot", sources, folder, export=options)])
 
 
-def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], list[Wanted]]) -> int:
+def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
     try:
         wanted = wanted_of(sources_among(files))
     except (OSError, ValueError) as error:

@@ -15,7 +15,7 @@ from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.source import Source
 from workbench.recording.reader.reading import sources_among
-from workbench.ui.share.make import Making, MakingView, Wanted
+from workbench.ui.share.make import MakeRequest, Making, MakingView
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -69,19 +69,19 @@ class Told:
 
 def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_path: Path) -> None:
     told, (source,) = Told(), sources_among([recordings])
-    assert told.making.start(Wanted("sheet", (source,), tmp_path))
-    assert not told.making.start(Wanted("sheet", (source,), tmp_path)), "two at a time"
+    assert told.making.start(MakeRequest("sheet", (source,), tmp_path))
+    assert not told.making.start(MakeRequest("sheet", (source,), tmp_path)), "two at a time"
     view = told.wait(lambda view: not view.running)
     assert view.problem == ""
     assert [path.name for path in view.made[0].paths] == [f"{source.stem}.sheet.png"]
-    assert told.making.start(Wanted("sheet", (source,), tmp_path))
+    assert told.making.start(MakeRequest("sheet", (source,), tmp_path))
     view = told.wait(lambda view: not view.running)
     assert "not written over" in view.problem and len(view.made) == 1
 
 
 def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     told = Told()
-    told.making.start(Wanted("film", sources_among([recordings]) * 20, tmp_path / "films", "eye"))
+    told.making.start(MakeRequest("film", sources_among([recordings]) * 20, tmp_path / "films", "eye"))
     told.wait(lambda view: view.done > 0.01 and "eye" in view.doing)
     told.making.stop()
     view = told.wait(lambda view: not view.running)
@@ -91,7 +91,9 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
 
 def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
     told = Told()
-    told.making.start(Wanted("lerobot", sources_among([recordings]) * 200, tmp_path / "datasets" / "one"))
+    told.making.start(
+        MakeRequest("lerobot", sources_among([recordings]) * 200, tmp_path / "datasets" / "one")
+    )
     until(lambda: list(tmp_path.glob("datasets/.one.*/videos/*/*/*")), "a film that is written")
     told.making.stop()
     view = told.wait(lambda view: not view.running)
@@ -102,7 +104,7 @@ def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_
 def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
     told = Told()
     (tmp_path / "x.json").write_text("{}")
-    told.making.start(Wanted("sheet", (Source(tmp_path / "x.json"),), tmp_path))
+    told.making.start(MakeRequest("sheet", (Source(tmp_path / "x.json"),), tmp_path))
     assert "x" in told.wait(lambda view: not view.running).problem
     scratch = told.making.scratch()
     told.making.close()

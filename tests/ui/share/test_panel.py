@@ -13,7 +13,7 @@ from tests.drive.panels import Panels
 from workbench.recording.episode.source import Source
 from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import Door
-from workbench.ui.share.make import EVERY_CAMERA, Made, Making, MakingView, Wanted
+from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView
 from workbench.ui.share.panel import (
     ALL_CAMERAS,
     MOST_NAMED,
@@ -30,14 +30,14 @@ class Noted(Making):
 
     def __init__(self) -> None:
         super().__init__()
-        self.wanted: list[Wanted] = []
+        self.wanted: list[MakeRequest] = []
         self.shown = MakingView()
         self.started = threading.Event()
 
     def view(self) -> MakingView:
         return self.shown
 
-    def start(self, wanted: Wanted) -> bool:
+    def start(self, wanted: MakeRequest) -> bool:
         self.wanted.append(wanted)
         return True
 

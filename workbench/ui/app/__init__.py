@@ -1,1 +1,1 @@
-"""The two pages put together, and the ways between them."""
+"""The live page, the review page, and switching between them."""

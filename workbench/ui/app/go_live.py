@@ -1,10 +1,4 @@
-"""From the review into the live env, and back: what "Go on live from here" opens, in which code, and the way there.
-
-Where the recording's task is open already, its env (or all) is put into the recorded state; else another session is
-opened for it beside the one that is open. The review stays, and says what it waits for, until the env stands in that
-state, or until only the live page can help: the task's code failed, or may have to be interrupted. Sessions that are
-opened here are closed here, with the folder of a recorded text.
-"""
+"""Continues a recording in a live env: chooses or opens a session, asks for consent, and switches the page."""
 
 from __future__ import annotations
 
@@ -45,7 +39,7 @@ if TYPE_CHECKING:
 
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4
-"""Envs of a session that is opened for all of them."""
+"""Envs of a session that is opened for "all envs"."""
 
 
 MakeSession = Callable[[TaskName, TaskOptions], Session]
@@ -53,22 +47,22 @@ MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 @dataclass
 class _Way:
-    """From a recording to a live env."""
+    """One transition from a recording to a live env."""
 
     info: EpisodeInfo
     run: RecordedRun
     state: int
     given_up: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
-    """Waits for somebody to say that the code may run."""
+    """Waits for the consent to run the code."""
     number: int = 0
-    """What `TimelineView.entered` is when it is there."""
+    """`TimelineView.entered` when the env has the recorded state."""
     problems: int = 0
     session: Session | None = None
-    """That is put into the state; None while somebody is asked. Set last."""
+    """Gets the recorded state; None until the consent is given. Set last."""
 
     def is_over(self) -> bool:
-        """Whether the live page has something to show now."""
+        """Whether to show the live page now: the state is there, the task failed, or it may have to be interrupted."""
         if self.session is None:
             return False
         view = self.session.view()
@@ -77,7 +71,7 @@ class _Way:
         return arrived or failed or is_busy_for_long(view)
 
     def words(self) -> str:
-        """What is waited for."""
+        """What it waits for, for the page."""
         task = self.info.task
         if self.session is None:
             return f"asking whether the code of {task} may run"
@@ -90,13 +84,17 @@ class _Way:
 
 
 class StepIn:
-    """Goes live from recordings.
+    """Continues recordings in a live env.
+
+    If the recording's task is open already, its env (or all) gets the recorded state; else another session is opened
+    for it, and closed here, with the folder of a recorded text. The review stays until the live page has something to
+    show.
 
     Args:
-        place: The pages, and the session that is open, if one is.
+        place: The pages, and the open session, if any.
         make_session: Opens a task; gets what `Session` gets.
-        clearances: Say what of the code that recordings name may run.
-        base: What is the same for all that is opened.
+        clearances: Decide which code named by recordings may run.
+        base: Options that all opened tasks share.
     """
 
     def __init__(
@@ -114,7 +112,7 @@ class StepIn:
         self._way: _Way | None = None
 
     def go(self, id: str, state: int) -> None:
-        """Go on live from a state of an opened recording; on the way there, stay in the review after all."""
+        """Continue live from a state of an opened recording; if that is in progress, cancel it."""
         if self._way is not None:
             self._give_up()
             return
@@ -139,14 +137,14 @@ class StepIn:
             self._enter(there, way)
             return
         wanted = Wanted(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
-        # An answer may take long, and this is one of the few threads that the page's buttons have.
+        # An answer may take long, and the page's buttons share few threads.
         way.thread = threading.Thread(
             target=self._clear_and_go, args=(way, wanted), name="clear", daemon=True
         )
         way.thread.start()
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
-        """A session that has this task open, in today's code."""
+        """An open session with this task in today's code."""
         with self._lock:
             session = self._place.session
             if session is not None and (self._own is None or self._own[1] is None):
@@ -189,7 +187,7 @@ class StepIn:
             way.given_up.set()
 
     def going(self) -> str:
-        """What is waited for on the way to the live env; empty while nobody is on it."""
+        """What the transition waits for; empty while there is none."""
         way = self._way
         return "" if way is None else way.words()
 
@@ -200,16 +198,16 @@ class StepIn:
             self._place.pages.show("live")
 
     def review_is_back(self) -> None:
-        """The page of recordings is shown anew: nobody is on the way any more who is not asked something."""
+        """The review page is shown again: forget a transition that waits for no consent."""
         if self._way is not None and self._way.session is not None:
             self._way = None
 
     def can_go_home(self) -> bool:
-        """Whether another session is live than the one that was opened first."""
+        """Whether the live session is not the one that was opened first."""
         return self._first is not None and self._place.session is not self._first
 
     def go_home(self) -> None:
-        """Back to the session that was opened first; the other ends."""
+        """Return to the session that was opened first; the other ends."""
         if self._first is None:
             return
         self._place.session = self._first
@@ -218,7 +216,7 @@ class StepIn:
             self._let_go()
 
     def close(self) -> None:
-        """End what was opened here; the pages must be stopped."""
+        """End the session opened here; the pages must be stopped."""
         way = self._way
         self._give_up()
         if way is not None and way.thread is not None:
@@ -240,7 +238,7 @@ class StepIn:
         return session
 
     def _let_go(self) -> None:
-        """End the session that was opened here. Its page, if that is shown, is taken away before it is missed."""
+        """End the session that was opened here, in a thread; the caller shows another page meanwhile."""
         if self._own is not None:
             threading.Thread(target=_end, args=self._own, name="end-session", daemon=True).start()
         self._own = None
@@ -250,13 +248,13 @@ class StepIn:
 
 
 class StepInPart(PagePart[ReviewView]):
-    """How to go live: the code, and into which envs."""
+    """Options of going live: which code, and into which envs."""
 
     def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
         self._step_in = step_in
         step_in.review_is_back()
         self._about: object = None
-        """Which recording and code the note below the code was made for."""
+        """The recording and the code that the note below the code is about."""
         gui = server.gui
         self._folder = gui.add_folder("Going on live", expand_by_default=False, visible=False)
         with self._folder:

@@ -1,11 +1,4 @@
-"""The page: its parts put together, and redrawn as the session goes on (`redraw_loop`).
-
-Whenever the session has something new, one immutable snapshot is taken, and every part compares it with
-what it drew last. So a part is a function of the snapshot, nothing is sent twice, and callbacks of the
-page, which run in any thread and any order, only ever ask the session for something.
-
-With no page open nothing is drawn, and the session is told so that it renders nothing either.
-"""
+"""The live page: builds its parts and redraws them when the session has something new."""
 
 from __future__ import annotations
 
@@ -46,14 +39,18 @@ ENVS_WIDTH = 520
 class Page:
     """The workbench's page on this server, showing this session.
 
+    Each redraw takes one immutable snapshot of the session, and every part compares it with what it drew last. Callbacks
+    of the page run in any thread and order, and only ask the session for something. While no page is open nothing is
+    drawn or rendered.
+
     Args:
-        server: Of viser, already behind its door.
-        session: What is shown and asked.
-        dark: How it begins.
+        server: Of viser.
+        session: The session.
+        dark: The first theme.
         on_review: Called when a person wants to see the recordings.
         stage: The 3-D view; None makes one.
-        commands: Of the program; in the palette as well.
-        clock: That the parts of the page go by.
+        commands: Further ones for the palette.
+        clock: Of all parts of the page.
     """
 
     def __init__(
@@ -104,7 +101,7 @@ class Page:
         server.scene.on_click()(self._on_scene_click)
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
-        """Returns the Run tab, which other parts put something into, and what is in all of them."""
+        """Returns the Run tab, which gets more content later, and the parts of all tabs."""
         server, session, clock, on_review = self._server, self._session, self._clock, self._on_review
         tabs = server.gui.add_tab_group()
         run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
@@ -145,20 +142,20 @@ class Page:
             self._envs = EnvPanel(self._server, self._session)
         self._env_window.dock_left()
         self._env_window.set_width(ENVS_WIDTH)
-        # A strip at the edge until somebody wants it: it takes half of a small screen's view.
+        # Minimized at first: it takes half of a small screen's view.
         self._env_window.minimize()
         self._envs_open = False
 
-    # --- life ------------------------------------------------------------------------------------
+    # --- start and stop --------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Draw it, and go on with that in a thread of its own."""
+        """Draw it, then keep drawing it in a thread."""
         self._loop.start()
 
     def stop(self) -> None:
-        """Stop to redraw; returns when the loop has ended."""
+        """Stop redrawing; returns when the loop has ended."""
         self._loop.stop()
-        # The session may live on under another page, and nobody looks at what it would render.
+        # The session may live on under another page, and must not render for this one.
         self._session.set_clients(0)
 
     @property
@@ -166,7 +163,7 @@ class Page:
         return self._view_panel.dark
 
     def redraw(self) -> None:
-        """Draw the session as it is now."""
+        """Draw the present state of the session."""
         view = self._session.view()
         draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
 
@@ -200,7 +197,7 @@ class Page:
                 len(task.geometry.body_names),
             )
         ):
-            # Between two versions a step of the old one may stand beside the new task.
+            # Between two versions a step of the old one may come with the new task.
             return
         one = self._view_panel.only_selected and task.num_envs > 1
         env = min(view.selected_env, task.num_envs - 1)
@@ -225,7 +222,7 @@ class Page:
         placed = self._studio.draw_in_view(view, offset)
         self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
         self._forces.draw(self._inspect.forces(view), offset)
-        # A scene of another size is framed anew; a reload that keeps the size never moves the view.
+        # A scene of another size is framed again; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
             self._waits_for_human = alone
@@ -237,7 +234,7 @@ class Page:
         self._framing.frame_untouched(lambda aspect, height: self._viewpoint(view, aspect, height))
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
-        """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""
+        """Point every open page (or only untouched ones), and those to come, at the scene."""
         if self._layout is not None and view.task is not None:
             self._framing.frame(lambda aspect, height: self._viewpoint(view, aspect, height), untouched_only)
 

@@ -1,11 +1,4 @@
-"""The review: recordings in place of a live env, on the same page, with the same timeline and keys.
-
-It is put together as the live page is: one loop waits until the review has something new, takes a snapshot, and every
-part draws what is new to it. There is no worker and no task file; what is shown comes from the recordings.
-
-It lies where the live one lies and looks the same, but counts forwards: a recording has a beginning and an end, and
-nothing is added to it. With several recordings each has a line of its own on the strip, placed as they are aligned.
-"""
+"""The review page: recordings in place of a live env, with the same timeline and keys."""
 
 from __future__ import annotations
 
@@ -13,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import viser
 
 from workbench.core.camera_data import CameraKey, Picture
@@ -21,30 +15,12 @@ from workbench.session.live.view import Seen
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.events import success_words
 from workbench.session.review.pictures import PictureReader
-from workbench.session.review.review import MOST_OPEN
-from workbench.session.review.view import ReviewView
+from workbench.session.review.review import MOST_OPEN, Review
+from workbench.session.review.view import ReviewView, column_at
 from workbench.ui.app.go_live import StepInPart
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
 from workbench.ui.library.panel import LibraryPanel
-from workbench.ui.review.compare import ReviewComparePanel
-from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
-from workbench.ui.review.panel import ReviewPanel
-from workbench.ui.review.rescore import RescorePanel
-from workbench.ui.review.scene import ReviewIn3D
-from workbench.ui.scene.viewpoint import ViewPanel
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.hotkeys import Command, register
-from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
-from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
-from workbench.ui.widgets.templates import render
-
-if TYPE_CHECKING:
-    from workbench.ui.app.workplace import Workplace
-import numpy as np
-
-from workbench.session.review.review import Review
-from workbench.session.review.view import column_at
 from workbench.ui.live.timeline import (
     LAST_EVENT,
     LAST_STEP,
@@ -54,28 +30,41 @@ from workbench.ui.live.timeline import (
     TimeBar,
     strip_values,
 )
-from workbench.ui.review.scene import shown_together
+from workbench.ui.review.compare import ReviewComparePanel
+from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
+from workbench.ui.review.panel import ReviewPanel
+from workbench.ui.review.rescore import RescorePanel
+from workbench.ui.review.scene import ReviewIn3D, shown_together
+from workbench.ui.scene.viewpoint import ViewPanel
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
+from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
+from workbench.ui.widgets.templates import render
+
+if TYPE_CHECKING:
+    from workbench.ui.app.workplace import Workplace
 
 TOLD_EVERY = 0.1
-"""Seconds, while it plays. Faster, numbers cannot be read."""
+"""Seconds between two drawings of the panels while it plays. Faster, numbers cannot be read."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
 LEAST_VIEW = 240
-"""Pixels of the view between the library and another panel."""
+"""Least pixels of the view between the library and another panel."""
 NARROW = 700
-"""Pixels of the view beside the library, from which on there is room for both."""
+"""Pixels of the view next to the library; below this there is no room for both."""
 TOLD_WIDTH = 20.0
-"""Seconds within which a page says how wide its view has become."""
+"""Seconds within which a page reports the new width of its view."""
 BACK = "Back to the live env"
 
 
 class ReviewPage:
-    """The review's page.
+    """The review's page, built and redrawn like the live page, without a worker or a task file.
 
     Args:
-        place: Of the recordings, and of what can be done with them.
-        dark: How it begins.
-        clock: That the parts of the page go by.
+        place: The recordings, and what can be done with them.
+        dark: The first theme.
+        clock: Of all parts of the page.
     """
 
     def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
@@ -88,10 +77,10 @@ class ReviewPage:
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
         self._fold_other: Callable[[bool], None] = lambda folded: None
-        """Folds and unfolds the panel of rerun."""
+        """Folds and unfolds rerun's panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
-        """Which of the two panels came into a page last, and when, until something is done about it."""
+        """Which of the two panels was unfolded last, and when, until the width was checked."""
         self._told = DrawDue(TOLD_EVERY, clock)
         self._framing = place.stage.framing
 
@@ -118,7 +107,7 @@ class ReviewPage:
         self._place.pages.show("live")
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
-        """Returns the Review tab, which another part is put into, and what is in all of them."""
+        """Returns the Review tab, which gets more content later, and the parts of all tabs."""
         server, review, place = self._server, self._review, self._place
         library, step_in = place.shelf.library, place.step_in
         tabs = server.gui.add_tab_group()
@@ -177,14 +166,14 @@ class ReviewPage:
         if self._had_opened:
             self._show_library(False)
 
-    # --- life ------------------------------------------------------------------------------------
+    # --- start and stop --------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Draw it, and go on with that in a thread of its own."""
+        """Draw it, then keep drawing it in a thread."""
         self._loop.start()
 
     def stop(self) -> None:
-        """Stop to redraw; returns when the loop has ended."""
+        """Stop redrawing; returns when the loop has ended."""
         self._loop.stop()
         self._library.close()
 
@@ -200,13 +189,13 @@ class ReviewPage:
         self.redraw()
 
     def redraw(self) -> None:
-        """Draw the review as it is now."""
+        """Draw the present state of the review."""
         view = self._review.view()
         self._take_pictures(view)
         draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
 
     def _draw_panels(self, view: ReviewView) -> None:
-        """While it plays, less often than the 3-D view, and all of them at once: what they say is of one moment."""
+        """Draw the panels, all from one view; while it plays, less often than the 3-D view."""
         if not self._told.is_due(object(), urgent=None if view.playing else object()):
             return
         self._make_way_for_the_first(view)
@@ -215,7 +204,7 @@ class ReviewPage:
             "review_status",
             view=view,
             going=self._place.step_in.going(),
-            # Those that `library_keys.js` keeps from doing anything while the library is folded.
+            # `library_keys.js` disables these while the library is folded.
             library_keys=" ".join(self._library.keys),
             success_words=success_words,
         )
@@ -229,7 +218,7 @@ class ReviewPage:
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.triangles, cameras, pictures)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
-        """The library takes half of a small screen: once a recording is open it is a strip at the edge there."""
+        """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
         ids = tuple(one.id for one in view.opened)
         if ids != self._had_opened:
             self._had_opened = ids
@@ -243,7 +232,7 @@ class ReviewPage:
         return width
 
     def _smallest_view(self) -> int:
-        """Pixels that the view is wide, on the page on which it is smallest; 0 where nobody looks."""
+        """Width in pixels of the smallest view of all pages; 0 without viewers."""
         widths = [client.camera.image_width for client in self._server.get_clients().values()]
         return min((width for width in widths if width), default=0)
 
@@ -270,9 +259,9 @@ class ReviewPage:
         self._unfolded = "other", self._clock()
 
     def _fold_what_crowds(self) -> None:
-        """Of two panels that leave no view, the one that was unfolded last is the one that is wanted.
+        """Fold the panel that was unfolded first, where library and rerun leave no room for the view.
 
-        A page says how wide its view has become some time later, and where rerun is loading that takes seconds.
+        A page reports its new width some time later; while rerun loads, that takes seconds.
         """
         last, since = self._unfolded
         if not last or not 0 < self._smallest_view() < LEAST_VIEW:
@@ -353,7 +342,7 @@ class ReviewPage:
         self._review.open(ids)
 
 
-# --- The timeline of a review: the live page's slider, strip and keys, over recordings that are whole ---
+# --- The timeline of a review -------------------------------------------------------------------------
 
 
 PLAY, PAUSE = "play", "pause"
@@ -361,6 +350,11 @@ FIRST, LAST = "first", "last"
 
 
 class ReviewTimeline(TimeBar[ReviewView]):
+    """The live page's slider, strip and keys, but counting forwards: a recording has a beginning and an end.
+
+    Each of several recordings has its own line on the strip, placed as they are aligned.
+    """
+
     def __init__(self, server: viser.ViserServer, review: Review, clock: Clock = time.monotonic) -> None:
         does = {
             PLAY: review.toggle_play,
@@ -381,7 +375,7 @@ class ReviewTimeline(TimeBar[ReviewView]):
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
         if wanted == self._drawn:
             return
-        # Only the cursor and the words follow the position.
+        # Only the cursor and the texts follow the position.
         if wanted[1:] != self._drawn[1:]:
             self._fixed = fixed_values(view)
         self._drawn = wanted
@@ -395,7 +389,7 @@ def walk(playing: bool) -> tuple[str, ...]:
 
 
 def fixed_values(view: ReviewView) -> dict[str, object]:
-    """What of the strip stays while the position moves."""
+    """The values of the strip that do not depend on the position."""
     rows = [
         (index, [h for h in view.opened[index].happenings if h.style != "reset"][:MOST_MARKS])
         for index in shown_together(view)

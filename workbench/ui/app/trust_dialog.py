@@ -1,8 +1,4 @@
-"""The window that asks whether code that a recording names may run.
-
-One window at a time, on every open page; whoever answers first has answered. Only a press of one of its buttons is a yes:
-Escape, a page that is closed, and the end of what wanted to run it are a no.
-"""
+"""The dialog that asks whether code named by a recording may run."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ from typing import Literal
 import viser
 
 from workbench.session.clearance import FOLLOWED, Consent, TrustQuestion
-from workbench.ui.library.dialogs import Question as Window
+from workbench.ui.library.dialogs import Dialog
 from workbench.ui.widgets.templates import render
 
 TITLE = "Run this code?"
@@ -24,9 +20,9 @@ DO_NOT, ONCE, ALWAYS = (
     "Run it, and trust this text from now on",
 )
 MOST_OF_ONE, MOST_OF_ALL = 200_000, 1_000_000
-"""Characters of one text, and of all of them together, that go to the page; of the rest it is said that it is missing."""
+"""Characters of one text, and of all texts, that go to the page; it says how much is left out."""
 _LOOK = 0.1
-"""Seconds between two looks at whether the answer is still wanted."""
+"""Seconds between two checks whether the answer is still wanted."""
 
 
 @dataclass
@@ -43,29 +39,32 @@ class _Pending:
 
 
 class TrustDialog:
-    """See the module's text."""
+    """Asks one question at a time, on every open page; the first answer counts.
+
+    Only a press of one of its buttons is a yes: Escape, a page that closes, and a request that is withdrawn are a no.
+    """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._lock = threading.RLock()
         self._waiting: list[_Pending] = []
         """The first is shown."""
-        self._window: Window | None = None
+        self._window: Dialog | None = None
         self._escape: viser.CommandHandle | None = None
         self._closed = False
         self._asking: Callable[[bool], None] = lambda asking: None
 
     def tell(self, asking: Callable[[bool], None]) -> None:
-        """Tell this from now on whether something is asked: a page's table of recordings takes no keys then."""
+        """Call `asking` whenever a question opens or the last one closes: the library's keys are off meanwhile."""
         with self._lock:
             self._asking = asking
             self._asking(bool(self._waiting))
 
     def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
-        """Show the question, and wait for the answer. Not to be called on viser's own threads.
+        """Show the question and wait for the answer. Never call it on viser's own threads.
 
         Args:
-            stopped: asked often; True withdraws the question.
+            stopped: called often; True withdraws the question.
         """
         pending = _Pending(question)
         with self._lock:
@@ -84,11 +83,11 @@ class TrustDialog:
                 self._asking(bool(self._waiting))
 
     def close(self) -> None:
-        """Take every question back."""
+        """Withdraw every question."""
         self._closed = True
 
     def _keep_shown(self) -> None:
-        """The window of the first question; a page that went has taken it along."""
+        """Open the dialog of the first question, again if a page switch has removed it."""
         with self._lock:
             if self._window is not None and not self._window.modal.closed:
                 return
@@ -96,16 +95,16 @@ class TrustDialog:
             question = pending.question
             gui = self._server.gui
             with self._server.atomic():
-                self._window = Window(self._server, TITLE, lambda: None)
+                self._window = Dialog(self._server, TITLE, lambda: None)
                 with self._window.modal:
-                    # The first has the focus: Enter must not run anything.
+                    # The first button has the focus: Enter must not run anything.
                     self._add_button(DO_NOT, None, viser.Icon.X, pending, Consent.NO)
                     if question.more:
                         label = f"Nor the {question.more} more that are asked about"
                         self._add_button(label, "gray", viser.Icon.X, pending, Consent.NONE)
                     self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Consent.ONCE)
                     self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Consent.ALWAYS)
-                    # After them, so that no name in it has the focus; page.css puts it above them.
+                    # After the buttons, so that nothing in it has the focus; page.css puts it above them.
                     gui.add_html(question_html(question))
                 self._escape = gui.add_command(DO_NOT, hotkey="escape")
                 self._escape.on_trigger(lambda _: pending.take(Consent.NO))
@@ -125,13 +124,13 @@ class TrustDialog:
     def _take_down(self) -> None:
         window, escape = self._window, self._escape
         self._window = self._escape = None
-        # False where the page went, and with it the window and the key.
+        # False if a page switch has removed dialog and key.
         if window is not None and window.close() and escape is not None:
             escape.remove()
 
 
 def question_html(question: TrustQuestion) -> str:
-    """What would run; every value escaped."""
+    """The code that would run, as HTML."""
     files: list[dict[str, object]] = []
     left = MOST_OF_ALL
     for file in question.files:

@@ -1,28 +1,18 @@
-"""The two pages of the program and what they need, put together: ``workbench open`` and ``workbench review`` share it.
-
-A folder of recordings is looked through only when somebody wants to see it: the library and the review begin with
-the first review page, and live until the program ends, so that what is open there is still open after a while at the
-live env.
-
-viser has one page a server, and two sets of panels in it would mean hiding half of everything. So a page is taken
-away whole, handles, commands and all, and the other is built in its place; every browser that is open follows. What
-a page shows lives elsewhere: the session plays and records on while its page is away, and the review keeps what is
-open in it. The bodies in the 3-D view stay (`stage`), and nothing of it is sent before the new page has been drawn
-once: controls that say nothing yet, or something else than is so, are never seen.
-
-Swaps are asked for by buttons and keys of the very pages that they take away. So they are done by a thread of their
-own, one after the other.
-"""
+"""Owns the two pages and what they share: recordings, dialogs, rescoring, downloads and the live session."""
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+import viser
 
 from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.watched_thread import watched_thread
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import mend, recovered_in_words
 from workbench.session.clearance import Clearances
@@ -41,38 +31,32 @@ from workbench.ui.widgets.hotkeys import Command
 
 if TYPE_CHECKING:
     from workbench.ui.app.live_page import Page
-import logging
-from typing import TYPE_CHECKING, Literal
 
-import viser
+log = logging.getLogger(__name__)
 
-from workbench.machine.processes.watched_thread import watched_thread
-
-if TYPE_CHECKING:
-    from workbench.ui.app.live_page import Page
-    from workbench.ui.app.review_page import ReviewPage
+Which = Literal["live", "review"]
 
 
 @dataclass(frozen=True)
 class Shelf:
-    """The recordings of a folder, and those that are open."""
+    """The recordings of a folder, and the review of those that are open."""
 
     library: Library
     review: Review
 
 
 class Workplace:
-    """Both pages behind one door, and what outlives them.
+    """Both pages on one server, and what outlives them. Used by ``workbench open`` and ``workbench review``.
 
     Args:
-        door: Of the pages.
+        door: The server of the pages.
         recordings: The folder that is recorded to and reviewed.
         make_session: Opens a task that a recording names; gets what `Session` gets.
-        base: What is the same for all tasks that recordings name.
+        base: Options that all tasks named by recordings share.
         session: The live env, if there is one.
-        tasks: Task files in which envs of foreign recordings may be found.
-        trust: Run what recordings name without asking.
-        on_notice: Called, on any thread, with a sentence that is to be seen in the terminal too.
+        tasks: Task files that may define the envs of foreign recordings.
+        trust: Run code named by recordings without asking.
+        on_notice: Called, on any thread, with a message for the terminal.
     """
 
     def __init__(
@@ -92,9 +76,9 @@ class Workplace:
         self._lock = threading.Lock()
         self._mending: threading.Thread | None = None
         self.commands: tuple[Command, ...] = ()
-        """In the palette of both pages; set before the first is shown."""
+        """In the palette of both pages; set before the first page is shown."""
         self.session = session
-        """That the live page shows when it is next built."""
+        """Shown by the live page when it is next built."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
         self.step_in = StepIn(self, make_session, clearances, base)
@@ -105,7 +89,7 @@ class Workplace:
 
     @property
     def shelf(self) -> Shelf:
-        """Looks into the folder when it is first asked for."""
+        """The folder is read at the first access, by the first review page; it stays open until the program ends."""
         with self._lock:
             if self._shelf is None:
                 library = Library(self._recordings)
@@ -113,7 +97,7 @@ class Workplace:
                 scenes = SceneProcess(self._tasks, self._imports)
                 self._shelf = Shelf(library, Review(library, make_scene=scenes))
                 if self.session is None:
-                    # A live env's recorder has done it, and is writing.
+                    # With a live env its recorder has recovered them already, and is writing.
                     self._mending = threading.Thread(
                         target=self._mend, args=(self._shelf,), name="mend", daemon=True
                     )
@@ -121,7 +105,7 @@ class Workplace:
             return self._shelf
 
     def _mend(self, shelf: Shelf) -> None:
-        """Make episodes of what a writer left that was killed."""
+        """Recover episodes of a writer that was killed."""
         try:
             mended = [str(file) for file in mend(self._recordings)]
         except OSError as error:
@@ -135,13 +119,13 @@ class Workplace:
             shelf.library.look_soon()
 
     def task_files(self) -> tuple[Path, ...]:
-        """The task files that this program was started with, or has open."""
+        """The task files that this program was started with or has open."""
         task = None if self.session is None else self.session.view().task
         live = () if task is None or task.file is None else (Path(task.file),)
         return tuple(file.absolute() for file in (*live, *self._tasks))
 
     def close(self) -> None:
-        """Stop the pages and what they read from; the first session and the door are their owner's to close."""
+        """Stop the pages and their readers. The caller closes the first session and the server."""
         self.pages.stop()
         with self._lock:
             if self._shelf is not None:
@@ -156,7 +140,7 @@ class Workplace:
         if which == "review":
             self.shelf.library.look_soon()
             return ReviewPage(self, dark)
-        # What a live env needs is not needed for looking at recordings.
+        # Imported late: a review alone does not need it.
         from workbench.ui.app.live_page import Page
 
         assert self.session is not None, "the live page is shown with its session"
@@ -165,20 +149,21 @@ class Workplace:
         )
 
 
-# --- Which page is on the server: the live env, or the review of recordings -------------------
-
-
-log = logging.getLogger(__name__)
-
-Which = Literal["live", "review"]
+# --- Which page is on the server: live or review ------------------------------------------------
 
 
 class Pages:
-    """
+    """Replaces one page by the other on the same server.
+
+    viser has one page a server, so a page is removed whole and the other is built in its place; every open browser
+    follows. The session and the review live on meanwhile, the bodies in the 3-D view stay (`Stage`), and nothing is
+    sent before the new page was drawn once, so that no empty control is ever seen. Buttons of the very page that is
+    removed ask for the switch, so a thread of its own does it.
+
     Args:
-        server: Of viser, already behind its door.
+        server: Of viser.
         stage: The 3-D view that the pages share.
-        make: Builds a page on the (empty) server, given which and whether it is to be dark.
+        make: Builds a page on the empty server, given which one and whether it is dark.
     """
 
     def __init__(
@@ -193,23 +178,23 @@ class Pages:
         self._thread = watched_thread("pages", self._serve)
 
     def start(self, which: Which) -> None:
-        """Show the first page; returns when it is there."""
+        """Show the first page; returns when it is shown."""
         self._show(which)
         self._thread.start()
 
     def show(self, which: Which) -> None:
-        """Ask for a page. Returns at once, so that a button of the page that goes may ask."""
+        """Request a page. Returns at once, so that a button of the present page may call it."""
         with self._wake:
             self._wish = which
             self._wake.notify_all()
 
     def wait_for(self, which: Which, timeout: float) -> bool:
-        """Sleep until that page is there."""
+        """Sleep until that page is shown; False after `timeout` seconds."""
         with self._wake:
             return self._wake.wait_for(lambda: self._shown == which, timeout)
 
     def stop(self) -> None:
-        """Stop the page that is there; it stays as it is until the server closes."""
+        """Stop redrawing the present page; it stays as it is until the server closes."""
         with self._wake:
             self._ending = True
             self._wake.notify_all()
@@ -230,7 +215,7 @@ class Pages:
             try:
                 self._show(wish)
             except Exception:
-                # Nothing would be left that one could press.
+                # The thread must survive, or no button could show a page again.
                 log.exception("The page could not be built.")
 
     def _show(self, which: Which) -> None:
@@ -239,7 +224,7 @@ class Pages:
             self._page.stop()
         with self._server.atomic():
             if self._page is not None:
-                # Nothing of the page that went is left: handles, commands, callbacks, nodes.
+                # Remove all of the old page: handles, commands, callbacks, nodes.
                 self._stage.clear()
                 self._server.gui.reset()
             self._page = self._make(which, dark)

@@ -1,8 +1,4 @@
-"""Tags, notes and deleting in the library: what is asked before, and what is said when it cannot be done.
-
-What is asked is asked in a window over the page, since a form in the scrolled table would be out of sight. It is there
-for all open pages, and keeps what it was asked for, not what is selected by the time of the answer.
-"""
+"""Dialogs of the library for tags, notes and deletion."""
 
 from __future__ import annotations
 
@@ -20,8 +16,8 @@ from workbench.ui.widgets.templates import counted, render, size
 MOST_NAMES = 6
 
 
-class Question:
-    """One window with a question, open until it is answered or `close`."""
+class Dialog:
+    """One modal window with a question, open on all pages until it is answered or closed."""
 
     def __init__(self, server: viser.ViserServer, title: str, closed: Callable[[], None]) -> None:
         self.modal = server.gui.add_modal(title)
@@ -29,7 +25,7 @@ class Question:
         self._lock = threading.Lock()
 
     def close(self) -> bool:
-        """Close it; False if it was closed already: of two answers only one counts."""
+        """Close it; False if it was closed already: only the first answer counts."""
         with self._lock:
             if self.modal.closed:
                 return False
@@ -39,23 +35,26 @@ class Question:
 
 
 MOST_KNOWN = 12
-"""Tags in use that are named."""
+"""Tags in use that are listed."""
 
 
 class LibraryEdits:
-    """One question at a time.
+    """Asks for tags, a note or a deletion and does it; one dialog at a time.
+
+    A dialog over the page, since a form in the scrolled table would be out of sight. It acts on the recordings that it
+    was opened for, not on those selected by the time of the answer.
 
     Args:
-        asking: is told when a window with a question comes and when it goes.
+        asking: called with True when a dialog opens and False when it closes.
     """
 
     def __init__(self, server: viser.ViserServer, library: Library, asking: Callable[[bool], None]) -> None:
         self._server, self._library, self._asking = server, library, asking
         self._lock = threading.RLock()
-        self._question: Question | None = None
+        self._question: Dialog | None = None
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the dialog, if there is one."""
         with self._lock:
             if self._question is not None:
                 self._question.close()
@@ -128,19 +127,19 @@ class LibraryEdits:
         answered: Callable[[str], object],
         value: str | None = None,
     ) -> None:
-        """
+        """Open a dialog.
+
         Args:
-            do: the button that is a yes.
-            answered: gets what was typed, as the page sent it, on a thread of viser's.
-            value: what stands in a field for a line of text, in which Enter is a yes too. None asks for none: what is
-                done then takes something away.
+            do: label of the button that accepts.
+            answered: gets the typed text, as the page sent it, on a thread of viser's.
+            value: text of the input line, in which Enter accepts too. None: no input, and the accept button is red.
         """
         gui, names = self._server.gui, [row.name for row in rows]
         shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
         with self._lock:
             self.close()
             self._asking(True)
-            self._question = question = Question(self._server, title, lambda: self._asking(False))
+            self._question = question = Dialog(self._server, title, lambda: self._asking(False))
         with question.modal:
             more = len(names) - len(shown)
             gui.add_html(render("library_question", question=asked, names=shown, more=more, answer=explained))
@@ -171,7 +170,7 @@ class LibraryEdits:
         return [row for row in rows if row is not None]
 
     def _do(self, work: Callable[[], object]) -> bool:
-        """Whether it could be done; if not, it is said why."""
+        """Whether it succeeded; a LibraryError is shown on every page."""
         try:
             work()
         except LibraryError as error:

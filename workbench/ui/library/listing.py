@@ -1,9 +1,4 @@
-"""Which recordings the library lists, in which order, on which page, which are selected, and what is done with those.
-
-Selection works as in every list of files: a press selects a row alone, control adds it or takes it away, shift takes
-all from the last one on. What is not listed is not selected, or a filter would hide what a deletion then takes. What is
-done is a button and a command with a key, of one description. Methods are called from any thread.
-"""
+"""Filter, order, pages and selection of the library's list, and the actions on selected recordings."""
 
 from __future__ import annotations
 
@@ -20,14 +15,18 @@ from workbench.ui.widgets.click_targets import Paged
 from workbench.ui.widgets.hotkeys import Command
 
 MOST_ROWS = 50
-"""On one page of the table."""
+"""Rows of one page of the table."""
 LONGEST_WORDS = 200
 TOGGLE, RANGE = 1, 2
-"""What was held with a press on a row; both together take a range along with what is selected."""
+"""Modifiers of a press on a row; both together add a range to the selection."""
 
 
 class LibraryList:
-    """Of one `Library`."""
+    """The list of one `Library`. Thread-safe.
+
+    Selection works as in a file manager: a press selects one row, control toggles it, shift selects all from the last
+    one on. Rows that are not listed are not selected, or a deletion would take what a filter hides.
+    """
 
     def __init__(self, library: Library) -> None:
         self._library = library
@@ -40,18 +39,18 @@ class LibraryList:
         self.pages = Paged(MOST_ROWS)
         self.selected: frozenset[str] = frozenset()
         self.cursor: str | None = None
-        """The row that was taken last, by mouse or keys."""
+        """The row that was pressed or moved to last."""
         self.follow = False
-        """Whether a browser shall scroll to the cursor: after keys, which may go where it does not look."""
+        """Whether a browser shall scroll to the cursor: after keys, which may leave the visible rows."""
         self._anchor: str | None = None
         self._place = 0
-        """Of the cursor when it was set: where to go on from when its row is deleted."""
+        """Row number of the cursor when it was set: where to continue when its row is deleted."""
         self._arranged: tuple[object, list[LibraryRow]] = (None, [])
 
-    # --- what there is -------------------------------------------------------------------------------
+    # --- rows ----------------------------------------------------------------------------------------
 
     def rows(self, view: LibraryView | None = None) -> list[LibraryRow]:
-        """What is listed, in its order."""
+        """The listed rows, in order."""
         with self.lock:
             view = self._library.view() if view is None else view
             key = (view.serial, self.words, self.outcome, self.task, self.column, self.descending)
@@ -61,7 +60,7 @@ class LibraryList:
             return self._arranged[1]
 
     def page(self, view: LibraryView) -> list[LibraryRow]:
-        """The rows of the page. What is not listed any more is let go of."""
+        """The rows of the present page. Drops selected rows that are no longer listed."""
         with self.lock:
             rows = self.rows(view)
             listed = {row.id for row in rows}
@@ -72,7 +71,7 @@ class LibraryList:
             return rows[places.start : places.stop]
 
     def state(self) -> object:
-        """Differs when anything here is another."""
+        """Changes whenever anything here changes."""
         with self.lock:
             self.rows()
             return self._arranged[0], self.pages.first, self.selected, self.cursor
@@ -85,7 +84,7 @@ class LibraryList:
     # --- selecting -----------------------------------------------------------------------------------
 
     def select(self, ids: Iterable[str]) -> None:
-        """Select these, of those that are listed."""
+        """Select those of these that are listed."""
         with self.lock:
             self.selected = frozenset(ids) & {row.id for row in self.rows()}
 
@@ -93,7 +92,7 @@ class LibraryList:
         self.select(row.id for row in self.rows())
 
     def press(self, id: str, held: int = 0) -> bool:
-        """Select as a press on this row does; False if it is not listed.
+        """Press this row; False if it is not listed.
 
         Args:
             held: `TOGGLE`, `RANGE`, both or neither.
@@ -107,7 +106,7 @@ class LibraryList:
             return True
 
     def move(self, by: int, held: int = 0) -> None:
-        """As an arrow key does: from the cursor, or from where it was."""
+        """Move the cursor as an arrow key does, from its row or from where it last was."""
         with self.lock:
             order = [row.id for row in self.rows()]
             if not order:
@@ -140,7 +139,7 @@ class LibraryList:
     # --- arranging -----------------------------------------------------------------------------------
 
     def sort_by(self, column: Column) -> None:
-        """By another column, or the same one the other way round."""
+        """Sort by a column; if it is the present one, reverse the order."""
         with self.lock:
             self.descending = not self.descending if column == self.column else begins_descending(column)
             self.column = column
@@ -152,7 +151,7 @@ class LibraryList:
             self.pages.go_to(0)
 
     def look_for(self, words: str, task: str | None) -> None:
-        """List what has these words, and is of this task, if there still is one of it."""
+        """List the rows with these words and of this task, if it still has recordings."""
         with self.lock:
             known = {row.task for row in self._library.rows()}
             words = words[:LONGEST_WORDS]
@@ -164,21 +163,21 @@ class LibraryList:
 
 @dataclass(frozen=True)
 class Action:
-    """Something to be done with the selected recordings."""
+    """Something to do with the selected recordings: a button, and a command with a key."""
 
     label: str
     hint: str
     run: Callable[[tuple[str, ...]], None]
     most: int | None = None
-    """Recordings that it can take at once."""
+    """Most recordings at once."""
     named: str = ""
-    """Its name among the commands; empty leaves it to the buttons."""
+    """Label of its command; empty: a button only."""
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
 
 
 def walking(listed: LibraryList) -> list[Command]:
-    """To go through the table and select in it."""
+    """Commands that move through the table and select in it."""
 
     def move(by: int, held: int = 0) -> Callable[[], None]:
         return lambda: listed.move(by, held)

@@ -1,13 +1,4 @@
-"""The library of recordings as a table: sort and filter it, select, open, tag, note, delete.
-
-What the rows say is in `library_rows`. Thousands of rows are shown a page at a time. Which are selected changes with
-every press, and a page of rows with their pictures is 150 KB; so the selection is not part of the table but a style
-sheet of its own that marks rows by their numbers, and only it is sent.
-
-A row has a number for as long as the page lives, and what a browser sends is such a number: if the table has moved
-meanwhile because a recording came in, the row that was pressed is still the one that is selected. Like everything on
-the page, selection, sorting and filter are the same for all who look at it.
-"""
+"""The library of recordings as a table: sort, filter, select, open, tag, note, delete."""
 
 from __future__ import annotations
 
@@ -47,14 +38,18 @@ from workbench.ui.widgets.templates import render
 MOST_OPEN = 4
 """Recordings that a review shows at once."""
 TYPING = 0.2
-"""Seconds without a keystroke after which the words that are looked for are taken."""
+"""Seconds without a keystroke after which the search runs."""
 ALL_TASKS = "all tasks"
 OPEN = 4
-"""In what ``choosable.html`` says of a press, beside `TOGGLE` and `RANGE`: it was the second of two."""
+"""Bit of ``choosable.html`` for the second press of a double click, next to `TOGGLE` and `RANGE`."""
 
 
 class LibraryPanel(PagePart[object]):
-    """The table in the present container.
+    """The table in the present container, the same for all open pages.
+
+    A page of rows with pictures is 150 KB, and the selection changes with every press: so the selection is a style
+    sheet of its own that marks rows by their numbers, and only that is sent. A row keeps its number for as long as the
+    page lives: a press selects the pressed row even if the table has moved meanwhile.
 
     Args:
         on_open: gets the ids of one to `MOST_OPEN` recordings, in the order of the table.
@@ -125,49 +120,49 @@ class LibraryPanel(PagePart[object]):
         self._numbers = self._presses.number_id("rows", self._on_row)
 
         self._number_of: dict[str, int] = {}
-        """Of a recording's row, from 1 on, in the order in which they came."""
+        """Number of each recording's row, from 1 on, in the order in which they came."""
         self._drawn: object = None
         self._filters_drawn: object = None
-        """What they were counted for: of thousands of rows that takes long."""
+        """What the filters were counted for: with thousands of rows counting takes long."""
         self._table_drawn: object = None
 
         self._keys: list[viser.CommandHandle] = []
         self._escapes: list[viser.CommandHandle] = []
         self.keys: tuple[str, ...] = ()
-        """Of `commands`, those that are of use only where the table is seen, as `Command.combination` has them."""
+        """Combinations of the commands that need the table to be visible."""
         self._asking = False
         self._tasks.on_update(lambda _: self._on_task())
 
-    # --- for whoever hosts it --------------------------------------------------------------------------
+    # --- for the page that has it ----------------------------------------------------------------------
 
     def selected(self) -> tuple[str, ...]:
         """Ids of the selected recordings, in the order of the table."""
         return self._list.selected_ids()
 
     def select(self, ids: Iterable[str]) -> None:
-        """Select these recordings, of those that are listed."""
+        """Select those of these recordings that are listed."""
         self._list.select(ids)
 
     def add_action(self, action: Action) -> None:
-        """One more button for the selected recordings; it is run on any thread and must not block."""
+        """Add a button for the selected recordings; it runs on any thread and must not block."""
         with self._lock:
             self._actions.append(action)
 
     def leave_keys(self, asking: bool) -> None:
-        """Take no keys while something is asked, here or by another part of the page."""
-        # viser's keys come before a focused button's: Enter on Cancel would open a recording.
+        """Disable the keys while a dialog is open, of the library or of another part."""
+        # viser's keys act before a focused button: Enter on Cancel would open a recording.
         self._asking = asking
         for key in self._keys:
             key.disabled = asking
         self._can_escape()
 
     def close(self) -> None:
-        """Close the window with a question, if there is one. For when the page goes, and its keys with it."""
+        """Close the dialog, if there is one. Called when the page goes, and its keys with it."""
         self._edits.close()
         self._keys, self._escapes = [], []
 
     def commands(self) -> list[Command]:
-        """Keys of the table, for the page to register after the last action was added."""
+        """Commands of the table; register them after the last `add_action`."""
         commands = [
             *walking(self._list),
             *(
@@ -189,7 +184,7 @@ class LibraryPanel(PagePart[object]):
             self._clear_filter()
 
     def _can_escape(self) -> None:
-        """Of no use but while something is asked, or looked for."""
+        """Enable Escape while a dialog is open or a filter is set."""
         listed = self._list
         of_use = self._asking or bool(listed.words or listed.task) or listed.outcome != "all"
         for handle in self._escapes:
@@ -198,7 +193,7 @@ class LibraryPanel(PagePart[object]):
     # --- drawing ---------------------------------------------------------------------------------------
 
     def draw(self, view: object = None) -> None:
-        """Draw what has changed; `view` is of the page that hosts it, and not looked at."""
+        """Draw what has changed; the page's own `view` is not used."""
         view = self._library.view()
         with self._lock, self._list.lock:
             self._find.show(self._list.words)
@@ -344,7 +339,7 @@ class LibraryPanel(PagePart[object]):
     def _number(self, id: str) -> int:
         return self._number_of.setdefault(id, len(self._number_of) + 1)
 
-    # --- what is pressed, typed and chosen ---------------------------------------------------------------
+    # --- presses and inputs ------------------------------------------------------------------------------
 
     def _press(self, key: object, do: Callable[[], None]) -> str:
         return self._presses.id_of(("library", key), lambda _client: do())
@@ -364,7 +359,7 @@ class LibraryPanel(PagePart[object]):
         self._list.choose("all")
         self._list.look_for("", None)
 
-    # --- what is done with the selected ones ---------------------------------------------------------------
+    # --- actions on the selected recordings ----------------------------------------------------------------
 
     def _run(self, action: Action) -> None:
         ids = self.selected()

@@ -1,8 +1,4 @@
-"""What the rows of the library say, which of them are shown, and in which order.
-
-Pure functions of rows, so that what a person reads can be checked without a browser. Rows without a value in a column
-come last whichever way it is sorted, and ties keep the newest first, which is the order that the table begins with.
-"""
+"""Texts, filters and order of the library's rows, as pure functions."""
 
 from __future__ import annotations
 
@@ -63,8 +59,8 @@ def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
 
 
 def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
-    """Whether each of these lower-case words is somewhere in its task, tags, note, name, source hash or what chose its
-    actions; ``seed:3`` means that seed."""
+    """Whether each of these lower-case words is in its task, tags, note, name, source hash or action source;
+    ``seed:3`` means that seed."""
     said = "\n".join(
         (row.task, *row.tags, row.note, row.name, row.source_hash, row.acted_by, row.problem or "")
     ).lower()
@@ -77,10 +73,10 @@ def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
 def chosen(
     rows: Iterable[LibraryRow], words: str = "", outcome: Outcome = "all", task: str | None = None
 ) -> list[LibraryRow]:
-    """The rows that a filter lets through.
+    """The rows that pass a filter.
 
     Args:
-        words: parted by spaces; each must be found.
+        words: separated by spaces; each must be found.
         task: None for all.
     """
     wanted = words.lower().split()
@@ -92,7 +88,7 @@ def chosen(
 
 
 def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
-    """What is said where a filter lets nothing through."""
+    """The message of a filter that nothing passes."""
     wanted = f" of {task}" if task is not None else ""
     kind = {"all": "recording", "success": "successful recording", "failed": "failed recording"}.get(
         outcome, f"{outcome} recording"
@@ -107,6 +103,7 @@ def begins_descending(column: Column) -> bool:
 
 
 def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> list[LibraryRow]:
+    """Sort rows; those without a value come last in both directions, ties are newest first."""
     newest_first = sorted(rows, key=lambda row: (-(row.written or 0.0), row.name))
     known = [row for row in newest_first if _key(row, column) is not None]
     unknown = [row for row in newest_first if _key(row, column) is None]
@@ -115,7 +112,7 @@ def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> lis
 
 
 def _key(row: LibraryRow, column: Column) -> float | str | None:
-    """What a row is sorted by; None for no value."""
+    """The value that a row is sorted by; None for no value."""
     if column == "date":
         return row.written
     if column == "seed":
@@ -133,11 +130,11 @@ def _key(row: LibraryRow, column: Column) -> float | str | None:
 
 
 def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> dict[str, Any]:
-    """What is said of a row besides what stands in it.
+    """The texts of a row's cells.
 
     Args:
         newest: of `newest_sources`.
-        now: with the zone that dates are shown in.
+        now: in the time zone of the shown dates.
     """
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
     env = "" if row.env_index is None else f"env {row.env_index}"

@@ -1,15 +1,4 @@
-"""The bodies of the envs in the page: built once a scene, moved once a frame.
-
-One viser node a body is unusable in a browser from a hundred bodies on (measured: 1 frame a second
-at 3,840), one batched node a shape is not (30 a second). So the scene is a handful of batched nodes,
-and a frame is two arrays a node: world positions and quaternions, each env's own pose plus its place
-in the grid. World poses and not parent frames, because viser's batches bypass its scene graph and a
-parent that moves in the same frame makes them shake.
-
-Showing one env alone really sends one env: the arrays of a batch may change their length, the
-browser then keeps that many instances. Bodies that an env lacks (NaN) are left out the same way.
-What a browser can draw is limited by triangles, so the fewer envs are shown the finer they are.
-"""
+"""Draws the bodies of the envs in the 3-D view: built once a scene, moved once a frame."""
 
 from __future__ import annotations
 
@@ -25,11 +14,20 @@ from workbench.ui.scene.env_grid import EnvLayout, InView, place_of_plane, plane
 from workbench.ui.scene.glb import WornTogether, as_glb, face_limit, group_by_wearers
 
 NAMES = ("/envs", "/floor")
-"""Below which all of it is in viser's tree."""
+"""Roots of its nodes in viser's tree."""
 
 
 class SceneView:
-    """The batched nodes of one scene under ``/envs``."""
+    """The batched nodes of one scene under ``/envs``.
+
+    One viser node a body is too slow in a browser from a hundred bodies on (measured: 1 frame a second at 3,840), one
+    batched node a shape is not (30 a second). A frame is two arrays a node: world positions and quaternions, each env's
+    own pose plus its grid offset. World poses, not parent frames: viser's batches bypass its scene graph, and a parent
+    that moves in the same frame makes them shake.
+
+    Showing one env sends one env: a batch's arrays may change their length. Bodies that an env lacks (NaN) are left out
+    the same way. Triangles limit a browser, so fewer envs are drawn with finer shapes.
+    """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -48,14 +46,14 @@ class SceneView:
         only_env: int | None = None,
         triangles: int = 200_000,
     ) -> None:
-        """Replace whatever was shown by this scene; what looks as before stays and is not sent again.
+        """Show this scene instead of the last; groups that look the same stay and are not sent again.
 
         Args:
-            geometry: What it looks like.
-            layout: Where each env stands.
+            geometry: Of the scene.
+            layout: The grid of the envs.
             poses: (N, B, 7) in env frames.
             only_env: Show this env alone; None shows all.
-            triangles: About how many may be drawn; richer shapes are simplified to fit.
+            triangles: Approximate limit; rich shapes are simplified to fit.
         """
         shown_envs = geometry.num_envs if only_env is None else 1
         limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, triangles)
@@ -85,11 +83,11 @@ class SceneView:
         self.move(poses, layout, only_env)
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
-        """Put every body where it is now.
+        """Move every body to its pose.
 
         Args:
             poses: (N, B, 7) in env frames.
-            layout: Where each env stands.
+            layout: The grid of the envs.
             only_env: Show this env alone, at the origin; None shows all, on the grid.
         """
         for group in self._drawn.values():
@@ -115,7 +113,7 @@ class _DrawnGroup:
             glb,
             batched_wxyzs=np.array([[1, 0, 0, 0]], np.float32),
             batched_positions=np.array([[0, 0, -1000]], np.float32),
-            # viser's levels of detail leave holes in open meshes and pop while one looks.
+            # viser's levels of detail leave holes in open meshes and switch visibly.
             lod="off",
             cast_shadow=False,
             receive_shadow=False,
@@ -123,7 +121,7 @@ class _DrawnGroup:
         self.wear(group, None)
 
     def wear(self, group: WornTogether, once: NDArray[np.float32] | None) -> None:
-        """From now on these (env, body) pairs wear it; a floor or wall is drawn `once`, moved by that."""
+        """Set the (env, body) pairs that it is drawn for; a floor or wall is drawn once, moved by `once` (3,)."""
         self._group, self._once = group, once
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
@@ -144,6 +142,6 @@ class _DrawnGroup:
             worn, positions = worn[there], positions[there]
         self.handle.visible = bool(len(positions))
         if len(positions):
-            # Equal arrays are not sent again (viser compares), so what rests costs no bytes.
+            # Equal arrays are not sent again (viser compares), so bodies at rest cost no bytes.
             self.handle.batched_positions = np.ascontiguousarray(positions)
             self.handle.batched_wxyzs = np.ascontiguousarray(worn[:, 3:])

@@ -1,15 +1,4 @@
-"""Where env i of the batch stands in the page's 3-D view.
-
-Every env has its own world frame and all of them sit on top of each other at its origin; a person
-wants to see them side by side. So each env is given an offset on a grid whose spacing comes from
-what stands in one env (its table and robot, not its endless floor or backdrop), and a pose in the page is the
-env's own pose plus that offset. Floors are wide enough for the whole grid and are drawn once:
-sixteen overlapping floors would flicker where they meet and cost sixteen times the triangles.
-
-Plain arrays and pure functions: nothing here knows of a browser.
-
-Level and round the bodies, never over them, so that nothing of the task is covered.
-"""
+"""The grid of envs in the 3-D view: offset of each env, env under a ray, and the mark of the selected env."""
 
 from __future__ import annotations
 
@@ -26,31 +15,37 @@ from viser.transforms import SO3
 from workbench.core.scene.shapes import SceneGeometry, Visual
 
 FLOOR_WIDTH = 8.0
-"""Metres. A flat static thing wider than this in both directions is a floor: ManiSkill's ground is
-40 to 100 m wide, the largest table 2.4 m."""
+"""Metres. A flat static body wider than this in both directions is a floor: ManiSkill's ground is 40 to 100 m wide, the
+largest table 2.4 m."""
 FLOOR_THICKNESS = 0.05
 LEVEL = 0.9
-"""Upward part of the normal from which on a plane is a floor and not a wall."""
+"""Least upward component of a floor's normal; below it a plane is a wall."""
 WIDER = 1.4
-"""A view is wider than it is tall, and depth is foreshortened in it."""
+"""Width over depth of the grid: a view is wider than tall, and depth is foreshortened."""
 MARGIN = 0.35
-"""Metres between two envs at rest; a robot that reaches out uses some of it."""
+"""Metres between two envs at rest; a robot that reaches out needs some of it."""
 ACTING_MARGIN = np.float32(0.08)
-"""Metres round the frames of robots' links and of things."""
+"""Metres around the frames of links and bodies."""
 
 
 @dataclass(frozen=True)
 class EnvLayout:
-    """One env's box and where each of them stands, in metres, z up."""
+    """The box of one env and the offset of each, in metres, z up.
+
+    All envs sit at the origin of their own frames. A pose in the page is the env's own pose plus its offset on a grid,
+    whose spacing comes from what stands in one env (table and robot, without floor or backdrop). Floors are wide
+    enough for the whole grid and drawn once: sixteen overlapping floors would flicker and cost sixteen times the
+    triangles.
+    """
 
     offsets: NDArray[np.float32]
     """(N, 3) added to an env's own coordinates."""
     low: NDArray[np.float32]
-    """(3,) lowest corner of what stands in one env, floor left out, in the env's frame."""
+    """(3,) lowest corner of one env's contents without the floor, in the env's frame."""
     high: NDArray[np.float32]
     """(3,)"""
     floor_height: float
-    """z on which the envs stand: the floor's, or the lowest point of the env."""
+    """z of the floor, or of the lowest point of the env."""
     has_floor: bool
 
     def box_of_all(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -59,16 +54,13 @@ class EnvLayout:
 
 
 def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray:
-    """(8, 3) corners of a box; the bits of a corner's number say at which end of x, y and z it is."""
+    """(8, 3) corners of a box; the bits of a corner's index pick the low or high end of x, y and z."""
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
     return np.where(picks == 0, low, high)
 
 
 def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDArray[np.floating] | None:
-    """The normal (3,), in the env's frame, of a flat, very wide thing that never moves; else None.
-
-    Floors and the walls that tasks put up as a backdrop: they are wide enough for the whole grid.
-    """
+    """The normal (3,), in the env's frame, of a flat, very wide, static body (floor or backdrop); else None."""
     if any(geometry.body_kinds[b] not in ("static", "kinematic") for b in np.unique(visual.bodies)):
         return None
     extent = np.ptp(visual.mesh.vertices, axis=0)
@@ -80,10 +72,9 @@ def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDA
 
 
 def place_of_plane(normal: NDArray, visual: Visual, poses: NDArray, layout: EnvLayout) -> NDArray[np.float32]:
-    """(3,) added to a plane that is drawn once, so that it serves the whole grid.
+    """(3,) offset of a plane that is drawn once for the whole grid.
 
-    A floor lies under the middle; a wall goes behind the last env on its side, or it would cut through
-    the envs in between.
+    A floor lies under the middle; a wall goes behind the last env on its side, or it would cut through the envs.
     """
     normal = np.asarray(normal, np.float64)
     if abs(normal[2]) > LEVEL:
@@ -98,7 +89,7 @@ def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
 
     Args:
         geometry: The scene.
-        poses: (N, B, 7) of a moment, normally right after a reset; rows of absent bodies are NaN.
+        poses: (N, B, 7), normally right after a reset; rows of absent bodies are NaN.
     """
     lows, highs = [np.zeros((0, 3))], [np.zeros((0, 3))]
     floors = []
@@ -133,13 +124,12 @@ def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
 def acting_box(
     geometry: SceneGeometry, poses: NDArray[np.float32], layout: EnvLayout
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest corner, in the env's frame, of what acts: robots, and bodies that can be moved.
+    """Lowest and highest corner, in the env's frame, of robots and movable bodies.
 
-    The table and the walls round them are left out, and so is what flies out of the env. All of the env where nothing
-    acts.
+    Static and kinematic bodies are left out, and positions are clipped to the env. The whole env where nothing moves.
 
     Args:
-        poses: (K, B, 7): of one env at some moments, or of several envs.
+        poses: (K, B, 7) of one env at K moments, or of K envs.
     """
     acting = [row for row, kind in enumerate(geometry.body_kinds) if kind in ("link", "dynamic")]
     places = poses[:, acting, :3].reshape(-1, 3)
@@ -147,15 +137,15 @@ def acting_box(
     places = np.clip(places, layout.low, layout.high)
     if not len(places):
         return layout.low, layout.high
-    # What is known is where their frames are, and they are larger than that.
+    # The places are origins of frames; bodies reach beyond them.
     return places.min(axis=0) - ACTING_MARGIN, places.max(axis=0) + ACTING_MARGIN
 
 
 def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:
-    """(N, 3) offsets of a grid about the origin, env 0 in front on the left as seen from +x.
+    """(N, 3) offsets of a grid around the origin, env 0 in front on the left as seen from +x.
 
-    Rows run along y and are filled from +x (nearest to where the camera starts) backwards. Their
-    number is chosen so that the whole is `WIDER` times as wide as deep, as nearly as whole rows allow.
+    Rows run along y and are filled from +x (nearest to the first viewpoint) backwards. Their number makes the grid
+    about `WIDER` times as wide as deep.
     """
     width, depth = float(spacing[1]), float(spacing[0])
     columns = max(1, min(num_envs, round((num_envs * WIDER * depth / width) ** 0.5)))
@@ -167,10 +157,10 @@ def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:
 
 
 def env_under_ray(layout: EnvLayout, origin: NDArray, direction: NDArray) -> int | None:
-    """The env whose box a ray of the view meets first, or None.
+    """The env whose box a ray hits first, or None.
 
-    A ray against one box an env (the slab test) answers a click without a search tree over every
-    triangle in the browser, which clickable meshes would have to rebuild at every frame.
+    The slab test on one box an env; clickable meshes would make the browser rebuild a search tree over all triangles
+    at every frame.
     """
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
@@ -187,7 +177,7 @@ def env_under_ray(layout: EnvLayout, origin: NDArray, direction: NDArray) -> int
 
 
 def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:
-    """(K', 8, 3) corners of each instance's box in its env's frame; absent instances left out."""
+    """(K', 8, 3) corners of each instance's box in its env's frame, without absent instances."""
     low, high = visual.mesh.vertices.min(axis=0), visual.mesh.vertices.max(axis=0)
     corners = box_corners(low, high)
     worn = poses[visual.envs, visual.bodies].astype(np.float64)
@@ -195,27 +185,27 @@ def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:
     return SO3(worn[:, None, 3:]).apply(corners[None]) + worn[:, None, :3]
 
 
-# --- Which env is selected, said in the view: a frame round it and its number -----------------
+# --- Mark of the selected env: a frame and its number ------------------------------------------
 
 
 COLOUR = (34, 139, 230)
 
 
 class InView:
-    """Something in the 3-D view that comes, changes and goes.
+    """A node of the 3-D view that is added, changed and removed.
 
     Args:
-        add: of viser's scene; makes it of the values of `names`.
-        names: of what changes of it.
+        add: viser's function that adds it, called with the values of `names`.
+        names: of the properties that change.
     """
 
     def __init__(self, add: Callable[..., Any], *names: str) -> None:
         self._add, self._names = add, names
         self.handle: Any = None
-        """Of viser's, while it is shown."""
+        """viser's, while it is shown."""
 
     def draw(self, *values: Any) -> None:
-        """Show it with these values; none of them takes it away."""
+        """Show it with these values; without values, remove it."""
         if not values:
             if self.handle is not None:
                 self.handle.remove()
@@ -234,18 +224,20 @@ def line_set(server: viser.ViserServer, name: str, colour: tuple[int, int, int],
 
 
 def view_label(server: viser.ViserServer, name: str, anchor: Literal["top-center", "bottom-left"]) -> InView:
-    """A text, and (3,) metres in the view where it is; `anchor` says which part of it is there."""
+    """A text at (3,) metres in the view; `anchor` is the part of the text that lies there."""
     return InView(partial(server.scene.add_label, name, anchor=anchor), "text", "position")
 
 
 class SelectionMark:
+    """A frame around an env, level with its table and around its bodies, so that it covers nothing, and a label."""
+
     def __init__(self, server: viser.ViserServer) -> None:
         self._frame = line_set(server, "/selected/frame", COLOUR, 3.0)
         self._label = view_label(server, "/selected/label", "top-center")
         self._drawn: tuple[int, int, str] | None = None
 
     def draw(self, layout: EnvLayout, env: int, shown: bool, name: str | None = None) -> None:
-        """Mark this env; not `shown` when it is alone in the view and needs no mark. `name` is said instead of its number."""
+        """Mark this env, unless it is alone in the view (not `shown`); `name` replaces its number."""
         name = f"env {env}" if name is None else name
         if not shown:
             self.clear()
@@ -258,8 +250,8 @@ class SelectionMark:
         corner_low = layout.low[:2] + offset[:2] - MARGIN * 0.4
         corner_high = layout.high[:2] + offset[:2] + MARGIN * 0.4
         (x0, y0), (x1, y1) = corner_low, corner_high
-        # A frame on the floor under a table is hidden by the tables in front, so it goes where things
-        # happen: ManiSkill puts table tops at z = 0. A centimetre above, or the two flicker.
+        # On the floor it would be hidden by the tables in front, so it lies on the table top (z = 0 in ManiSkill), a
+        # centimetre above, or the two flicker.
         z = max(layout.floor_height, min(0.0, float(layout.high[2]))) + 0.01
         corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], np.float32)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)

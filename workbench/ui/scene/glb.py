@@ -1,11 +1,4 @@
-"""Shapes of the scene as GLB, the one mesh format that a browser shows with its true material.
-
-viser draws either bare triangles in one colour or a GLB with textures, metal and roughness. Bare
-triangles also lose the normals, so a box with shared corners is shaded like a ball. Hence GLB for
-everything. Visuals that the same bodies wear (the parts of one link) go into one file with one
-material a part: a frame then costs two messages a link and not two a part, and viser tears a frame
-that needs more than 128.
-"""
+"""Converts shapes of a scene to GLB, grouped and simplified for the browser."""
 
 from __future__ import annotations
 
@@ -21,7 +14,7 @@ from trimesh.visual.material import PBRMaterial
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 
 LARGEST_TEXTURE = 1024
-"""Pixels. A page is sent every texture before it shows anything; 4k scans are megabytes each."""
+"""Pixels. A page loads every texture before it shows anything; 4k scans are megabytes each."""
 
 
 LAYER = 4e-4
@@ -30,7 +23,10 @@ LAYER = 4e-4
 
 @dataclass(frozen=True)
 class WornTogether:
-    """Visuals with exactly the same wearers, drawn as one node."""
+    """Visuals of exactly the same (env, body) pairs, drawn as one node.
+
+    A frame then costs two messages a link instead of two a part; viser tears a frame that needs more than 128.
+    """
 
     name: str
     visuals: tuple[Visual, ...]
@@ -41,7 +37,7 @@ class WornTogether:
 
 
 def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
-    """The visuals of a scene, those that the same (env, body) pairs wear put together."""
+    """The visuals of a scene, grouped by the (env, body) pairs that have them."""
     groups: dict[tuple[bytes, bytes], list[Visual]] = {}
     for visual in geometry.visuals:
         if len(visual.mesh.faces):
@@ -54,9 +50,9 @@ def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
 
 
 def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budget: int) -> int:
-    """The most triangles a visual may have so that all instances together stay within the budget.
+    """The most triangles of one visual with which all instances together stay within the budget, at least 200.
 
-    Simple shapes keep all of theirs; only the rich ones give way, down to a few hundred.
+    Simple shapes keep all triangles, only rich ones are reduced.
     """
     faces = np.array([len(visual.mesh.faces) for visual in visuals], np.int64)
     shown = np.array([len(visual.envs) for visual in visuals], np.int64) * shown_envs / num_envs
@@ -71,10 +67,11 @@ def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budg
 
 
 def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
-    """One GLB of these parts, all in the frame of the body that wears them.
+    """One GLB of these parts, in the frame of their body.
 
-    The browser merges the parts into one buffer and refuses those that differ in which attributes
-    they have, so normals are always written, and texture coordinates as soon as one part has some.
+    viser draws bare triangles in one colour and without normals (a box is shaded like a ball), or a GLB with textures,
+    metal and roughness; hence GLB for everything. The browser merges the parts into one buffer and refuses parts with
+    different attributes: normals are always written, texture coordinates as soon as one part has some.
     """
     textured = any(mesh.uvs is not None for mesh, _ in parts)
     parts = list(zip(lift_painted_layers([mesh for mesh, _ in parts]), [m for _, m in parts], strict=True))
@@ -84,11 +81,11 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
             mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False, validate=False
         )
         if mesh.normals is None:
-            # Asking for them puts them in the cache, and only cached normals are exported.
+            # Reading them fills the cache, and only cached normals are exported.
             _ = solid.vertex_normals
         uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs.copy()
-        # trimesh counts v from the bottom of the picture and turns it round when it writes glTF, which
-        # counts from the top, as SAPIEN does: unturned, every texture would stand on its head.
+        # trimesh counts v from the bottom of the image and flips it for glTF, which counts from the top, as SAPIEN
+        # does: without this every texture would be upside down.
         uvs[:, 1] = 1.0 - uvs[:, 1]
         solid.visual = TextureVisuals(uv=uvs if textured else None, material=_pbr(material, number))
         scene.add_geometry(solid, geom_name=str(number))
@@ -98,12 +95,11 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
 
 
 def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:
-    """Thin layers of one body that lie on each other, pulled apart as far as a browser can tell.
+    """Move thin layers of one body that lie on each other apart, as far as a browser's depth buffer needs.
 
-    ManiSkill paints its targets as discs that rise by a hundredth of a millimetre each. SAPIEN's float
-    depth keeps them apart; a browser's 24 bits do not, and the rings turn into noise. Layers (thinner
-    than a millimetre, crossing each other's outline) are scaled along their thin axis so that each is
-    `LAYER` beyond the one before; what has any thickness stays as it is.
+    ManiSkill paints its targets as discs that rise by a hundredth of a millimetre each. SAPIEN's float depth keeps
+    them apart; a browser's 24 bits do not, and the rings turn into noise. Layers thinner than a millimetre are moved
+    along their thin axis so that each is `LAYER` beyond the one before; thicker parts stay.
     """
     layers: dict[int, list[int]] = {}
     for number, mesh in enumerate(meshes):
@@ -132,12 +128,11 @@ def _pbr(material: Material, number: int) -> PBRMaterial:
         name=f"part {number}",
         baseColorFactor=[red, green, blue, alpha],
         baseColorTexture=texture,
-        # Bare metal shows nothing but what it reflects, and there are no surroundings to reflect.
+        # Bare metal shows only reflections, and the page has no surroundings to reflect.
         metallicFactor=float(np.clip(material.metallic, 0.0, 0.4)),
         roughnessFactor=float(np.clip(material.roughness, 0.0, 1.0)),
         alphaMode="BLEND" if see_through else "OPAQUE",
-        # Meshes of robots are often open shells with mixed winding; seen from behind they would
-        # have holes.
+        # Meshes of robots are often open shells with mixed winding: single-sided they would have holes.
         doubleSided=True,
     )
 
@@ -149,7 +144,6 @@ def _texture(pixels: NDArray[np.uint8]) -> Image.Image:
     if max(image.size) > LARGEST_TEXTURE:
         image.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE), Image.Resampling.LANCZOS)
     if image.mode == "RGB":
-        # trimesh writes an image as JPEG only if it says it is one; a PNG of a photograph is five
-        # times the size.
+        # trimesh writes JPEG only if the image claims that format; a PNG of a photograph is five times the size.
         image.format = "JPEG"
     return image

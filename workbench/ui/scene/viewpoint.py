@@ -1,9 +1,4 @@
-"""Where the page looks from when it first shows a scene; after that the view belongs to the person.
-
-It frames the whole grid (or the one env) by itself, and again only for a scene of another size or a choice that
-changes what is shown. A page's panels take their places some moments after it has come, much later on a busy machine,
-and a person opens more: while nobody has moved the view it is framed for the shape that it has.
-"""
+"""The page's viewpoint: framing the grid or one env, lights, and the View panel."""
 
 from __future__ import annotations
 
@@ -24,14 +19,14 @@ from workbench.ui.server.viser_private import remove_nodes_but
 from workbench.ui.widgets.parts import PagePart
 
 FOV = 0.75
-"""Vertical, radians. viser's own 75 degrees bends what stands at the edge of a grid."""
+"""Vertical, radians. viser's own 75 degrees distorts the edges of a grid."""
 USUAL_ASPECT = 1.25
-"""Of the view beside the panel in a 1280 x 720 window, before a page has said its own."""
+"""Of the view in a 1280 x 720 window, until a page has sent its own."""
 USUAL_HEIGHT = 720.0
 """Pixels."""
 MOST_COVERED = 0.45
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
-"""ManiSkill's robots look along +x, so their front is seen from there; a little from the side."""
+"""ManiSkill's robots face +x, so they are seen from there; a little from the side."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +38,7 @@ class Viewpoint:
 
 
 def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
-    """The nearest upright view from the front and above that has the whole box in it, above what is covered.
+    """The nearest upright view from the front and above with the whole box in its uncovered part.
 
     Let the camera stand at ``target - d * forward - k * up``. A corner c, as seen from the target, is inside the
     picture when ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between
@@ -51,7 +46,7 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered
     the corners and the pairs of corners give, and k the middle of what is left to it.
 
     Args:
-        covered: Part of the picture's height that something lies over, from below (the timeline).
+        covered: Part of the picture's height, from below, that the timeline covers.
     """
     target = (np.asarray(low, np.float64) + high) / 2
     forward = -FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
@@ -87,16 +82,15 @@ def frame_one(
     fovy: float = FOV,
     acting: tuple[NDArray, NDArray] | None = None,
 ) -> Viewpoint:
-    """The view of one env at the origin, above what is covered.
+    """The view of one env at the origin, in the uncovered part of the picture.
 
-    It is what the task's own human camera sees, where there is one: from its direction, as far away as makes its
-    picture as high (and wide) as what is left of the view, and so that the middle of the picture is in the middle of that.
+    With a human camera: from its direction, at a distance at which its picture fits the uncovered part, centred there.
 
     Args:
-        picture: Of the human camera; only its pose is looked at.
+        picture: Of the human camera; only its pose is used.
         covered: As of `frame_box`.
         fovy: The human camera's vertical field of view, radians.
-        acting: Box of what is to be seen where there is no human camera; None takes all that stands in the env.
+        acting: Box to frame where there is no human camera; None takes the whole env.
     """
     if picture is None:
         low, high = (layout.low, layout.high) if acting is None else acting
@@ -105,7 +99,7 @@ def frame_one(
     position = picture.pose[:3].astype(np.float64)
     forward = SO3(picture.pose[3:].astype(np.float64)).apply(np.array([1.0, 0.0, 0.0]))
     centre = (layout.low + layout.high) / 2
-    # The page turns about what it looks at, so that has to be at the depth of the env.
+    # The page orbits around its look-at point, so that has to be at the depth of the env.
     depth = max(float((centre - position) @ forward), 0.2)
     tall = float(np.tan(FOV / 2))
     left = min(1 - covered, float(np.clip(aspect, 0.3, 4.0)))
@@ -122,18 +116,24 @@ Frame = Callable[[float, float], Viewpoint]
 
 
 class Framing:
+    """Points the open pages at the scene until a person has moved the view.
+
+    A page's panels take their places some moments after it has come (later on a busy machine), and a person opens
+    more: as long as the view is untouched it is framed for its present shape.
+    """
+
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
         self._framed: object = None
 
     def is_new(self, what: object) -> bool:
-        """Whether this is something else than was asked about last: then it is to be framed anew."""
+        """Whether this differs from the last call's: then it has to be framed."""
         new, self._framed = what != self._framed, what
         return new
 
     def follow(self) -> int:
-        """Forget the pages that have gone; returns how many are open."""
+        """Forget closed pages; returns the number of open ones."""
         clients = self._server.get_clients()
         for number in self._pointed.keys() - clients.keys():
             del self._pointed[number]
@@ -141,11 +141,11 @@ class Framing:
 
     @property
     def pointed(self) -> frozenset[int]:
-        """The open pages that were pointed at something."""
+        """The open pages that were pointed at the scene."""
         return frozenset(self._pointed)
 
     def frame(self, frame: Frame, untouched_only: bool = False) -> None:
-        """Point every open page (or those whose view nobody has moved), and those to come."""
+        """Point every open page (or only untouched ones), and those to come."""
         usual = frame(USUAL_ASPECT, USUAL_HEIGHT)
         self._server.initial_camera.position = usual.position
         self._server.initial_camera.look_at = usual.look_at
@@ -154,18 +154,18 @@ class Framing:
                 self._point(client, frame)
 
     def frame_untouched(self, frame: Frame) -> None:
-        """Frame anew each page that nobody has moved and that looks, or is shaped, otherwise than it was framed."""
+        """Frame each untouched page again whose viewpoint or shape is not the framed one."""
         for number, client in self._server.get_clients().items():
             position, aspect = self._pointed.get(number, (self._server.initial_camera.position, USUAL_ASPECT))
             as_framed = _is_at(client, position) and abs(aspect_of(client) / aspect - 1) <= 0.05
-            # If it looks from somewhere else, it lost its connection and came back, or the person was quicker.
+            # Not as framed: it lost its connection and came back, or the person was quicker.
             if not as_framed and self._is_untouched(client):
                 self._point(client, frame)
 
     def _is_untouched(self, client: viser.ClientHandle) -> bool:
         """True while the page looks from where it was last pointed, or from where every page begins.
 
-        What a page that is just coming is told may reach it before where pages begin, which then is where it looks from.
+        The latter, since the initial viewpoint may reach a new page after the one that it was pointed at.
         """
         position, _ = self._pointed.get(client.client_id, (None, None))
         begins = self._server.initial_camera.position
@@ -175,7 +175,7 @@ class Framing:
         viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
         client.camera.position = viewpoint.position
         client.camera.look_at = viewpoint.look_at
-        # After it is: who waits for it may close the page, and viser warns of what is written to a page that has gone.
+        # Last: a caller that waits for it may close the page, and viser warns of writes to a closed page.
         self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
 
 
@@ -192,7 +192,11 @@ def aspect_of(client: viser.ClientHandle) -> float:
 
 
 def light(server: viser.ViserServer) -> None:
-    """Put the lights into the scene; once a server."""
+    """Add the lights to the scene; once a server.
+
+    viser's own lights burn out white plastic and textures; an environment map or shadows would make a browser without
+    a graphics card pay for each pixel.
+    """
     server.scene.configure_default_lights(enabled=False, cast_shadow=False)
     server.scene.configure_environment_map(None)
     server.scene.add_light_hemisphere(
@@ -204,12 +208,10 @@ def light(server: viser.ViserServer) -> None:
 
 
 class Stage:
-    """Bodies, light and viewpoint on this server: what outlives the pages that draw into it.
+    """Bodies, lights and viewpoint on this server, shared by the pages.
 
-    The bodies stay in the browser while one page takes the other's place, so what looks as before is not sent again and
-    the view is never empty in between. Labels, frustums, marks and handles go with their page. viser's own lights burn
-    white plastic and textures out; an environment map or shadows would make a browser without a graphics card pay for
-    each pixel.
+    The bodies stay in the browser while one page replaces the other, so that equal ones are not sent again and the view
+    is never empty. Labels, frustums, marks and handles go with their page.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -217,21 +219,21 @@ class Stage:
         server.scene.set_up_direction("+z")
         light(server)
         server.initial_camera.fov = FOV
-        # Depth is 24 bit: with viser's near plane of a centimetre a goal that is painted a millimetre
-        # above a table flickers from a few metres on.
+        # Depth has 24 bits: with viser's near plane of a centimetre a goal painted a millimetre above a table flickers
+        # from a few metres on.
         server.initial_camera.near = 0.05
         server.initial_camera.far = 300.0
         self.scene = SceneView(server)
         self.framing = Framing(server)
 
     def clear(self) -> None:
-        """Take away what a page has put up besides the bodies."""
-        # Callbacks first: a click that comes now is nobody's.
+        """Remove everything of a page but the bodies and lights."""
+        # Callbacks first: a click that comes now has no page to answer it.
         self._server.scene.remove_click_callback("all")
         remove_nodes_but(self._server, (*BODIES, "/lights"))
 
 
-# --- How the page shows what it shows: all envs or one, dark or light -------------------------
+# --- The View panel: all envs or one, detail, dark or light ------------------------------------
 
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}

@@ -1,1 +1,1 @@
-"""What is made of recordings to be handed on."""
+"""The Share tab: films, pages, sheets and datasets made from recordings, and rerun's viewer."""

@@ -1,11 +1,4 @@
-"""What is made from recordings to be handed on: films, moving pages, sheets of pictures, datasets.
-
-One list of what can be made, for the page and the command line. Making takes processor and memory, and some of it a
-renderer: the page has it done by a process of its own (`workbench.ui.share.make`).
-
-Encoding a film takes a core for a while, and drawing a scene takes a renderer that the server's process must not
-import (a crash in a driver would take the page along). What is stopped before it is finished leaves nothing.
-"""
+"""Makes films, moving 3-D pages, sheets of pictures and datasets from recordings, in a process of its own."""
 
 from __future__ import annotations
 
@@ -48,45 +41,49 @@ from workbench.ui.widgets.templates import counted, sentence
 
 What = Literal["film", "scene", "page", "sheet", "lerobot"]
 MOST_SAID = 5
-"""Sentences on recordings that were left out."""
+"""Sentences about recordings that were left out."""
 EVERY_CAMERA = ""
 
 
 @dataclass(frozen=True)
-class Wanted:
+class MakeRequest:
+    """What to make, and from which recordings."""
+
     what: What
     sources: tuple[Source, ...]
     folder: Path
-    """Where the files go; for a dataset the folder that it becomes."""
+    """Of the files; for a dataset the folder that it becomes."""
     camera: str = EVERY_CAMERA
     """Of a film."""
     eye: Eye | None = None
-    """From where a scene is seen; None: a usual place."""
+    """The viewpoint of a scene; None: a usual one."""
     export: ExportOptions = ExportOptions()
     """Of a dataset."""
 
 
 @dataclass(frozen=True)
 class Made:
+    """The files that were made."""
+
     paths: tuple[Path, ...]
     words: str
-    """What it is, in a sentence or two."""
+    """Summary in a sentence or two."""
     not_made: tuple[str, ...] = ()
-    """Of which recordings it could not be made, each a sentence that names it and says why."""
+    """A sentence for each recording that failed, with its name and the reason."""
 
 
 OnProgress = Callable[[float, str], None]
 
 
-def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> Made:
-    """Make it, of every recording that has what is wanted.
+def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None) -> Made:
+    """Make what is wanted from each recording that has it. Used by the page and the command line.
 
     Args:
-        on_progress: called with the part that is done, 0..1, and what is done now.
+        on_progress: called with the part that is done, 0..1, and the current work.
 
     Raises:
-        ValueError: none of the recordings can be read and has what is wanted; the message says which lacks what.
-        OSError: it cannot be written; the message says why. What was finished before stays.
+        ValueError: it can be made from none of the recordings; the message says which lacks what.
+        OSError: it cannot be written; the message says why. Finished files stay.
         RuntimeError: this machine has nothing to render with.
     """
     if wanted.what == "lerobot":
@@ -110,12 +107,12 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
 
 
 def file_name(what: What, source: str, camera: str = "") -> str:
-    """Of what is made from the recording that is called `source`, and of its `camera` where it is a film of one."""
+    """File name of what is made from the recording `source`, and from its `camera` for a film."""
     suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
     return source + suffix.get(what, ".sheet.png")
 
 
-def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> list[Path]:
+def _of_readable(wanted: MakeRequest, source: Source, on_progress: OnProgress) -> list[Path]:
     episode = read_source(source)
     try:
         return _of_one(wanted, source, episode, on_progress)
@@ -127,7 +124,7 @@ def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> lis
         ) from error  # it does not lack pictures, they cannot be read
 
 
-def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
+def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
     name, fps = source.stem, 1.0 / seconds_a_step(episode)
     if wanted.what == "film":
         cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
@@ -155,7 +152,7 @@ def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnPro
     return [path]
 
 
-def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
+def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     count = len(wanted.sources)
     made = export_lerobot(
         [(source.stem, partial(read_source, source)) for source in wanted.sources],
@@ -172,7 +169,7 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
 
 
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
-    """Of one of several."""
+    """Progress of one of several."""
     return lambda done, doing: on_progress((number + done) / count, doing)
 
 
@@ -184,30 +181,34 @@ def _counted(
         yield picture
 
 
-# --- Something is made from recordings in a process of its own, while the page goes on --------
+# --- Making in a process of its own, while the page goes on ------------------------------------
 
 
 END_SECONDS = 5.0
 SAY_EVERY = 0.1
-"""Seconds. A sheet of pictures is quick, and a line a frame would be more to read than to make."""
+"""Seconds. For a sheet of pictures, a message a frame would cost more than the frame."""
 
 
 @dataclass(frozen=True)
 class MakingView:
-    """How it stands."""
+    """State of the work."""
 
     running: bool = False
     done: float = 0.0
     """0..1"""
     doing: str = ""
     problem: str = ""
-    """Why it could not be made, in a sentence; empty if it could, or was stopped."""
+    """Why it failed, in a sentence; empty if it succeeded or was stopped."""
     made: tuple[Made, ...] = ()
-    """All that was made so far, the newest first."""
+    """All that was made so far, newest first."""
 
 
 class Making:
-    """At most one thing at a time. All methods may be called from any thread."""
+    """Makes one thing at a time, in another process. Thread-safe.
+
+    Encoding a film takes a core for a while, and drawing a scene takes a renderer that the server's process must not
+    import: a crash in a driver would take the page along. Work that is stopped leaves no files.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -220,14 +221,14 @@ class Making:
         return self._view
 
     def scratch(self) -> Path:
-        """A folder for what is fetched by the page and then not needed any more; gone after `close`."""
+        """A temporary folder for downloads; `close` deletes it."""
         with self._lock:
             if self._scratch is None:
                 self._scratch = Path(tempfile.mkdtemp(prefix="workbench-shared-"))
             return self._scratch
 
-    def start(self, wanted: Wanted) -> bool:
-        """Begin; False where something is made already."""
+    def start(self, wanted: MakeRequest) -> bool:
+        """Begin; False if something is being made already."""
         with self._lock:
             if self._view.running:
                 return False
@@ -238,11 +239,11 @@ class Making:
             return True
 
     def stop(self) -> None:
-        """End what is made now; nothing of it stays. Returns at once."""
+        """End the present work and leave no files of it. Returns at once."""
         self._stopped.set()
 
     def close(self) -> None:
-        """Stop, wait for the end of the process, and take the scratch folder away."""
+        """Stop, wait for the end of the process, and delete the scratch folder."""
         self.stop()
         if self._thread is not None:
             # One that hangs is ended with this process, by its `machine.processes.family`.
@@ -250,7 +251,7 @@ class Making:
         if self._scratch is not None:
             shutil.rmtree(self._scratch, ignore_errors=True)
 
-    def _run(self, wanted: Wanted) -> None:
+    def _run(self, wanted: MakeRequest) -> None:
         came: list[Made | str] = []
         work = Work(_make, (wanted,), Made | str, tuple[float, str], "that makes it")
         deal: Deal[Made | str, tuple[float, str]] = Deal(
@@ -273,11 +274,11 @@ class Making:
 
 
 class _Stopped(BaseException):
-    """Goes through the blocks that take half-written files away."""
+    """Unwinds the blocks that delete half-written files."""
 
 
-def _make(wanted: Wanted, share: Share) -> None:
-    """In the other process."""
+def _make(wanted: MakeRequest, share: Share) -> None:
+    """Runs in the other process."""
     said_at = 0.0
 
     def on_progress(done: float, doing: str) -> None:
@@ -293,7 +294,7 @@ def _make(wanted: Wanted, share: Share) -> None:
 
     if share.next() is None:
         return
-    # By a signal: a film of an episode takes a while in which nobody says how far it is.
+    # By a signal: encoding a film has long stretches without progress in which it must be possible to stop.
     signal.signal(signal.SIGALRM, look)
     signal.setitimer(signal.ITIMER_REAL, SAY_EVERY, SAY_EVERY)
     if wanted.what == "scene":

@@ -1,8 +1,4 @@
-"""The Share tab: choose what is to be made of the recordings, make it, save it; and rerun beside it.
-
-They are about the recordings that are selected in the library, and where none is, about those that are open; where
-both are there and differ, a person chooses.
-"""
+"""The Share tab: make something from the selected or open recordings, download it, or open them in rerun."""
 
 from __future__ import annotations
 
@@ -26,7 +22,7 @@ from workbench.session.review.view import ReviewView
 from workbench.ui.library.panel import LibraryPanel
 from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import Door
-from workbench.ui.share.make import EVERY_CAMERA, Made, Making, MakingView, Wanted, What, file_name
+from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView, What, file_name
 from workbench.ui.share.rerun_view import RerunPages, RerunView
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
@@ -41,22 +37,22 @@ WHAT: dict[str, What] = {
 ALL_CAMERAS = "every camera"
 SELECTED, OPENED = "what is selected in the library", "what is open in the review"
 MOST_SHOWN = 6
-"""Made things in the list; the newest ones."""
+"""Results in the list; the newest."""
 MOST_NAMED = 5
-"""Recordings and files that are named before they are made; of the others their number is said."""
+"""Recordings and files that are named before they are made; the others are counted."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What the tab is about."""
+    """The recordings that the tab is about: those selected in the library, or else those that are open."""
 
     sources: tuple[Source, ...] = ()
     cameras: tuple[str, ...] = ()
-    """Those that are known of them: of recordings that are not open none is."""
+    """Known only for recordings that are open."""
     selected: bool = False
-    """They are those that are selected in the library, and not those that are open."""
+    """They are those selected in the library."""
     in_view: bool = False
-    """It is the one recording that the 3-D view shows: a film of the view is made from where the page looks."""
+    """It is the one recording in the 3-D view: a film of the view uses the page's viewpoint."""
 
 
 class SharePanel:
@@ -64,9 +60,9 @@ class SharePanel:
 
     Args:
         server: The page.
-        offers: Where what was made is fetched.
-        making: What makes it; it outlives this page.
-        folder: Datasets go into a folder of it that is named for them.
+        offers: Downloads of what was made.
+        making: Makes it; outlives this page.
+        folder: Datasets go into ``datasets`` below it.
     """
 
     def __init__(self, server: viser.ViserServer, offers: Downloads, making: Making, folder: Path) -> None:
@@ -98,7 +94,7 @@ class SharePanel:
         self._stop.on_click(lambda _: self._making.stop())
 
     def takes_opened(self, choice: bool) -> bool:
-        """Whether it is to be about what is open although other recordings are selected; `choice`: there are both."""
+        """Whether the person chose the open recordings instead of the selected ones; `choice`: there are both."""
         self._of.visible = choice
         return choice and self._of.value == OPENED
 
@@ -132,7 +128,7 @@ class SharePanel:
         chosen, what = self._chosen, WHAT[self._what.value]
         if not chosen.sources:
             return
-        wanted = Wanted(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
+        wanted = MakeRequest(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
         if what == "lerobot":
             now = datetime.datetime.now()
             words = self._task.value.strip()[:400]
@@ -145,7 +141,7 @@ class SharePanel:
             self._making.start(replace(wanted, folder=folder, export=export))
             return
         camera = self._camera.value if self._camera.value in chosen.cameras else EVERY_CAMERA
-        # A folder of its own each time: names that were made before are not in the way.
+        # A new folder each time: a file of the same name may exist from before.
         folder = Path(tempfile.mkdtemp(dir=self._making.scratch()))
         self._making.start(replace(wanted, folder=folder, camera=camera))
 
@@ -154,15 +150,15 @@ class SharePanel:
         return render("share", view=view, made=made)
 
     def _links(self, made: Made) -> list[tuple[str, Path, str]]:
-        """Of its files: where each is fetched, it, and its short name."""
+        """Address, path and short name of each file."""
         files = [path for path in made.paths if path.is_file()]
         short = short_names([path.name for path in files])
         return [(self._offers.address(path, download=True), path, name) for path, name in zip(files, short)]
 
 
 def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str, Any]:
-    """What a press on *Make* makes, as far as it is known before the recordings are read: in words, its files
-    with their short names, and the folder ``where`` they go; empty for files that the page offers to save."""
+    """What a press on *Make* will make, as far as known before the recordings are read: a description, the files with
+    their short names, and the folder ``where`` they go (empty for downloads)."""
     names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what == "lerobot":
@@ -184,7 +180,7 @@ _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Without the time that a recording's name ends with, where they differ without it too: it is half of the name."""
+    """Names without the time at their end, unless two would become equal."""
     short = [_TIME.sub("", name) for name in names]
     return short if len(set(short)) == len(short) else list(names)
 
@@ -194,7 +190,7 @@ def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
-    """From where this page looks."""
+    """The page's viewpoint."""
     if client is None or client.camera.image_width == 0:
         return None
     camera = client.camera
@@ -204,7 +200,7 @@ def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
 
 
 class Sharing:
-    """What is shared of a folder of recordings through a door, whatever page is shown. One a door."""
+    """Downloads, rerun and work in progress: what outlives the pages. One for each `Door`."""
 
     def __init__(self, door: Door) -> None:
         self._offers = Downloads(door)
@@ -225,7 +221,7 @@ class Sharing:
         return SharePart(library, table, share, RerunView(server, self._rerun, make_way, unfolded))
 
     def close(self) -> None:
-        """Stop what is made, and take away what was made for the page."""
+        """Stop the present work and delete the downloads."""
         self._making.close()
 
 
@@ -253,5 +249,5 @@ class SharePart(PagePart[ReviewView]):
 
 
 def rerun_files(rows: Sequence[LibraryRow]) -> tuple[Path, ...]:
-    """The .rrd files of these; ManiSkill's recordings have none."""
+    """The .rrd files of these rows; ManiSkill's recordings have none."""
     return tuple(path for row in rows for path in row.paths if path.suffix == ".rrd")

@@ -1,19 +1,4 @@
-"""Recordings in rerun's own viewer, beside the page or in a tab of its own, through the page's one door.
-
-rerun's web viewer is a program of 43 MB that looks at any address it is given and tells its makers that it runs. Here
-it comes from the wheel that wrote the recordings (so file and viewer are of one version), packed; it is served under
-the page's own address, where the same cookie lets it in and one forwarded port carries all of it; and a content
-security policy lets it talk to nobody else.
-
-Which recordings it opens stands in its address, and has to be a whole address there, host and port included. What
-host a browser sees is known in the browser alone (behind ``ssh -L`` it is another one), so the page that is opened
-is a small one of ours that puts the addresses together and goes on to rerun's.
-
-The moment that it opens at cannot stand there: rerun takes one in the address of its own servers' recordings only. So
-a few lines of ours in its page tell it when it has the recording, through the way in that it has for that
-(``viewer_control``, rerun 0.41: one message of protobuf's, written by hand). If another rerun knows no such message, it
-opens at the first moment, which the panel's heading then still tells apart.
-"""
+"""Serves rerun's web viewer for recordings, and shows it in a panel or a browser tab."""
 
 from __future__ import annotations
 
@@ -40,11 +25,11 @@ from workbench.ui.widgets.templates import render
 log = logging.getLogger(__name__)
 
 SHARE, LEAST = 0.66, 480
-"""Of the width between the other panels; and pixels. The rest is the scene's, with the timeline under it."""
+"""Share of the width between the other panels, and least pixels. The scene and the timeline have the rest."""
 SETTLES = 0.3
-"""Seconds from what a panel shows being asked for until the panel is where it stays."""
+"""Seconds from a page's request for the panel's content until the panel has its place."""
 Moments = Mapping[Path, int]
-"""The step at which a recording is looked at."""
+"""The step at which each recording is looked at."""
 
 _SHOW = "/rerun/show/"
 _BLUEPRINT = ".rbl"
@@ -52,7 +37,19 @@ _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 
 
 class RerunPages:
-    """The addresses under which recordings are shown. One a door."""
+    """The addresses under which rerun shows recordings. One for each `Door`.
+
+    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its makers.
+    Here it comes from the wheel that wrote the recordings (so file and viewer have one version), packed, under the
+    page's own address: the same cookie and one forwarded port serve it, and a content security policy forbids it
+    other servers.
+
+    The recordings stand in the viewer's address as whole addresses, with host and port. Only the browser knows the
+    host (behind ``ssh -L`` it is another one), so the opened page is a small one of ours that builds the addresses and
+    redirects to rerun. The step cannot stand there: rerun takes one only for recordings of its own servers. So a few
+    lines of ours in its page send it (``viewer_control``, rerun 0.41: one protobuf message, written by hand) when the
+    recording has come. A rerun without that message opens at the first step.
+    """
 
     def __init__(self, door: Door, offers: Downloads) -> None:
         self._offers = offers
@@ -67,7 +64,7 @@ class RerunPages:
         """The address, from the root of the server, that opens these ``.rrd`` files together.
 
         Args:
-            moments: asked when the address is opened: the step at which each of them begins, where that is not the first.
+            moments: called when the address is opened; the step at which each of them begins, if not the first.
         """
         paths = tuple(Path(path).resolve() for path in recordings)
         with self._lock:
@@ -86,7 +83,7 @@ class RerunPages:
             if part == f"{number}{_BLUEPRINT}" and (blueprint := _blueprint(path)) is not None:
                 return 200, "application/octet-stream", blueprint
         names = ", ".join(path.stem for path in paths)
-        # The first moment too: rerun follows what it reads until it reads, at the end of a file, that it is to pause.
+        # The first step too: rerun follows the data until it reads, at the end of a file, that it shall pause.
         begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
         page = render(
             "rerun_go_on",
@@ -130,14 +127,14 @@ def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
 
 
 class RerunView:
-    """Buttons in the present container that open recordings in rerun, and the panel in which they are shown.
+    """Buttons in the present container that open recordings in rerun, and the panel that shows it.
 
     Args:
         server: The page.
         pages: Where rerun is served.
-        make_way: Called before the panel comes, to make room for it, with what folds and unfolds it; says how many
-            pixels there are between the other panels then.
-        unfolded: Called when a page shows the panel, which may have been unfolded there.
+        make_way: Called before the panel opens, to make room for it, with a function that folds and unfolds it;
+            returns the pixels between the other panels.
+        unfolded: Called when a page shows the panel.
     """
 
     def __init__(
@@ -158,7 +155,7 @@ class RerunView:
         self._drawn: object = None
         self._width = LEAST
         self._asked_at: float | None = None
-        """When a page last asked for what is in the panel, if the panel has got no width since."""
+        """When a page last requested the panel's content, if the panel has got no width since."""
         self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
@@ -166,10 +163,11 @@ class RerunView:
     def draw(
         self, paths: Sequence[Path], chosen: int | None = None, moments: Moments = MappingProxyType({})
     ) -> None:
-        """From now on the buttons are about these ``.rrd`` files, of as many recordings as are `chosen`.
+        """Set the ``.rrd`` files that the buttons open.
 
         Args:
-            moments: the step at which each is looked at, of those that are.
+            chosen: number of recordings, of which some may have no ``.rrd`` file.
+            moments: the step at which each open one is looked at.
         """
         self._moments = moments
         self._chosen = len(paths) if chosen is None else chosen
@@ -190,10 +188,10 @@ class RerunView:
         self._widen()
 
     def _widen(self) -> None:
-        """Give the panel its width on a page that has just placed it.
+        """Set the panel's width once a page has placed it.
 
-        viser gives 300 pixels to what is docked beside another panel, whatever width it is docked with; only one that
-        is there takes a width. That it is there is known by its asking for what is in it.
+        viser gives 300 pixels to a panel that is docked next to another, and ignores the width given at docking. The
+        request for the panel's content tells that it is there.
         """
         with self._lock:
             asked = self._asked_at
@@ -210,7 +208,7 @@ class RerunView:
         return self._pages.address(paths, moments)
 
     def open(self) -> None:
-        """Show the recordings in a panel beside the scene; returns when the viewer is there to be loaded."""
+        """Show the recordings in a panel next to the scene; returns when the viewer can be loaded."""
         paths, moments = self._paths, self._moments
         with self._lock:
             if not paths or self._waiting:
@@ -238,7 +236,7 @@ class RerunView:
             heading = [(path.stem, begins[path]) for path in paths]
             self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
             Presses(self._server).when_unfolded(self._unfolded)
-        # Beside the scene, with a border that can be dragged.
+        # Next to the scene, with a border that can be dragged.
         panel.dock_left()
         self._width = max(LEAST, round(SHARE * room))
 
@@ -248,7 +246,7 @@ class RerunView:
                 (self._panel.minimize if folded else self._panel.expand)()
 
     def close(self) -> None:
-        """Take the panel away, and the program that runs in it."""
+        """Remove the panel and the viewer in it."""
         with self._lock:
             panel, self._panel = self._panel, None
         if panel is not None:

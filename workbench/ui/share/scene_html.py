@@ -1,13 +1,4 @@
-"""The 3-D view of an episode as one HTML file that moves: opened from a disk or a mail, without a server or a network.
-
-viser's page can play what its server would have sent, from a recording that stands in the page itself. So the scene is
-built as for a page that nobody looks at, moved from state to state with the pauses between them, and written down. The
-player has a time line, a pause button and speeds; the view is turned and moved as live.
-
-The player begins anew at the end without a pause, so the last state is held for a while, and its clock runs on. What
-time and step it is in the episode is therefore said by a caption of ours, with what the recording is; the player's own
-clock is not shown.
-"""
+"""Writes the 3-D view of an episode as one moving HTML file that needs no server and no network."""
 
 from __future__ import annotations
 
@@ -29,7 +20,7 @@ from workbench.ui.server.gated_server import DoorOptions, open_door
 from workbench.ui.widgets.templates import counted, render
 
 TRIANGLES = 80_000
-"""About how many are drawn. A robot's own meshes have twice that, and the file would be three times the size."""
+"""Approximate limit. A robot's own meshes have twice that, and the file would be three times the size."""
 
 PAUSE = 1.0
 """Seconds at the end."""
@@ -43,10 +34,15 @@ def write_scene_html(
 ) -> None:
     """Write the moving scene to a new file at `path`.
 
+    viser's page can play what its server would have sent, from a recording in the page itself: the scene is built and
+    moved state by state on a server without viewers, with pauses in between, and recorded. The player repeats without
+    a pause, so the last state is held; its clock includes that pause and is hidden, and our caption shows the
+    episode's time and step.
+
     Args:
-        path: where; must not exist.
-        episode: what.
-        eye: from where it is seen at first.
+        path: must not exist.
+        episode: with geometry and poses.
+        eye: the first viewpoint; None: a usual one.
         on_progress: called with the part that is done, 0..1.
 
     Raises:
@@ -57,7 +53,7 @@ def write_scene_html(
         raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to show.")
     eye = eye or usual_eye(episode)
     with new_file(path) as temporary:
-        # A door that lets nobody in: viser's server has to be somewhere, and nobody is told where.
+        # viser needs a running server; its address is never shown.
         door = open_door(DoorOptions(port=0))
         try:
             page = _recorded(door.server, episode, eye, on_progress)
@@ -89,11 +85,11 @@ def _recorded(
     assert geometry is not None and poses is not None
     env = 0 if geometry.num_envs == 1 else episode.info.env_index
     server.scene.set_up_direction("+z")
-    # viser's own lights: its player goes back to them at every turn, and other ones would flash.
+    # viser's own lights: its player returns to them at every repetition, and others would flash.
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
     camera.near, camera.far = 0.05, 300.0
-    # All envs of the scene that it came from; the other ones stand where nobody looks and are not drawn.
+    # All envs of the scene that it came from; the others are NaN and not drawn.
     batch = np.full((geometry.num_envs, *poses.shape[1:]), np.nan, np.float32)
     batch[env] = poses[0]
     scene = SceneView(server)
@@ -105,6 +101,6 @@ def _recorded(
         scene.move(batch, layout, env)
         recording.insert_sleep(seconds_a_step(episode))
         on_progress(0.9 * state / len(poses))
-    # It begins anew by itself; without a pause one does not see how it ended.
+    # The player repeats; without a pause the end cannot be seen.
     recording.insert_sleep(PAUSE)
     return recording.as_html(dark_mode=True)
