@@ -24,7 +24,7 @@ from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.reading import sources_among
 from workbench.session.clearance import Clearances
 from workbench.session.rescore.recordings import Rescorer
-from workbench.ui.share.make import Making, Wanted
+from workbench.ui.share.make import MakeRequest, Making
 
 pytestmark = pytest.mark.usefixtures("child_process")
 PATIENCE = 200.0
@@ -90,7 +90,7 @@ class Filming:
     process = "a process that makes it"
 
     def __init__(self, place: Path) -> None:
-        self._wanted = Wanted("film", sources_among([place / "v1"]), place / "films", "eye")
+        self._wanted = MakeRequest("film", sources_among([place / "v1"]), place / "films", "eye")
         self._making = Making()
 
     def start(self) -> None:
