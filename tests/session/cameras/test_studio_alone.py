@@ -14,7 +14,9 @@ from tests.session.studio import BARE, FILE, INFO, KEY
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.cameras.report import OfferedPlacement
+from workbench.jobs.pool import Answer
 from workbench.jobs.task import TaskDescription, TaskOptions
+from workbench.machine.processes.wire import Call
 from workbench.session.cameras.file_edits import StudioFile
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.studio import CameraStudio
@@ -163,16 +165,30 @@ class OfAFile:
         self.opened: list[tuple[Path, str]] = []
         self.task: TaskDescription = replace(TASK, file=str(file), source={str(file): TASK_TEXT})
         self.cameras.task = replace(self.task, source_files=(str(file),))
+        self.notes = 0
+        self.asker = Asker(self._refuse)
         self.studio = StudioFile(
             self.cameras,
-            lambda: None,
+            self._note,
             lambda file, name: self.opened.append((file, name)),
-            Asker(lambda request: None),
+            self.asker,
             lambda: None,
-            lambda: cast(ShownMoment, None),
+            lambda: ShownMoment(0, 2, None),
         )
         self.studio.folder = folder
         folder.mkdir()
+
+    def _note(self) -> None:
+        self.notes += 1
+
+    def _refuse(self, request: Request) -> None:
+        assert isinstance(request, Call)
+        self.asker.take(Answer(request.number, why="nothing can be drawn here"))
+
+    def looks(self, wish: Wish) -> None:
+        with self.cameras.lock:
+            """It was submitted whole."""
+        self.studio._look(wish, FILE)
 
     def writes(self) -> Writing:
         edit = SourceEdit(str(self.file), TASK_TEXT, TASK_TEXT + "\n", (), FILE)
@@ -192,6 +208,23 @@ def written(tmp_path: Path) -> Iterator[OfAFile]:
     made = OfAFile(tmp_path / "push.py", tmp_path / "copies")
     yield made
     made.studio.close()
+
+
+def test_what_is_written_or_refused_is_told_to_the_page(written: OfAFile) -> None:
+    written.writes()
+    until(lambda: written.notes == 1, "the page being told")
+    written.file.write_text("edited\n")
+    written.studio.undo_write()
+    until(lambda: written.notes == 2, "the page being told again")
+    assert written.studio.view.stage == "written"
+    assert written.studio.view.message.startswith("Not done: push.py was edited since")
+
+
+def test_that_there_is_no_picture_of_a_camera_to_be_added_is_said(written: OfAFile) -> None:
+    written.studio._later(written.looks, Wish("add", ("human", "side"), FILE))
+    until(lambda: written.notes, "the page being told")
+    said = "There is no picture of the new camera: nothing can be drawn here."
+    assert written.cameras.problem == said and written.studio.view.picture is None
 
 
 def test_a_task_that_may_be_copied_is_copied_and_what_was_written_to_the_other_file_is_past(

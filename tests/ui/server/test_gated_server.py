@@ -168,6 +168,7 @@ def test_a_port_in_visers_environment_changes_nothing(monkeypatch):
     door = open_door(DoorOptions(port=0))
     try:
         assert door.server.get_port() == door.port
+        assert door.notice is None, "any port was asked for"
         assert get(door, "/")[0] == 200
     finally:
         door.close()
