@@ -315,7 +315,7 @@ def view(
         host: address to serve the page on.
         port: port of the page; 0 takes any free one.
     """
-    from workbench.cli.share import view_in_terminal
+    from workbench.cli.view import view_in_terminal
 
     return view_in_terminal(files, web, host, port)
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.progress import TimeRemainingColumn
 
-from workbench.cli.terminal import progress_bar, refuse, say, say_addresses, warn
+from workbench.cli.terminal import progress_bar, refuse, say
 from workbench.recording.episode.source import Source
 from workbench.recording.lerobot.export import DoesNotFit, ExportOptions
 from workbench.recording.reader.reading import sources_among
-from workbench.recording.rerun.viewer import has_screen, open_window, recordings_among, web_viewer_folder
 from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, make
 
 SCENE, CAMERAS = "scene", "cameras"
@@ -84,49 +81,3 @@ def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], l
     for why in not_made:
         refuse(why)
     return 2 if not_made else 0
-
-
-# --- ``workbench view`` in a terminal: rerun's own viewer, in a window or, where there is no screen, in a page ---
-
-
-def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
-    """Show them until the window is closed or Ctrl-C comes; returns the exit code."""
-    try:
-        if web or not has_screen(os.environ):
-            return _in_page(recordings_among(files), host, port)
-        viewer = open_window(files)
-    except (OSError, ValueError, RuntimeError) as error:
-        return refuse(str(error))
-    try:
-        viewer.wait()
-    except RuntimeError as error:
-        return refuse(str(error))
-    except KeyboardInterrupt:
-        say("closing")
-    finally:
-        viewer.close()
-    return 0
-
-
-def _in_page(files: Sequence[Path], host: str, port: int) -> int:
-    from workbench.ui.server.file_response import Downloads
-    from workbench.ui.server.gated_server import DoorOptions, open_door
-    from workbench.ui.share.rerun_view import RerunPages
-
-    web_viewer_folder()
-    door = open_door(DoorOptions(host=host, port=port))
-    try:
-        address = RerunPages(door, Downloads(door)).address(files)
-        if door.warning:
-            warn(door.warning)
-        say_addresses(door.addresses(address))
-        say(f"  remote  {door.ssh_hint}")
-        say("  Ctrl-C ends it.")
-        while True:
-            # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
-            time.sleep(0.2)
-    except KeyboardInterrupt:
-        say("closing")
-    finally:
-        door.close()
-    return 0

@@ -17,7 +17,7 @@ from workbench.session.cameras.view import StudioCamera
 from workbench.ui.cameras.compare import what_differs
 from workbench.ui.cameras.export import as_lists, file_name, matrices_html
 from workbench.ui.cameras.suggest import box_edges, choices_of
-from workbench.ui.widgets.inputs import NewResult
+from workbench.ui.widgets.progress import NewResult
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),

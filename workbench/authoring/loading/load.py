@@ -22,14 +22,13 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from workbench.authoring.loading import registry
+from workbench.authoring.loading.import_problems import import_problem, named_module_problem
 from workbench.authoring.loading.library_names import named_like_library, search_first, stop_guarding
 from workbench.authoring.loading.modules import (
     AuthorFinder,
     ModuleName,
     SetAside,
     hidden_by_libraries,
-    import_problem,
-    named_module_problem,
     put_back,
     read_source,
     set_aside,

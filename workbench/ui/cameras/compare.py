@@ -17,7 +17,8 @@ from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import JobResult, refusals_told
+from workbench.ui.widgets.inputs import refusals_told
+from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
 
 FILE, KEPT = "as in the file", "as kept (A)"

@@ -23,7 +23,7 @@ from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import JobResult
+from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import counted, render
 
 AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"

@@ -23,7 +23,8 @@ from workbench.ui.cameras.pose_math import FARTHEST
 from workbench.ui.scene.env_grid import box_corners, line_set
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import JobResult, refusals_told
+from workbench.ui.widgets.inputs import refusals_told
+from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1

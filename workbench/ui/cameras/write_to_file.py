@@ -28,7 +28,7 @@ from workbench.ui.cameras.pose_math import Placing, rounded
 from workbench.ui.server.control_values import limit_text
 from workbench.ui.server.viser_private import element_id
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import NewResult
+from workbench.ui.widgets.progress import NewResult
 from workbench.ui.widgets.templates import render
 
 LEAVE, CLOSE = "Leave the file as it is", "Close"

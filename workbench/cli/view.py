@@ -1,0 +1,54 @@
+"""``workbench view`` in a terminal: rerun's own viewer, in a window or, where there is no screen, in a page."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from workbench.cli.terminal import refuse, say, say_addresses, warn
+from workbench.recording.rerun.viewer import has_screen, open_window, recordings_among, web_viewer_folder
+
+
+def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
+    """Show them until the window is closed or Ctrl-C comes; returns the exit code."""
+    try:
+        if web or not has_screen(os.environ):
+            return _in_page(recordings_among(files), host, port)
+        viewer = open_window(files)
+    except (OSError, ValueError, RuntimeError) as error:
+        return refuse(str(error))
+    try:
+        viewer.wait()
+    except RuntimeError as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        say("closing")
+    finally:
+        viewer.close()
+    return 0
+
+
+def _in_page(files: Sequence[Path], host: str, port: int) -> int:
+    from workbench.ui.server.file_response import Offers
+    from workbench.ui.server.gated_server import DoorOptions, open_door
+    from workbench.ui.share.rerun_view import RerunPages
+
+    web_viewer_folder()
+    door = open_door(DoorOptions(host=host, port=port))
+    try:
+        address = RerunPages(door, Offers(door)).address(files)
+        if door.warning:
+            warn(door.warning)
+        say_addresses(door.addresses(address))
+        say(f"  remote  {door.ssh_hint}")
+        say("  Ctrl-C ends it.")
+        while True:
+            # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        say("closing")
+    finally:
+        door.close()
+    return 0
