@@ -31,14 +31,14 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
 
 
 def _in_page(files: Sequence[Path], host: str, port: int) -> int:
-    from workbench.ui.server.file_response import Offers
+    from workbench.ui.server.file_response import Downloads
     from workbench.ui.server.gated_server import DoorOptions, open_door
     from workbench.ui.share.rerun_view import RerunPages
 
     web_viewer_folder()
     door = open_door(DoorOptions(host=host, port=port))
     try:
-        address = RerunPages(door, Offers(door)).address(files)
+        address = RerunPages(door, Downloads(door)).address(files)
         if door.warning:
             warn(door.warning)
         say_addresses(door.addresses(address))
