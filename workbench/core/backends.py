@@ -23,14 +23,14 @@ class BackendUnavailable(RuntimeError):
 class ChosenBackend:
     simulation: Literal["cpu", "gpu"]
     render_backend: str
-    """What ManiSkill takes: ``gpu`` (SAPIEN's ``cuda`` device), ``cpu`` (any other) or ``none``."""
+    """ManiSkill's name: ``gpu`` (SAPIEN's ``cuda`` device), ``cpu`` (any other) or ``none``."""
 
 
 @dataclass(frozen=True)
 class Renderer:
     render_backend: str
     name: str
-    """For people, for example ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
+    """Of the device, for example ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
 
 
 def gpu_library_path() -> Path:
@@ -57,7 +57,7 @@ def why_no_gpu_simulation() -> str | None:
 def find_renderer() -> Renderer | None:
     """What SAPIEN renders with, or None when it finds no device.
 
-    Asked once: a process can have one render device only, and a second one under another name raises.
+    Cached: a process can have one render device only, and a second one under another name raises.
     """
     for device in ("cuda", "cpu") if torch.cuda.is_available() else ("cpu",):
         try:
@@ -96,7 +96,7 @@ def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
 
 
 def unused_gpu_text(wanted: Backend) -> str | None:
-    """What is to be told where there is a GPU and ``auto`` does not simulate on it, a sentence; else None."""
+    """Notice that ``auto`` does not simulate on the GPU that there is; None if there is nothing to notice."""
     if wanted != "auto" or why_no_gpu_simulation() is not None:
         return None
     return (

@@ -23,24 +23,24 @@ from mani_skill.envs.sapien_env import BaseEnv
 from workbench.core.rules import Degree, Finding
 
 MOST_ROWS = 64
-"""Places that are kept apart; a task that breaks rules at more has the others counted."""
+"""Places that are kept; breaches at further places are only counted."""
 _GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
-"""``mani_skill.envs.sapien_env`` and ``.scene``: they write what they are told to."""
+"""``mani_skill.envs.sapien_env`` and ``.scene`` among them: they write what a task passes."""
 _FRAMES_KEPT = 12
 _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
-"""Where the frames end that are told with an error: above are those that the traceback has anyway."""
+"""Where the frames of an error end: the traceback has the ones above anyway."""
 
 Frame = tuple[FrameType, int, int]
 """A frame with its last instruction and its line at the time."""
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
-"""A rule, and the line or the thing that it was broken at."""
+"""A rule, and the line or thing at which it was broken."""
 Place = tuple[str, int, str]
 """File, line, and the name of the function."""
 
 
 class BrokenRule(RuntimeError):
-    """The task did what goes wrong, or is lost, in GPU simulation."""
+    """The task broke a rule of GPU simulation that stops."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
         super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', it goes on.)")
@@ -48,7 +48,7 @@ class BrokenRule(RuntimeError):
 
 
 class WrongReturn(BrokenRule):
-    """What a hook returned is not what ManiSkill takes it for: `hook` is its name, `problem` the failing."""
+    """A hook returned what ManiSkill cannot use: `hook` is its name, `problem` what is wrong."""
 
     def __init__(self, problem: str, hook: str, rule: str, place: Place | None) -> None:
         super().__init__(f"{hook}() {problem}{in_brackets(place)}.", rule, place)
@@ -60,7 +60,7 @@ class RuleWarning(UserWarning):
 
 
 def warn_of(finding: Finding) -> None:
-    """As Python warns, at the author's line."""
+    """Issue a Python warning at the author's line."""
     if finding.file is None or finding.line is None:
         warnings.warn(finding.message, RuleWarning, stacklevel=2)
     else:
@@ -71,11 +71,11 @@ def warn_of(finding: Finding) -> None:
 class _Row:
     finding: Finding
     occasion: Occasion
-    """At what it was last broken."""
+    """When it was last broken."""
     exact: bool
-    """False where the line is no more than likely."""
+    """False where the line is only likely."""
     confirmed: bool = True
-    """False for a row of the version before, which the present one has not broken yet."""
+    """False for a row of the previous version that the present one has not broken yet."""
 
 
 class BrokenRules:
@@ -91,17 +91,17 @@ class BrokenRules:
         """
         Args:
             degrees: of each rule; see `rules.degrees_of`.
-            on_finding: called with each place the first time that the task goes on after it.
+            on_finding: called once for each place where a rule that does not stop is broken.
         """
         self._degrees, self._on_finding = degrees, on_finding
         self._rows: dict[_Key, _Row] = {}
         self._now: Occasion = "reset"
         self.more = 0
-        """Times that rules were broken at places for which there is no row left."""
+        """Breaches at places beyond `MOST_ROWS`."""
         self.serial = 0
         """Grows with every change."""
         self.step: int = 0
-        """Control steps that were made."""
+        """Control steps made."""
 
     @property
     def rows(self) -> tuple[Finding, ...]:
@@ -118,12 +118,12 @@ class BrokenRules:
         place: Place | None = None,
         subject: Hashable = None,
     ) -> None:
-        """Raise, or note it and return, as the rule's degree has it.
+        """Raise or note a breach, by the rule's degree.
 
         Args:
-            frames: who is at fault, to become the innermost of the traceback; empty for whoever calls now,
-                None where no line is at fault, or only `place` is known.
-            subject: what was broken, where one row is for that and not for the line.
+            frames: at fault, to become the innermost of the traceback; empty for those of the present call, None where
+                no line is at fault or only `place` is known.
+            subject: the thing that gets one row, instead of the line.
         """
         degree = self._degrees[rule]
         if degree == "off":
@@ -136,14 +136,14 @@ class BrokenRules:
         self._note(rule, message, place, subject, exact=frames is not None)
 
     def begin(self) -> None:
-        """The task was tried, and begins now: steps are counted from here."""
+        """Count steps from here: the task was tried, and begins now."""
         self.step = 0
         self._rows = {
             key: replace(row, finding=replace(row.finding, first_step=0)) for key, row in self._rows.items()
         }
 
     def returned(self, rule: str, hook: str, problem: str, place: Place | None) -> None:
-        """As `breaks`, of what a hook returned."""
+        """As `breaks`, for the return value of a hook."""
         if self._degrees[rule] == "stop":
             raise WrongReturn(problem, hook, rule, place)
         if self._degrees[rule] == "warn":
@@ -171,10 +171,10 @@ class BrokenRules:
 
     @contextmanager
     def during(self, occasion: Occasion, confirms: bool = True) -> Iterator[None]:
-        """What is broken within is broken at this; what was not again is mended.
+        """Within this, breaches belong to `occasion`; unconfirmed rows of it that do not break again are dropped.
 
         Args:
-            confirms: whether all rules that can be broken at it could be.
+            confirms: whether every rule of this occasion could have been broken.
         """
         before, self._now = self._now, occasion
         try:
@@ -187,20 +187,19 @@ class BrokenRules:
             self.serial += 1
 
     def copy(self) -> tuple[Any, ...]:
-        """What is known now, for `put_back`."""
+        """The present rows, for `put_back`."""
         return dict(self._rows), self.more
 
     def put_back(self, kept: tuple[Any, ...]) -> None:
-        """Another version was tried, and is not taken."""
+        """Restore rows: another version was tried and not taken."""
         self._rows, self.more = kept
         self.serial += 1
 
     def edited(self, place_now: Callable[[Finding], tuple[str, int] | None]) -> None:
-        """Another version of the file runs on: a row whose function is another now leaves, and the others have to be
-        broken again at the next occasion to stay.
+        """Continue with another version of the file: drop rows whose function changed, mark the others unconfirmed.
 
         Args:
-            place_now: file and line of a row in the new version; None where its function is another.
+            place_now: file and line of a row in the new version; None where its function changed.
         """
         rows, self._rows = self._rows, {}
         self.serial += 1
@@ -248,7 +247,7 @@ def place_of_hook(task: type, hook: str) -> Place | None:
 
 
 def place_of(frames: Sequence[Frame]) -> Place | None:
-    """The first line that a person wrote who is no author of a library; else the first not in ManiSkill's general code."""
+    """The first line outside installed packages; else the first outside ManiSkill's general code."""
     general = None
     for frame, _, line in frames:
         code = frame.f_code
@@ -265,7 +264,7 @@ def in_brackets(place: Place | None) -> str:
 
 
 def class_is_installed(cls: type) -> bool:
-    """Whether a class comes from a package, and not from a file of whoever runs it."""
+    """Whether a class comes from an installed package, not from a user's file."""
     try:
         return is_installed(inspect.getfile(cls))
     except (TypeError, OSError):  # made in a notebook, or by type()
@@ -283,7 +282,7 @@ def is_installed(file: str) -> bool:
 _OWN_FOLDERS = tuple(
     f"{Path(file).parent}/" for file in (inspect.__file__, mani_skill.__file__, str(Path(__file__).parent))
 )
-"""Of Python, of ManiSkill wherever it was installed from, and of the workbench."""
+"""Of Python, ManiSkill and the workbench."""
 
 
 # --- the line that assigns ---------------------------------------------------------------------------
@@ -294,7 +293,7 @@ _NOT_IN_A_RESET = {"__init__", "_load_scene", "_load_agent", "_after_reconfigure
 
 
 def find_assignment(task: type, path: str) -> Place | None:
-    """Where the task gives ``self.<path>`` its value, as far as its text says: in its reset first, then in other methods.
+    """The line that assigns ``self.<path>``, by the task's source: in its reset first, then in other methods.
 
     Args:
         path: ``target``, ``memory.best``, ``targets['left']``, ``goal.raw_pose``.
@@ -312,7 +311,7 @@ def find_assignment(task: type, path: str) -> Place | None:
 
 
 def files_of_task(task: type) -> set[str]:
-    """Where its methods are written, and those that it inherits of below BaseEnv."""
+    """Source files of its methods, and of those that it inherits from classes below BaseEnv."""
     return {function.__code__.co_filename for _, function in _methods(task)}
 
 

@@ -22,22 +22,22 @@ class CameraSettings:
     """Pose, lens, size and shader of one camera, as ManiSkill's ``CameraConfig`` has them."""
 
     position: tuple[float, float, float]
-    """Metres, in the frame of its mount; in the env's frame if it stands still."""
+    """Metres, in the frame of its mount, or the env's if it has none."""
     quaternion: tuple[float, float, float, float]
     """wxyz, of unit length, in the same frame. The camera looks along x, y is to its left, z is up."""
     fov: float | None
-    """Vertical field of view in radians; None where `intrinsic` is given in its place."""
+    """Vertical field of view in radians; None if `intrinsic` is given."""
     intrinsic: Matrix3 | None
-    """OpenCV's matrix in pixels; None where `fov` is given."""
+    """OpenCV's matrix in pixels; None if `fov` is given."""
     width: int
     height: int
     near: float
     """Metres."""
     far: float
     shader_pack: str
-    """``minimal``, ``default``, ``rt`` ...: what draws it, and so which modalities it has."""
+    """``minimal``, ``default``, ``rt`` ...; it decides the modalities."""
     distance: float | None = field(default=None, compare=False)
-    """Metres along its line of sight to the point that it looks at; None where none is named. Nothing that is drawn."""
+    """Metres along its line of sight to its target; None without one. Does not change a picture."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class CallSite:
 
 
 CLOSE = 1e-6
-"""How far two cameras may be apart that are called the same: metres, quaternion components, radians; of pixels and
-of near and far, as a share. A config keeps its pose in single precision."""
+"""Largest difference of equal cameras: metres, quaternion components, radians; relative for pixels, near and far. A
+config keeps its pose in single precision."""
 
 
 def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> tuple[str, ...]:
@@ -78,7 +78,7 @@ def _alike(a: Any, b: Any, close: float) -> bool:
 
 
 def setting_text(value: object) -> str:
-    """What one setting is, for a sentence."""
+    """One setting as text."""
     if isinstance(value, tuple):
         return f"({', '.join(map(setting_text, value))})"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -86,7 +86,7 @@ def setting_text(value: object) -> str:
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 MOST_PIXELS = 4096
-"""On a side; a typing mistake of a digit more would take the memory of all envs."""
+"""On a side; a digit too many would take the memory of all envs."""
 
 
 _FURTHEST = 1e6
@@ -94,7 +94,7 @@ _FURTHEST = 1e6
 
 
 def why_no_camera(settings: CameraSettings) -> str | None:
-    """Why there can be no such camera, as a sentence without its end; None if there can."""
+    """Why these settings are invalid, as a sentence without its full stop; None if they are valid."""
     numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
     if not all(abs(number) <= _FURTHEST for number in numbers):
         return "the camera's pose, near and far must be finite numbers"
@@ -126,7 +126,7 @@ def why_no_camera(settings: CameraSettings) -> str | None:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """One camera of the task, the same in every env but for its pose.
+    """One camera of the task; only its pose may differ between envs.
 
     Poses are ManiSkill's camera frame: x forward, y left, z up, quaternion wxyz.
     """
@@ -146,16 +146,16 @@ class CameraInfo:
     modalities: tuple[str, ...]
     """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
-    """What the task's own config says, wherever the camera was moved since; env 0's where they differ. None where
-    the config cannot be said in these words (a lens that differs between envs)."""
+    """Of the task's own config, even if the camera was moved since; env 0's where they differ. None if
+    `CameraSettings` cannot express it (a lens that differs between envs)."""
     varies: bool = False
-    """Its pose differs between envs, or is another than its config says: the task's code moves it."""
+    """Its pose differs between envs or from its config: the task's code moves it."""
     site: CallSite | None = None
-    """Where the config was made; None where that was not noted."""
+    """Where the config was made; None if not noted."""
 
     @property
     def key(self) -> CameraKey:
-        """What tells it from all others."""
+        """Unique in its task."""
         return self.kind, self.name
 
 
@@ -172,8 +172,7 @@ class Picture:
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
     """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation is
-    this in whole millimetres as int16, which ends at 32.767 m: what `step_pictures` takes from there is left so. Else
-    there is no such end."""
+    this in whole millimetres as int16, up to 32.767 m, and `step_pictures` leaves it so. Otherwise unlimited."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None

@@ -13,7 +13,7 @@ def env_numbers(env_idx: Any) -> list[int]:
     """The numbers in `env_idx`, one or several, in the order given.
 
     Raises:
-        TypeError: they are no whole numbers, or a mask.
+        TypeError: they are no integers, or a mask.
     """
     try:
         each = [env_idx] if np.ndim(env_idx) == 0 else list(env_idx)
@@ -22,21 +22,21 @@ def env_numbers(env_idx: Any) -> list[int]:
         return [operator.index(i) for i in each]
     except TypeError as error:
         raise TypeError(
-            f"env_idx and source are whole numbers, one an env, not {env_idx!r}: of a mask, take mask.nonzero().flatten()"
+            f"env_idx and source must be integers, one per env, not {env_idx!r}; convert a mask with mask.nonzero().flatten()"
         ) from error
 
 
 def require_env(env: int, num_envs: int) -> None:
-    """Raise IndexError where there is no such env."""
+    """Raise IndexError if there is no such env."""
     if not 0 <= env < num_envs:
         raise IndexError(f"env {env} is out of range for {num_envs} envs")
 
 
 def envs_of_batch(env_idx: Any, num_envs: int) -> list[int]:
-    """As `env_numbers`, each once and there.
+    """As `env_numbers`, each existing and named once.
 
     Raises:
-        IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
+        IndexError, ValueError: `env_idx` names an env that does not exist, one twice, or none.
     """
     chosen = env_numbers(env_idx)
     if not chosen:

@@ -45,8 +45,8 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     stock_set_ee_action = PDEEPosController.set_action
 
     def link_data(self: Any) -> torch.Tensor:
-        # Only velocities are read this way (`Link.pose` reads the system's tensor itself), and the
-        # root's are fetched with every step: a root alone must not pay for all links.
+        # Only velocities are read this way (`Link.pose` reads the tensor itself), and a root's are fetched with
+        # every step: reading a root alone must not fetch all links.
         system = batched_system(self.scene)
         if system is not None and not self.is_root.all():
             system.fetch_link_velocities()
@@ -59,7 +59,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             _set_ee_action_of_each_env(self, action)
 
     def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
-        """Let the cached property `name` of a batched CPU scene's struct be where `find` has each of its `things`."""
+        """Replace the cached property `name`: in a batched CPU scene it gives the row of each of the struct's `things`."""
         stock = owner.__dict__[name].func
 
         def rows(self: Any) -> torch.Tensor:
@@ -72,7 +72,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             )
 
         value = cached_property(rows)
-        # Assigned after the class body it has no name, and raises when it is first read.
+        # Without this a cached_property that is assigned after the class body raises at its first read.
         value.__set_name__(owner, name)
         setattr(owner, name, value)
 
@@ -84,13 +84,12 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
 
 
 def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
-    """``PDEEPosController.set_action`` as a single CPU env does it, for every env.
+    """``PDEEPosController.set_action`` of a single CPU env, for every env.
 
-    ManiSkill has two inverse kinematics: on the CPU a solver that runs until the pose is reached, for one
-    env; on the GPU one damped step along the Jacobian, for all. For the same ``pd_ee_delta_pos`` action they
-    aim 1.3 cm apart (mean of 30 random ones, 3.8 cm at most), and the second takes any translation as one
-    along the root's axes, whatever the config's ``frame``. An env here is to equal stock's, so the first is
-    called for each: 0.1 ms an env and control step.
+    ManiSkill has two inverse kinematics: on the CPU a solver that iterates until the pose is reached, for one env; on the
+    GPU one damped step along the Jacobian, for all. Their targets for one ``pd_ee_delta_pos`` action differ by 1.3 cm (mean of
+    30 random ones, 3.8 cm at most), and the second ignores the config's ``frame``. An env here must equal stock's, so the
+    first is called for each: 0.1 ms an env and control step.
     """
     action = controller._preprocess_action(action)
     controller._step = 0
@@ -100,7 +99,7 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
     goal = controller._target_pose = controller.compute_target_pose(before, action)
     solver, qpos = controller.kinematics, controller.articulation.get_qpos()
     solved = [solver.compute_ik(pose=goal[i : i + 1], q0=qpos[i : i + 1]) for i in range(len(qpos))]
-    # Where the pose cannot be reached the arm stays, as in stock.
+    # For a pose that cannot be reached the arm stays, as in stock.
     target = torch.cat([start[i : i + 1] if row is None else row for i, row in enumerate(solved)])
     controller._target_qpos = target.to(start.dtype)
     if controller.config.interpolate:
@@ -115,9 +114,9 @@ _BETWEEN_SUBSTEPS = ("_step_action", "_before_simulation_step", "_after_simulati
 def substeps_are_unwatched(env: Any, task: type) -> bool:
     """Whether only ManiSkill's own code runs between the substeps of a control step.
 
-    Its own hooks read and write nothing of the simulation there: ``BaseEnv``'s are empty, and its
-    controllers' ``before_simulation_step`` writes at most drive targets into a tensor that is not applied
-    before the next control step. A task, robot or controller that brings its own is taken to look.
+    Those hooks do not touch the simulation: ``BaseEnv``'s are empty, and its controllers' ``before_simulation_step``
+    at most writes drive targets, which are not applied before the next control step. A hook of the task, its robot or its
+    controllers may read state.
 
     Args:
         task: the class of `env` without our mixin.
@@ -137,29 +136,28 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
 
 
 def asks_for_a_gpu(caller: FrameType) -> bool:
-    """Whether who asks for ``env.gpu_sim_enabled`` wants to know of a GPU, and not which code path to take.
+    """Whether the caller of ``env.gpu_sim_enabled`` asks for a GPU, not for the code path to take.
 
-    One does: ``CPUGymWrapper`` refuses what is simulated on a GPU. It works on a batched CPU env of
-    one, so it is told the truth; everybody else decides by the answer whether to apply and fetch.
+    Only ``CPUGymWrapper`` does: it refuses GPU simulation, and works on a batched CPU env of one. All other callers
+    decide by the answer whether to apply and fetch.
     """
     return caller.f_code is CPUGymWrapper.__init__.__code__
 
 
 def episode_seeds(env: BaseEnv) -> np.ndarray | None:
-    """(N,) the seeds that the envs were last reset with; None before the first reset."""
+    """(N,) seeds of the last resets; None before the first."""
     return env._episode_seed
 
 
 def draws_its_own_seeds(env: BaseEnv) -> bool:
-    """Whether a reset without a seed draws one for each env: ``enhanced_determinism``."""
+    """Whether a reset without a seed draws one for each env (``enhanced_determinism``)."""
     return env._enhanced_determinism
 
 
 def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> None:
-    """Seed the numpy randomness of some envs, and leave the others' as it is.
+    """Seed the numpy generators of these envs only.
 
-    ``BaseEnv.reset(seed=[...], options={"env_idx": ...})`` takes the list for all envs: the seeds of a
-    subset would replace, and shorten, the seeds of the whole batch.
+    ``BaseEnv.reset(seed=[...], options={"env_idx": ...})`` would replace, and shorten, the seeds of the whole batch.
     """
     keep_episode_seeds(env, env_idx, seeds)
     env._batched_episode_rng[env_idx] = BatchedRNG.from_seeds(seeds, backend=env._batched_rng_backend)
@@ -170,9 +168,8 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
 def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
     """Within this ``_episode_rng``, from which the robot's first joints are drawn, is the generator of that env.
 
-    ManiSkill keeps it for code that was written for one env, and it is env 0's for good: a partial reset of env 3
-    would draw on from wherever env 0's episode got to, whatever its own seed. Nor does ``enhanced_determinism``
-    draw other seeds than those that were set, which it does in a reset that is given none.
+    In ManiSkill it is always env 0's: a partial reset of env 3 would draw from env 0's generator, ignoring its own seed. Also
+    stops ``enhanced_determinism`` from drawing new seeds, as it does in a reset without a seed.
     """
     env._episode_rng = env._batched_episode_rng[index]
     draws_seeds, env._enhanced_determinism = env._enhanced_determinism, False
@@ -184,26 +181,26 @@ def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
 
 
 def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: Any) -> None:
-    """Say that these envs were reset with these seeds; their generators are left as they are."""
+    """Set the episode seeds of these envs; their generators stay as they are."""
     every = np.array(env._episode_seed, dtype=np.int64)
     every[env_idx] = seeds
     env._episode_seed = every
 
 
 def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
-    """Say to ManiSkill's setters which envs are being reset: ``scene._reset_mask``; all of them between resets."""
+    """Set ``scene._reset_mask``, the envs that ManiSkill's setters write; all of them between resets."""
     mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     mask[env_idx] = True
     env.scene._reset_mask = mask
 
 
 def keep_observation(env: BaseEnv, obs: Any) -> None:
-    """What ``reset`` and ``step`` do with what they observed: ``_last_obs``."""
+    """Set ``_last_obs``, as ``reset`` and ``step`` do."""
     env._last_obs = obs
 
 
 def last_observation(env: BaseEnv) -> Any:
-    """What ``reset`` or ``step`` observed last, before any wrapper: ``_last_obs``."""
+    """The last observation of ``reset`` or ``step``, before any wrapper: ``_last_obs``."""
     return env._last_obs
 
 
@@ -211,31 +208,31 @@ def open_env(env: Any) -> BaseEnv:
     """The env under its wrappers: ``base_env`` of ManiSkillVectorEnv, ``unwrapped`` of all others.
 
     Raises:
-        TypeError: there is no ManiSkill env.
+        TypeError: it is no ManiSkill env.
         RuntimeError: it was closed.
     """
     env = getattr(getattr(env, "base_env", env), "unwrapped", env)
     if not isinstance(env, BaseEnv):
-        raise TypeError(f"a ManiSkill env is wanted, not {type(env).__name__}")
+        raise TypeError(f"expected a ManiSkill env, not {type(env).__name__}")
     if env.scene is None:
-        raise RuntimeError("this env was closed: there is no simulation any more")
+        raise RuntimeError("this env is closed: its simulation is gone")
     return env
 
 
 def task_class(env: BaseEnv) -> type[BaseEnv]:
-    """The author's class, without what the CPU core puts in front of it."""
+    """The author's class, without the CPU core's mixins."""
     return getattr(type(env), "_workbench_task", type(env))
 
 
 def apply_and_fetch(env: BaseEnv) -> None:
-    """Let the simulation have what was written to its tensors, and the tensors what comes of it."""
+    """Apply the tensors to the simulation, and fetch them again."""
     env.scene._gpu_apply_all()
     env.scene.px.gpu_update_articulation_kinematics()  # type: ignore[union-attr]
     env.scene._gpu_fetch_all()
 
 
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
-    """Each env's numpy generators: of its episodes, and of the seeds of its episodes."""
+    """Each env's numpy generators: of its episodes, and of its episode seeds."""
     return {"episode": env._batched_episode_rng.rngs, "main": env._batched_main_rng.rngs}
 
 
@@ -264,28 +261,28 @@ def data_rows_of(struct: Any) -> torch.Tensor:
 
 
 def agents(env: Any) -> list[Any]:
-    """One for each robot of ``env.agent``; none for a task without a robot."""
+    """One for each robot of ``env.agent``; none without a robot."""
     agent = env.agent
     return agent.agents if isinstance(agent, MultiAgent) else [] if agent is None else [agent]
 
 
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
-    """Its row of each env in the tensors of joints, ``px.cuda_articulation_qpos`` and its kin: ``_data_index``."""
+    """Its row of each env in the joint tensors, such as ``px.cuda_articulation_qpos``: ``_data_index``."""
     return articulation._data_index
 
 
 def joints_of(struct: Any) -> int:
-    """How many active joints an Articulation has, ``max_dof``; 0 for an Actor."""
+    """Number of active joints of an Articulation, ``max_dof``; 0 for an Actor."""
     return int(getattr(struct, "max_dof", 0))
 
 
 def hidden_objects(env: Any) -> list[Any]:
-    """What the task hides from its sensors: ``_hidden_objects``, Actors (merged ones too)."""
+    """Actors (merged ones too) that the task hides from its sensors: ``_hidden_objects``."""
     return env._hidden_objects
 
 
 def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
-    """Where an actor that is hidden now really is, (M, 7) or (7,), or None if it is not hidden.
+    """True pose of an actor that is hidden now, (M, 7) or (7,); None if it is not hidden.
 
     ``Actor.hide_visual`` cannot switch off drawing in GPU simulation: it keeps the pose in
     ``before_hide_pose`` and moves the actor 99999 m away. On a stock CPU env nothing moves.
@@ -296,7 +293,7 @@ def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
 
 
 def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:
-    """What ``obs_mode="state"`` flattens, with its names: ``_get_obs_state_dict``. Runs the author's hooks."""
+    """The observation that ``obs_mode="state"`` flattens: ``_get_obs_state_dict``. Runs the author's hooks."""
     return env._get_obs_state_dict(info)
 
 
@@ -307,27 +304,27 @@ def cameras(env: Any) -> dict[CameraKey, Any]:
 
 
 def forget_cameras(env: Any) -> None:
-    """Leave no camera in the env's and its scene's lists, for `set_up_sensors` to fill them again."""
+    """Empty the camera lists of the env and its scene; `set_up_sensors` fills them again."""
     env._sensors, env._human_render_cameras = {}, {}
     env.scene.camera_groups.clear()
     env.scene.sensors, env.scene.human_render_cameras = {}, {}
 
 
 def set_up_sensors(env: Any) -> None:
-    """What ``_reconfigure`` does last: configs of sensors and human cameras, and the cameras themselves."""
+    """Make configs and cameras, as ``_reconfigure`` does last."""
     env._setup_sensors({"reconfigure": True})
 
 
 def flatten_observation(env: Any, obs: Any) -> Any:
-    """What ``step`` does to an observation after the reward has seen it: ``_flatten_raw_obs``."""
+    """Flatten an observation as ``step`` does after computing the reward: ``_flatten_raw_obs``."""
     return env._flatten_raw_obs(obs)
 
 
 def camera_components(camera: Any) -> list[Any]:
     """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
 
-    Empty for what is no plain camera: tactile sensors, or the stereo depth camera (which ManiSkill
-    3.0.1 cannot build: its constructor wants an argument that BaseEnv does not pass).
+    Empty for other sensors: tactile ones, or the stereo depth camera (which ManiSkill 3.0.1 cannot build: its
+    constructor needs an argument that BaseEnv does not pass).
     """
     inner = getattr(camera, "camera", None)
     return inner._render_cameras if isinstance(inner, RenderCamera) else []
@@ -341,7 +338,7 @@ _note_camera: Callable[[Any, FrameType], None] | None = None
 
 @contextmanager
 def noting_cameras(note: Callable[[Any, FrameType], None]) -> Iterator[None]:
-    """Within this `note` is called with every ``CameraConfig`` that is made, and the frame that makes it."""
+    """Within this, call `note` with each new ``CameraConfig`` and the frame that makes it."""
     global _note_camera
     mark_camera_configs()
     before, _note_camera = _note_camera, note
@@ -352,7 +349,7 @@ def noting_cameras(note: Callable[[Any, FrameType], None]) -> Iterator[None]:
 
 
 def camera_configs(env: Any) -> dict[CameraKey, Any]:
-    """What the camera hooks give now, before keywords of ``gym.make`` change it."""
+    """Configs that the camera hooks return now, before keywords of ``gym.make`` change them."""
     of_agent = {} if env.agent is None else parse_camera_configs(env.agent._sensor_configs)
     sensors = {**parse_camera_configs(env._default_sensor_configs), **of_agent}
     people = parse_camera_configs(env._default_human_render_camera_configs)
@@ -363,14 +360,14 @@ def camera_configs(env: Any) -> dict[CameraKey, Any]:
 
 
 def mark_camera_configs() -> None:
-    """Let every ``CameraConfig`` of this process keep where it was made, for `camera_site`, and at what its pose was
-    said to look, for `camera_target`. Of tasks that are imported after this. Safe to call again."""
+    """Make every ``CameraConfig`` keep where it was made (`camera_site`) and the target of its ``look_at`` (`camera_target`),
+    in tasks that are imported after this. Safe to call again."""
     stock = CameraConfig.__init__
     if hasattr(stock, "_workbench_stock"):
         return
     stock_look_at = sapien_utils.look_at
     looked: deque[tuple[Pose, Any]] = deque(maxlen=64)
-    """The last poses of ``look_at``, and their targets. Tensors are not read before a camera is made: on a GPU that waits."""
+    """The last poses of ``look_at`` with their targets; tensors are read only when a camera is made, since a GPU waits."""
 
     @wraps(stock)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
@@ -395,23 +392,23 @@ def mark_camera_configs() -> None:
 
 def _place_of_call(frame: FrameType) -> CallSite:
     code = frame.f_code
-    # Of a call over several lines `f_lineno` may be one within.
+    # In a call over several lines `f_lineno` may be a later line.
     start = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,))[0]
     return CallSite(code.co_filename, start or frame.f_lineno, code.co_qualname)
 
 
 def camera_site(config: Any) -> CallSite | None:
-    """Where a config was made; None where that was not kept."""
+    """Where a config was made; None if unknown."""
     return getattr(config, "_workbench_site", None)
 
 
 def camera_target(config: Any) -> Any:
-    """What ``look_at`` was given as its target when it made the config's pose; None where another thing made it."""
+    """The target of the ``look_at`` that made the config's pose; None if none did."""
     return getattr(config, "_workbench_target", None)
 
 
 def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components: list[Any]) -> None:
-    """Make a ``Camera`` one of this config and these components, which are set up as the config says."""
+    """Give a ``Camera`` this config and these components, which already match the config."""
     kind, name = key
     camera.config = config
     (env._sensor_configs if kind == "sensor" else env._human_render_camera_configs)[name] = config

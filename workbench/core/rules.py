@@ -18,11 +18,11 @@ class Rule:
 
     id: str
     degree: Degree
-    """Unless a person chooses one for all rules."""
+    """Default degree."""
     asks: str
-    """Of the task, in a sentence."""
+    """What the task must do, in a sentence."""
     otherwise: str
-    """What happens on the GPU where the task does not."""
+    """What happens on the GPU if the task does not."""
 
 
 _TABLE = (
@@ -118,10 +118,10 @@ RULES: Mapping[str, Rule] = {rule.id: rule for rule in _TABLE}
 
 
 def degrees_of(choice: Degree | None) -> dict[str, Degree]:
-    """The degree of each rule: the chosen one for all, or each rule's own where none is chosen.
+    """The degree of each rule: `choice` for all, or each rule's own if it is None.
 
     Raises:
-        ValueError: no such degree.
+        ValueError: `choice` is no degree.
     """
     if choice is not None and choice not in DEGREES:
         raise ValueError(f"rules must be 'stop', 'warn' or 'off', not {choice!r}")
@@ -130,28 +130,28 @@ def degrees_of(choice: Degree | None) -> dict[str, Degree]:
 
 @dataclass(frozen=True)
 class Finding:
-    """A rule that a task broke at one place, however often."""
+    """Breaches of one rule at one place."""
 
     rule: str
     """Its id."""
     degree: Degree
     message: str
-    """What was done, what comes of it, and what to write instead; of the first time."""
+    """Of the first breach: what was done, its effect, and what to write instead."""
     file: str | None
-    """The author's file, or another that the line is in; None where none is known."""
+    """File of the line; None if unknown."""
     line: int | None
     """1-based line in `file`."""
     code: str
     """The text of that line, stripped."""
     function: str
-    """The function or hook that the line is in."""
+    """Function or hook of the line."""
     count: int
-    """How often."""
+    """Number of breaches."""
     first_step: int
-    """Control steps of the batch that had been made, the first time; 0 in a reset before the first, and in the
-    reset and the step with which a page tries a version."""
+    """Control steps of the batch before the first breach; 0 in a reset before the first step, and in the reset and step
+    with which a page tries a version."""
 
     @property
     def key(self) -> tuple[str, str | None, str, str]:
-        """What stays the same while the lines around it move."""
+        """Stays the same when lines around it move."""
         return self.rule, self.file, self.function, self.code

@@ -17,18 +17,18 @@ LOCK_WAIT_S = 180
 
 
 class AptFailed(RuntimeError):
-    """apt-get did not do it; the message carries the end of what it said."""
+    """apt-get failed; the message has the end of its output."""
 
 
 @dataclass(frozen=True)
 class PackageVersion:
     version: str
     suite: str
-    """As apt names it in ``-t``: ``bookworm-backports``."""
+    """As in apt's ``-t``: ``bookworm-backports``."""
 
 
 def has_apt() -> bool:
-    """True on Debian, Ubuntu and what descends from them."""
+    """True on Debian, Ubuntu and their derivatives."""
     return shutil.which("apt-get") is not None
 
 
@@ -49,7 +49,7 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
     """Run apt-get without questions, waiting for dpkg's lock, which an unattended upgrade may hold.
 
     Raises:
-        AptFailed: it is missing, ended with an error or took longer than `timeout_s`.
+        AptFailed: it is missing, failed, or took longer than `timeout_s`.
     """
     command = ["apt-get", "-q", "-y", "-o", f"DPkg::Lock::Timeout={LOCK_WAIT_S}", *options, *arguments]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
@@ -71,13 +71,13 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
 
 
 def apt_install(*packages: str) -> None:
-    """Install what apt's lists have now, without what is only recommended. Raises AptFailed."""
+    """Update apt's lists and install these packages without recommended ones. Raises AptFailed."""
     apt_get(["update"])
     apt_get(["install", "--no-install-recommends", *packages])
 
 
 def available_versions(package: str, options: Sequence[str] = ()) -> list[PackageVersion]:
-    """What apt could install, newest first; empty without apt or before the first ``apt-get update``."""
+    """Versions that apt offers, newest first; empty without apt or before the first ``apt-get update``."""
     if shutil.which("apt-cache") is None:
         return []
     done = subprocess.run(
@@ -87,7 +87,7 @@ def available_versions(package: str, options: Sequence[str] = ()) -> list[Packag
 
 
 def parse_madison(text: str) -> list[PackageVersion]:
-    """``apt-cache madison``: ``package | version | uri suite/component arch Packages``, newest first."""
+    """Parse ``apt-cache madison``: ``package | version | uri suite/component arch Packages``, newest first."""
     versions: list[PackageVersion] = []
     for line in text.splitlines():
         columns = [column.strip() for column in line.split("|")]
@@ -114,11 +114,11 @@ class AptSource:
     suites: tuple[str, ...]
     components: tuple[str, ...]
     options: dict[str, str] = field(default_factory=dict)
-    """Those of `CARRIED_OPTIONS` that it sets, under their deb822 names, values as deb822 spells them."""
+    """Its options among `CARRIED_OPTIONS`, with names and values as in deb822."""
 
 
 def parse_one_line_format(text: str) -> list[AptSource]:
-    """The sources of a ``*.list`` file. Lines that are not a ``deb`` source are passed over."""
+    """The ``deb`` sources of a ``*.list`` file."""
     return [
         source for line in text.splitlines() if (source := _parse_line(line.split("#", 1)[0])) is not None
     ]
@@ -137,7 +137,7 @@ def _parse_line(line: str) -> AptSource | None:
 
 
 def parse_deb822_format(text: str) -> list[AptSource]:
-    """The enabled ``deb`` sources of a ``*.sources`` file: paragraphs of ``Name: value``, as a mail's header has them."""
+    """The enabled ``deb`` sources of a ``*.sources`` file: paragraphs of ``Name: value``, as in a mail header."""
     sources: list[AptSource] = []
     without_comments = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
     for paragraph in re.split(r"\n\s*\n", without_comments):
@@ -146,14 +146,14 @@ def parse_deb822_format(text: str) -> list[AptSource]:
             tuple(fields.get(name, "").split()) for name in ("Types", "URIs", "Suites", "Components")
         )
         if "deb" in types and uris and suites and fields.get("Enabled", "yes").strip().lower() != "no":
-            # A value that goes on over lines, as an inline key does, keeps them.
+            # A value of several lines (an inline key) keeps them.
             options = {name: fields[name].strip(" ") for name in CARRIED_OPTIONS if name in fields}
             sources.append(AptSource(uris, suites, components, options))
     return sources
 
 
 def read_apt_sources(folder: Path = Path("/etc/apt")) -> list[AptSource]:
-    """All sources of this machine, in the order in which apt reads the files."""
+    """All sources of this machine, in apt's order of files."""
     sources: list[AptSource] = []
     for path in [folder / "sources.list", *sorted((folder / "sources.list.d").glob("*"))]:
         if not path.is_file():

@@ -14,7 +14,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 
 def find_chromium() -> str | None:
-    """Path of a Chromium that runs: the one that PLAYWRIGHT_CHROMIUM names, else the first on PATH."""
+    """Path of a working Chromium: the one named by PLAYWRIGHT_CHROMIUM, else the first on PATH."""
     named = os.environ.get(VARIABLE)
     candidates = [named] if named else [path for name in NAMES if (path := shutil.which(name))]
     return next((path for path in candidates if chromium_version(path) is not None), None)
@@ -31,13 +31,13 @@ def chromium_version(path: str) -> str | None:
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    # Another program of that name may end with 0 too; a browser's version has four numbers.
+    # Another program of that name may succeed too; a browser's version has four numbers.
     version = re.search(r"\d+(\.\d+){3}", done.stdout)
     return done.stdout.strip() if done.returncode == 0 and version else None
 
 
 def how_to_get_chromium() -> str:
-    """One sentence for a person on this machine."""
+    """Advice for this machine, in one sentence."""
     named = os.environ.get(VARIABLE)
     if named:
         return f"{VARIABLE}={named} is no Chromium that runs: correct the path or unset the variable."

@@ -48,10 +48,10 @@ class DoctorFinding:
 
     topic: str
     ok: bool | None
-    """True: works. None: the workbench runs without it, with less. False: it cannot run."""
+    """True: works. None: the workbench runs, with less. False: it cannot run."""
     what: str
     advice: str | None = None
-    """What to do; None where nothing is amiss."""
+    """What to do; None if all is well."""
 
 
 def diagnose() -> list[DoctorFinding]:
@@ -86,12 +86,12 @@ def diagnose() -> list[DoctorFinding]:
 
 
 def exit_code(findings: Sequence[DoctorFinding]) -> int:
-    """0 if the workbench can run here, with less perhaps; 1 if not."""
+    """0 if the workbench can run here, perhaps with less; 1 if not."""
     return int(any(finding.ok is False for finding in findings))
 
 
 def print_report(findings: Sequence[DoctorFinding], console: Console | None = None) -> None:
-    """The findings as a table, each lack followed by what to do."""
+    """Print the findings as a table, with advice."""
     console = console or Console(highlight=False)
     marks = {True: "[green]ok[/]", None: "[yellow]less[/]", False: "[red]no[/]"}
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
@@ -124,7 +124,7 @@ def _python() -> list[DoctorFinding]:
 
 
 def _packages() -> list[DoctorFinding]:
-    """Installed versions against those that the distribution asks for."""
+    """Installed versions against the distribution's requirements."""
     try:
         requirements = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:
@@ -168,7 +168,7 @@ def _render_device() -> list[DoctorFinding]:
 
 
 def _gpu() -> list[DoctorFinding]:
-    """CUDA through torch, then PhysX on it, without causing SAPIEN to fetch anything."""
+    """CUDA through torch, then PhysX on it, without a download by SAPIEN."""
     child = subprocess.run(
         python_command("-c", GPU_QUESTIONS),
         env=child_environment(),
@@ -229,7 +229,7 @@ def _cores_and_memory() -> list[DoctorFinding]:
 
 
 def _reading() -> list[DoctorFinding]:
-    """How far the processes are confined that read recordings."""
+    """Confinement of the processes that read recordings."""
     version = landlock_version()
     if version:
         what = f"recordings are read in processes that may read their folder and write nothing (Landlock {version})"
@@ -250,7 +250,7 @@ def _page_address() -> list[DoctorFinding]:
         f"http://127.0.0.1:{DEFAULT_PORT}/ and a token that `workbench open` prints; from elsewhere: {tunnel}"
     )
     with socket.socket() as trial:
-        # As a server does it: a port whose last connections still linger counts as free.
+        # As a server does: a port with lingering connections counts as free.
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind(("127.0.0.1", DEFAULT_PORT))

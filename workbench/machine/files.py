@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 MOST_BYTES = 64 << 20
-"""Of what is expected to be there."""
+"""Most bytes of a file that is compared before it is replaced."""
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
 
 @contextmanager
 def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Path]:
-    """A file in the folder of `path` that holds `content` and is on the disk; gone after the block, if it is still there.
+    """A temporary file with `content` in the folder of `path`, synced to disk; removed after the block.
 
     Raises:
         OSError: it cannot be written.
@@ -32,19 +32,19 @@ def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Pa
             os.fsync(file.fileno())
         yield temporary
     finally:
-        with contextlib.suppress(OSError):  # what is to be told is why it was not written
+        with contextlib.suppress(OSError):  # must not hide the error of the block
             temporary.unlink(missing_ok=True)
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Let `path`, which must be free, be the file that is whole at `temporary`; that one may be gone then.
+    """Give the file at `temporary` the free name `path`; `temporary` may then be gone.
 
     Raises:
-        FileExistsError: it is taken.
-        OSError: it cannot be done.
+        FileExistsError: `path` exists.
+        OSError: the file cannot be linked or renamed.
     """
     try:
-        os.link(temporary, path)  # unlike a rename it is never over another
+        os.link(temporary, path)  # unlike a rename it never replaces a file
     except FileExistsError:
         raise
     except OSError as error:
@@ -61,7 +61,7 @@ def give_name(temporary: Path, path: Path) -> None:
 
 
 def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
-    """Write a file that must not be there yet; False, and nothing done, if it is. Raises OSError."""
+    """Write a new file; returns False, and changes nothing, if it exists. Raises OSError."""
     with written_beside(path, content, mode) as temporary:
         try:
             give_name(temporary, path)
@@ -71,20 +71,20 @@ def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
 
 
 def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> bool:
-    """Let `path`, whether or not it is there yet, hold `content`; False, and nothing done, if it no longer holds what is `expected`.
+    """Write or replace a file in one step. Returns False, and changes nothing, if its content is no longer `expected`.
 
-    A link stays one; mode and owner stay as they are.
+    A link stays a link; mode and owner stay.
 
     Raises:
-        OSError: it cannot be written; it holds what it held before.
+        OSError: it cannot be written; its content is unchanged.
     """
     path = path.resolve()
     with written_beside(path, content) as temporary:
         with contextlib.suppress(FileNotFoundError):  # a new file has no mode to keep
             status = path.stat()
-            with contextlib.suppress(PermissionError):  # a group's file that somebody else in the group owns
+            with contextlib.suppress(PermissionError):  # a group's file with another owner
                 os.chown(temporary, status.st_uid, status.st_gid)
-            with contextlib.suppress(PermissionError):  # a drive that knows no modes
+            with contextlib.suppress(PermissionError):  # a drive without modes
                 os.chmod(temporary, stat.S_IMODE(status.st_mode))
         if expected is not None and read_regular_file(path, MOST_BYTES) != expected:
             return False
@@ -94,10 +94,10 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to; what was written has the name `path` after the block, unless it raised.
+    """A temporary name to write to in the folder of `path`; after the block the file is `path`, unless the block raised.
 
     Raises:
-        FileExistsError: there is something at `path`; the message says what to do.
+        FileExistsError: `path` exists; the message says what to do.
         OSError: the folder cannot be written to, or the disk is full; the message names the file.
     """
     path = Path(path)
@@ -117,7 +117,7 @@ def new_file(path: Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
     finally:
-        # The other name is there by now, or it is to be told why it is not.
+        # `path` exists by now, or an error is being raised, which this must not hide.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
@@ -125,7 +125,7 @@ def new_file(path: Path) -> Iterator[Path]:
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:  # which would be taken for one of the file's own name
+    except FileExistsError as error:  # would be mistaken for the file's own name
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
 
 
@@ -135,11 +135,11 @@ def _taken(path: Path) -> FileExistsError:
     )
 
 
-# --- Reads files that others may have replaced: only regular files, and only so much of them ---
+# --- reading files that others may have replaced: regular files of limited size ---------------------
 
 
 MOST_SOURCE_BYTES = 16 << 20
-"""Of one Python file; the largest of the standard library has a fiftieth of this."""
+"""Of one Python file; 50 times the largest of the standard library."""
 _PIECE = 1 << 20
 _KINDS = (
     (stat.S_ISDIR, "folder"),
@@ -151,24 +151,24 @@ _KINDS = (
 
 
 class NotARegularFile(OSError):
-    """A path that leads to a device, a pipe, a socket or a folder. As text, a sentence that names the path."""
+    """A path to a device, pipe, socket or folder. Its text is a sentence that names the path."""
 
     def __str__(self) -> str:
         return f"{self.filename} {self.strerror}"
 
 
 class FileTooLarge(OSError):
-    """A file with more bytes than its kind may have. As text, as of `NotARegularFile`."""
+    """A file with more bytes than allowed. Its text is a sentence that names the path."""
 
     __str__ = NotARegularFile.__str__
 
 
 def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:
-    """The content of a file of at most `most_bytes`.
+    """The content of a regular file of at most `most_bytes`.
 
     Raises:
-        NotARegularFile: ``path`` is, or links to, something else. It was not read from.
-        FileTooLarge: there is more, also where the file says a smaller size or grows meanwhile.
+        NotARegularFile: ``path`` is, or links to, something else, from which nothing was read.
+        FileTooLarge: it has more, even if it states a smaller size or grows meanwhile.
         OSError: it cannot be opened or read.
     """
     with open_regular_file(path, most_bytes) as file:
@@ -183,18 +183,18 @@ def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:
 
 
 def open_regular_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> BinaryIO:
-    """Open a file for reading, never waiting for it; links to regular files are followed.
+    """Open a regular file for reading without blocking; links are followed.
 
     Args:
-        most_bytes: its size may be no more than this; None for any size. A file that grows afterwards, and one of
-            ``/proc`` that has no size, can give more.
+        most_bytes: largest size; None for any. A file that grows afterwards, or one of ``/proc`` that has no size, can
+            give more.
 
     Raises:
         NotARegularFile, FileTooLarge, OSError: as `read_regular_file`.
     """
-    # Looked at before it is opened: opening some devices does something (a watchdog, a tape).
+    # Checked before opening: opening some devices has an effect (a watchdog, a tape).
     _must_be_regular(path, os.stat(path).st_mode)
-    # It may be another one by now, and the open of a pipe without a writer would wait for ever.
+    # Checked again: it may have been replaced. O_NONBLOCK: opening a pipe without a writer would wait for ever.
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
         found = os.fstat(fd)

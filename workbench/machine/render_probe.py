@@ -24,26 +24,26 @@ SYSTEM_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libgthread-2.0.so.0": "libglib2.0-0",
 }
-"""Libraries that the wheels of sapien and opencv-python load and do not carry -> Debian's package."""
+"""Libraries that the wheels of sapien and opencv-python load but do not contain -> Debian's package."""
 
 
 @dataclass(frozen=True)
 class RenderProbe:
-    """What one look found."""
+    """Result of one probe."""
 
     ok: bool
     name: str | None = None
-    """The device, as Vulkan calls it: ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
+    """Device name from Vulkan: ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
     driver: str | None = None
-    """The driver and its version: ``llvmpipe, Mesa 25.0.7-2``."""
+    """Driver and version: ``llvmpipe, Mesa 25.0.7-2``."""
     error: str | None = None
-    """Why not, in a sentence; None when `ok`."""
+    """The reason in a sentence; None if `ok`."""
     env: Mapping[str, str] = field(default_factory=dict)
-    """Variables that a process must be started with to find this device; empty for a system driver."""
+    """Environment variables with which a process finds this device; empty for a system driver."""
     device: str | None = None
-    """What ``sapien.Device`` takes for it: ``cuda`` or ``cpu`` (any other Vulkan device)."""
+    """Argument of ``sapien.Device``: ``cuda``, or ``cpu`` for any other Vulkan device."""
     missing_libraries: tuple[str, ...] = ()
-    """Those of `SYSTEM_LIBRARIES` that cannot be loaded; not empty makes `ok` False."""
+    """Those of `SYSTEM_LIBRARIES` that cannot be loaded; with any, `ok` is False."""
 
 
 def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float = 60) -> RenderProbe:
@@ -53,8 +53,7 @@ def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float =
     kernel module crashes or hangs in native code. So the child builds a `sapien.render.RenderSystem` on the device that
     ManiSkill would ask for.
 
-    Never raises for what the child does: a crash, a hang of `timeout_s` or a missing library is an
-    answer with ``ok=False``.
+    A crash, a hang of `timeout_s` or a missing library of the child gives ``ok=False``, never an exception.
     """
     added = dict(env or {})
     try:
@@ -112,8 +111,7 @@ def _look() -> RenderProbe:
     import sapien.render
 
     refusals: list[str] = []
-    # CUDA first, as ManiSkill's "gpu" render backend; a process can have one render device, so the first
-    # that works ends the search.
+    # CUDA first, as ManiSkill's "gpu" render backend. A process can have one render device: the first that works.
     for device in ("cuda", "cpu"):
         try:
             system = sapien.render.RenderSystem(device)
@@ -128,7 +126,7 @@ def _look() -> RenderProbe:
 
 
 def _why(refusal: str) -> str:
-    """SAPIEN's refusal, with what a person can do about it where the environment is the reason."""
+    """SAPIEN's refusal, with advice if the environment names a driver."""
     for variable in DRIVER_VARIABLES:
         if os.environ.get(variable):
             return f"{refusal} (the environment has {variable}={os.environ[variable]}: unset it, or mend it)"

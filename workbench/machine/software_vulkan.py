@@ -36,12 +36,12 @@ from workbench.machine.user_folder import cache_folder
 
 
 def private_mesa_folder() -> Path:
-    """Where the packages are unpacked: a folder of the user's cache."""
+    """Folder of the user's cache where the packages are unpacked."""
     return cache_folder() / "mesa"
 
 
 def private_mesa_env() -> dict[str, str] | None:
-    """The variables that make a new process use what `unpack_private_mesa` left; None if there is nothing."""
+    """Variables with which a new process uses what `unpack_private_mesa` left; None if there is nothing."""
     return _env_of(private_mesa_folder())
 
 
@@ -55,15 +55,15 @@ def unpack_private_mesa(
     to the process that renders. Deleting the folder undoes all of it.
 
     Args:
-        package: the package that carries lavapipe.
-        extra_source: a deb822 source to read besides the machine's own, or None.
+        package: the package with lavapipe.
+        extra_source: a deb822 source in addition to the machine's, or None.
         choose: picks one of the versions on offer, None if none will do.
 
     Returns:
-        The variables that a process must be started with to render with it.
+        The variables with which a process renders with it.
 
     Raises:
-        AptFailed: nothing suitable on offer, or fetching or unpacking failed.
+        AptFailed: no suitable version is offered, or fetching or unpacking failed.
     """
     target = private_mesa_folder()
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ def unpack_private_mesa(
 
 
 def _private_apt(scratch: Path, extra_source: str | None) -> list[str]:
-    """apt options that keep lists and cache in `scratch` and read the machine's sources and one more."""
+    """apt options that keep lists and cache in `scratch`, with the machine's sources and `extra_source`."""
     for folder in ("lists/partial", "cache/archives/partial", "sources"):
         (scratch / folder).mkdir(parents=True)
     machine = Path("/etc/apt")
@@ -130,7 +130,7 @@ def _manifests(root: Path) -> list[Path]:
 
 
 def _point_manifests_into(root: Path) -> None:
-    """Debian's manifest names the driver by its path on the system, or by a bare name that the linker seeks."""
+    """Name the unpacked driver in the manifests; Debian's name a system path, or a bare library name."""
     for manifest in _manifests(root):
         content = json.loads(manifest.read_text())
         driver = Path(content["ICD"]["library_path"]).name
@@ -156,27 +156,27 @@ def _env_of(root: Path) -> dict[str, str] | None:
     }
 
 
-# --- Making sure that SAPIEN can render: a software Vulkan driver where there is no other -----
+# --- providing a render device ---------------------------------------------------------------------
 
 
 MESA = "mesa-vulkan-drivers"
 OLDEST_MESA = (24, 3)
-"""SAPIEN 3.0.3 refuses lavapipe 22.3 and renders on 25.0.7; 24.3 is the first with what it asks for."""
+"""SAPIEN 3.0.3 refuses lavapipe 22.3 and renders on 25.0.7; 24.3 is the first with what it needs."""
 BACKPORTS_FILE = Path("/etc/apt/sources.list.d/workbench-backports.sources")
 
 
 @dataclass(frozen=True)
 class MesaPlan:
-    """Where a Mesa that is new enough comes from."""
+    """Source of a Mesa that is new enough."""
 
     package: PackageVersion | None
-    """None if it is known only after `source_to_add` has been added and read."""
+    """None if it is known only after `source_to_add` has been read."""
     source_to_add: str | None = None
-    """A deb822 source, or None if apt knows a good version already."""
+    """A deb822 source, or None if apt already offers a good version."""
 
 
 def mesa_version(debian_version: str) -> tuple[int, int]:
-    """``25.0.7-2~bpo12+1`` -> (25, 0), an epoch left out; (0, 0) if it does not begin with numbers."""
+    """``25.0.7-2~bpo12+1`` -> (25, 0), without the epoch; (0, 0) if it does not start with numbers."""
     match = re.match(r"(?:\d+:)?(\d+)\.(\d+)", debian_version)
     return (int(match[1]), int(match[2])) if match else (0, 0)
 
@@ -187,7 +187,7 @@ def first_good_mesa(versions: list[PackageVersion]) -> PackageVersion | None:
 
 
 def plan_mesa() -> MesaPlan | None:
-    """How to come by Mesa 24.3 or newer on this machine; None where this distribution has no way."""
+    """Source of Mesa 24.3 or newer on this machine; None if the distribution has none."""
     good = first_good_mesa(available_versions(MESA))
     if good is not None:
         return MesaPlan(good)
@@ -203,8 +203,8 @@ def ensure_render_device(install: bool) -> RenderProbe:
     renders with `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
 
     Returns:
-        The last probe. Where ``ok``, start the process that renders with ``probe.env`` added. Where not,
-        ``error`` ends with what to do next.
+        The last probe. If ``ok``, start the process that renders with ``probe.env`` added; else ``error`` ends with what
+        to do next.
     """
     probe = probe_render_device()
     if probe.missing_libraries and install and can_install_packages():
@@ -215,13 +215,13 @@ def ensure_render_device(install: bool) -> RenderProbe:
         packages = " ".join(SYSTEM_LIBRARIES[library] for library in probe.missing_libraries)
         return _with_advice(probe, f"Type: sudo apt-get install {packages}")
     if any(os.environ.get(variable) for variable in DRIVER_VARIABLES):
-        # The person chose a driver. Another one, installed beside it, would not be looked at anyway.
+        # A driver was chosen: another one, even if installed, would not be used.
         return probe
     return _bring_mesa(probe, install)
 
 
 def use_private_driver() -> None:
-    """Let SAPIEN, in this process and in those that it starts, find the driver of a user who may not install one."""
+    """Let SAPIEN in this process and its children find a driver that was unpacked for this user."""
     os.environ.update(ensure_render_device(install=False).env)
 
 
@@ -274,7 +274,7 @@ def _install_mesa(probe: RenderProbe) -> RenderProbe:
 
 
 def backports_of_this_machine() -> str | None:
-    """The backports source that Debian's machines may need, None elsewhere."""
+    """The backports source that a Debian machine may need; None on others."""
     release = os_release()
     if release.get("ID") != "debian":
         return None
@@ -301,7 +301,7 @@ def _command_to_type() -> str:
 
 
 def main() -> None:
-    """Bring a render device if there is none; ``--export`` prints shell lines for the variables it needs."""
+    """Provide a render device if there is none; ``--export`` prints only shell lines for its variables."""
     probe = ensure_render_device(install=True)
     if probe.ok:
         if "--export" not in sys.argv[1:]:

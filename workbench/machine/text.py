@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _UNITS = (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4), ("µm", 1e-6, 1e-6), ("nm", 1e-9, 0.0))
-"""Name, size, and from where on it is used."""
+"""Name, size, and the least length for which it is used."""
 
 
 def number_text(value: float, form: str = ".4g") -> str:
@@ -26,7 +26,7 @@ def number_text(value: float, form: str = ".4g") -> str:
 
 
 def nonfinite_text(values: ArrayLike) -> str:
-    """How many of these are no finite numbers: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
+    """Counts of values that are not finite: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
     flat = np.asarray(values).reshape(-1)
     counts = {"NaN": int(np.isnan(flat).sum()), "infinite": int(np.isinf(flat).sum())}
     told = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
@@ -34,7 +34,7 @@ def nonfinite_text(values: ArrayLike) -> str:
 
 
 def mean_text(values: ArrayLike, say: Callable[[float], str] = number_text) -> str:
-    """The mean of those that are finite, and how many are not: ``0.25, NaN in 3 of 16``."""
+    """Mean of the finite values, and counts of the others: ``0.25, NaN in 3 of 16``."""
     flat = np.asarray(values, np.float64).reshape(-1)
     finite = flat[np.isfinite(flat)]
     return ", ".join(
@@ -43,7 +43,7 @@ def mean_text(values: ArrayLike, say: Callable[[float], str] = number_text) -> s
 
 
 def length(metres: float) -> str:
-    """As a person says it: ``3.2 cm``, ``0.4 mm``, ``70 nm``, ``0``."""
+    """A length as text: ``3.2 cm``, ``0.4 mm``, ``70 nm``, ``0``."""
     if metres == 0:
         return "0"
     if not math.isfinite(metres):
@@ -52,18 +52,18 @@ def length(metres: float) -> str:
     return f"{metres / size:.2g} {unit}"
 
 
-# --- Text that comes from elsewhere, made harmless for a terminal and a page: controls are shown, colours are kept ---
+# --- text from elsewhere, made safe for a terminal and a page: controls are escaped, colours kept -----
 
 
 _SHOWN = re.compile(
     "[\x00-\x1f\x7f-\x9f"  # C0, DEL and C1, which some terminals take for ESC and a letter
     "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # the direction of writing
     "\u2028\u2029"  # line ends, to some programs
-    "\u200b\u2060\ufeff\U000e0000-\U000e007f"  # seen by nobody
+    "\u200b\u2060\ufeff\U000e0000-\U000e007f"  # invisible
     "\ud800-\udfff]"  # bytes of a file's name that are not UTF-8: they cannot be printed
 )
 COLOURS = re.compile("\x1b\\[([0-9;:]{0,64})m")
-"""What changes them, and with which numbers."""
+"""A colour sequence, and its numbers."""
 HARMLESS = frozenset((0, 1, 2, 3, 4, 7, 9, 22, 23, 24, 27, 29, *range(30, 50), *range(90, 108)))
 """Codes of colours and styles that hide nothing and do not blink."""
 
@@ -82,14 +82,14 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def short_line(text: str, longest: int) -> str:
-    """`text` on one line of about `longest` characters, as in `plain_text`; what is too long lacks its middle."""
+    """`text` on one line of about `longest` characters, as `plain_text`; a longer one loses its middle."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
     return plain_text(text)
 
 
 def only_colours(text: str, keep: str = "\n\t") -> str:
-    """`text` with its colours as they are and all else as in `plain_text`."""
+    """`text` as `plain_text`, but with its colours."""
     if not _SHOWN.search(text):
         return text
     parts: list[str] = []
@@ -104,12 +104,12 @@ def only_colours(text: str, keep: str = "\n\t") -> str:
 
 
 def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
-    """The codes, each with what belongs to it: (31,), (38, 5, 208), (48, 2, 0, 0, 0)."""
+    """The codes, each with its arguments: (31,), (38, 5, 208), (48, 2, 0, 0, 0)."""
     parts = iter(numbers.split(";"))
     for part in parts:
         if ":" in part:
             values = [int(value) if value else 0 for value in part.split(":")]
-            # 38:2:SPACE:r:g:b and the 38:2:r:g:b that many write.
+            # 38:2:SPACE:r:g:b, and the common 38:2:r:g:b.
             if values[0] in (38, 48) and len(values) > 5 and values[1] == 2:
                 del values[2]
             yield tuple(values)
@@ -125,7 +125,7 @@ def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
 
 
 class SafeStream:
-    """A text stream that lets nothing through but text and its colours."""
+    """A text stream that passes only text and its colours."""
 
     def __init__(self, raw: Any) -> None:
         self.raw = raw
@@ -143,22 +143,21 @@ class SafeStream:
 
 
 def guard_terminal() -> None:
-    """From now on nothing that this process prints does more to a terminal than show text in colours.
+    """Let this process print only text and colours to its terminal.
 
-    For good, since the traceback of what ends the process is printed last of all. What a program of its own writes to
-    the terminal, and native code, does not come by here.
+    For good, since a traceback that ends the process is printed last. Does not cover native code and other programs.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is not None and not isinstance(stream, SafeStream):
             setattr(sys, name, SafeStream(stream))
-    # Where nobody sets up logging, as here, all records go through this one.
+    # Without a logging set-up all records go through this handler.
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_OneLine())
 
 
 class _OneLine(logging.Formatter):
-    """A record of a logger is one line, whatever names are in it, and its traceback behind it."""
+    """Formats a log record as one line, followed by its traceback."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return plain_text(super().formatMessage(record))

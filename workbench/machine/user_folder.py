@@ -17,11 +17,11 @@ MOST_BYTES = 16 << 20
 
 
 class NoUserFolder(OSError):
-    """There is no such folder, or it cannot be relied on; the message is the end of a sentence."""
+    """The folder is missing or not private; the message is the end of a sentence."""
 
 
 def user_folder() -> Path:
-    """Where it is, such as ``~/.config/workbench``; it may be missing.
+    """Path of the configuration folder, such as ``~/.config/workbench``; it may not exist.
 
     Raises:
         NoUserFolder: this user has no home folder.
@@ -31,18 +31,18 @@ def user_folder() -> Path:
     except RuntimeError as error:
         raise NoUserFolder(f"this user has no home folder ({error})") from error
     if not folder.is_absolute():
-        # Below the current folder, which may be a downloaded one: earlier versions of platformdirs answer so.
+        # Earlier versions of platformdirs return a path below the current folder, which may be a downloaded one.
         raise NoUserFolder(f"the configuration folder has no absolute path ({folder})")
     return folder
 
 
 def cache_folder() -> Path:
-    """Where files of ours lie that can be had again, such as ``~/.cache/workbench``; it may be missing."""
+    """Folder for files that can be made again, such as ``~/.cache/workbench``; it may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "workbench"
 
 
 def read_private(name: str) -> bytes | None:
-    """The content of a file of the folder; None where there is none.
+    """The content of a file of the folder; None if it does not exist.
 
     Raises:
         NoUserFolder: the folder or the file belongs to another user, or others may write to it.
@@ -58,7 +58,7 @@ def read_private(name: str) -> bytes | None:
         _check_private(path, status := os.fstat(descriptor))
         if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
             raise NoUserFolder(f"{path} is no ordinary file of at most {MOST_BYTES >> 20} MB")
-        # Not before: of a folder it raises, and leaves the descriptor open.
+        # After the checks: for a folder fdopen raises, and leaves the descriptor open.
         with os.fdopen(descriptor, "rb", closefd=False) as file:
             return file.read(MOST_BYTES)
     finally:
@@ -66,10 +66,10 @@ def read_private(name: str) -> bytes | None:
 
 
 def write_private(name: str, content: bytes) -> None:
-    """Let a file of the folder hold `content`, readable by this user alone; the folder is made if missing.
+    """Write a file of the folder, readable by this user alone; makes the folder if it is missing.
 
     Raises:
-        OSError: it cannot be written; the file is as it was.
+        OSError: it cannot be written; the file is unchanged.
     """
     path = _made() / name
     with written_beside(path, content, 0o600) as temporary:
@@ -77,7 +77,7 @@ def write_private(name: str, content: bytes) -> None:
 
 
 def create_private(name: str, content: bytes) -> bool:
-    """The same for a file that must not be there yet; False, and nothing done, if it is.
+    """As `write_private` for a new file; returns False, and changes nothing, if it exists.
 
     Raises:
         OSError: it cannot be written.
@@ -86,10 +86,10 @@ def create_private(name: str, content: bytes) -> bool:
 
 
 def set_aside(name: str) -> Path:
-    """Rename a file of the folder that is broken; returns its new place.
+    """Rename a broken file of the folder; returns its new path.
 
     Raises:
-        OSError: it cannot be done.
+        OSError: it cannot be renamed.
     """
     path = user_folder() / name
     broken = path.with_name(f"{name}.broken")
@@ -99,10 +99,10 @@ def set_aside(name: str) -> Path:
 
 @contextmanager
 def locked(name: str) -> Iterator[None]:
-    """Meanwhile no other process or thread is here with this name.
+    """Hold a lock of this name against other processes and threads.
 
     Raises:
-        OSError: the lock cannot be made.
+        OSError: the lock file cannot be made.
     """
     descriptor = os.open(_made() / f"{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -121,7 +121,7 @@ def _made() -> Path:
 
 
 def _check_private(path: Path, status: os.stat_result) -> None:
-    """What another user can write could say that anything is trusted."""
+    """Raise if another user can write there: the trust store must be the user's own."""
     if os.geteuid() != 0 and status.st_uid not in (os.geteuid(), 0):
         raise NoUserFolder(f"{path} belongs to another user")
     if status.st_mode & 0o022:

@@ -200,8 +200,8 @@ def test_states_that_are_given_go_where_set_state_puts_them_and_observations_as_
         ([0, -4], ValueError, "names an env twice"),
         ([4], IndexError, "out of range for 4 envs"),
         ([-5], IndexError, "out of range for 4 envs"),
-        (torch.tensor([True, False, True, False]), TypeError, "of a mask"),
-        ([0.5], TypeError, "whole numbers"),
+        (torch.tensor([True, False, True, False]), TypeError, "convert a mask"),
+        ([0.5], TypeError, "must be integers"),
     ],
 )
 def test_what_is_no_list_of_different_envs_is_refused_and_changes_nothing(

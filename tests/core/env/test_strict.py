@@ -278,7 +278,9 @@ def test_an_apply_of_what_was_fetched_before_the_step_is_refused() -> None:
         self.scene._gpu_fetch_all()
         move(self)
 
-    caught = breaks(pick_cube(_after_control_step=move), "puts '.*', and whatever else moved, back to before")
+    caught = breaks(
+        pick_cube(_after_control_step=move), "puts '.*', and everything else that moved, back to before"
+    )
     assert "# the fault" in told_at(caught)
     run(pick_cube(_after_control_step=fetch_and_move)).close()
 

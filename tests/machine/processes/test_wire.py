@@ -234,8 +234,8 @@ def array(name: str, shape: tuple[int, ...], code: int = 1) -> msgspec.msgpack.E
     ("sent", "says"),
     [
         (b"", "unpack"),
-        (b"hello", "longer than it is"),
-        (pickle.dumps(Loading("x")), "longer than it is"),
+        (b"hello", "exceeds the data"),
+        (pickle.dumps(Loading("x")), "exceeds the data"),
         (framed(("Loading", None, {"activity": 3})), "Expected `str`, got `int`"),
         (framed(("Loading", None, {})), "missing required field `activity`"),
         (framed(("dict", None, {"a": 1})), "it was a dict, which is no message"),

@@ -40,7 +40,7 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class LookAt:
-    """A camera said as "from here, look there"."""
+    """A camera pose as eye, target and roll."""
 
     eye: tuple[float, float, float]
     """Metres."""
@@ -56,10 +56,10 @@ class LookAt:
 
 
 def normalised(quaternion: ArrayLike) -> Floats:
-    """(4,) wxyz of unit length with w >= 0: q and -q are one rotation, and one of them must be compared.
+    """(4,) wxyz of unit length with w >= 0, so that q and -q compare equal.
 
     Raises:
-        ValueError: it has no direction (all zero, not finite), and so says no rotation.
+        ValueError: it is no rotation (all zero, or not finite).
     """
     q = _vector(quaternion, 4, "a quaternion")
     # Divided by the largest first: the squares of tiny numbers are zero.
@@ -78,16 +78,16 @@ def rotation_matrix(quaternion: ArrayLike) -> Floats:
 
 
 def quaternion_of(rotation: ArrayLike) -> Floats:
-    """(4,) wxyz of a rotation matrix (3, 3); of the nearest rotation, if it is a little off.
+    """(4,) wxyz of the rotation nearest to a matrix (3, 3).
 
     Raises:
-        ValueError: the matrix is no rotation; says what is wrong with it.
+        ValueError: the matrix is no rotation, and why.
     """
     return normalised(mat2quat(nearest_rotation(rotation)))
 
 
 def nearest_rotation(matrix: ArrayLike) -> Floats:
-    """(3, 3) the rotation nearest to a matrix that was meant to be one.
+    """(3, 3) the rotation nearest to a matrix.
 
     Raises:
         ValueError: it is farther from any rotation than `ROTATION_TOLERANCE`: a mirror image, scaled, skewed,
@@ -153,8 +153,8 @@ def rpy_of(quaternion: ArrayLike) -> tuple[float, float, float]:
     """Roll, pitch and yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll).
 
     URDF's and ROS's fixed-axis convention, transforms3d's ``sxyz``. For a camera in ManiSkill's frame: yaw turns
-    it to the left, a positive pitch looks down, roll turns it clockwise as seen from behind. Looking straight down
-    or up roll and yaw are one rotation; all of it is then said as yaw.
+    it to the left, a positive pitch looks down, roll turns it clockwise as seen from behind. Straight down or up, roll
+    and yaw are one rotation, and all of it is given as yaw.
     """
     r = rotation_matrix(quaternion)
     flat = math.hypot(r[0, 0], r[1, 0])
@@ -167,7 +167,7 @@ def rpy_of(quaternion: ArrayLike) -> tuple[float, float, float]:
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
-    """(4,) wxyz of roll, pitch and yaw in degrees; see `rpy_of` for what they mean."""
+    """(4,) wxyz of roll, pitch and yaw in degrees, as in `rpy_of`."""
     return normalised(euler2quat(*np.radians(_vector([roll, pitch, yaw], 3, "roll, pitch and yaw"))))
 
 
@@ -180,12 +180,12 @@ def pose_of(settings: CameraSettings) -> Floats:
 
 
 def pose_in_env(settings: CameraSettings, mount: ArrayLike | None) -> Floats:
-    """(7,) in the env's frame; `mount` (7,) is where the body is that it rides on, None for one that stands still."""
+    """(7,) in the env's frame; `mount` (7,) is the pose of the body that carries it, None without one."""
     return pose_of(settings) if mount is None else compose(mount, pose_of(settings))
 
 
 def with_pose(settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
-    """The same camera at another pose (7,), said in the frame of its mount."""
+    """The same camera at another pose (7,) in the frame of its mount."""
     p = _vector(pose, 7, "a pose")
     qw, qx, qy, qz = map(float, normalised(p[3:]))
     return replace(settings, position=triple(p[:3]), quaternion=(qw, qx, qy, qz))
@@ -197,32 +197,30 @@ def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
 
 
 def target_of(settings: CameraSettings) -> Floats:
-    """(3,) the point that a camera looks at, in the frame of its mount: a metre ahead where it names none."""
+    """(3,) the target of a camera, in the frame of its mount; one metre ahead if it has none."""
     return settings.position + (settings.distance or 1.0) * axes_of(settings.quaternion)[0]
 
 
 def inverse(pose: ArrayLike) -> Floats:
-    """(7,) the pose that undoes this one: world to camera of camera to world."""
+    """(7,) the inverse pose: world to camera of camera to world."""
     p = _vector(pose, 7, "a pose")
     return make_pose(-rotation_matrix(p[3:]).T @ p[:3], qconjugate(p[3:]))
 
 
 def compose(mount: ArrayLike, local: ArrayLike) -> Floats:
-    """(7,) in the env's frame: the pose `local`, which is said in the frame of a body that stands at `mount`."""
+    """(7,) `local`, a pose in the frame of a body at `mount`, in the env's frame."""
     m, p = _vector(mount, 7, "a mount's pose"), _vector(local, 7, "a pose")
     r = rotation_matrix(m[3:])
     return make_pose(m[:3] + r @ p[:3], qmult(normalised(m[3:]), normalised(p[3:])))
 
 
 def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
-    """(7,) in the frame of a body that stands at `mount`: the pose `world`, which is said in the env's frame."""
+    """(7,) `world`, a pose in the env's frame, in the frame of a body at `mount`."""
     return compose(inverse(mount), world)
 
 
 def pose_from_look_at(look_at: LookAt) -> Floats:
-    """(7,) of "from here, look there"; right also straight down and up.
-
-    ManiSkill's own ``look_at`` gives a quaternion that is not of unit length there; everywhere else this is its pose.
+    """(7,) of eye, target and roll. Equals ManiSkill's ``look_at``, whose quaternion straight down and up is not of unit length.
 
     Raises:
         ValueError: eye and target are one point.
@@ -236,13 +234,13 @@ def pose_from_look_at(look_at: LookAt) -> Floats:
 
 
 def look_at_of(pose: ArrayLike, distance: float = 1.0) -> LookAt:
-    """Eye, target and roll of a pose (7,); the target is put `distance` metres in front of the eye."""
+    """Eye, target and roll of a pose (7,), with the target `distance` metres ahead of the eye."""
     if not distance > 0:
         raise ValueError(f"the target must lie in front of the camera, not {distance} m")
     p = _vector(pose, 7, "a pose")
     r = rotation_matrix(p[3:])
     target = p[:3] + distance * r[:, 0]
-    # The direction that the way back will see: next to the vertical its last digits decide what upright means.
+    # As `pose_from_look_at` computes it: near the vertical the last digits decide what upright means.
     forward = _direction(target - p[:3], "forward")
     turned = upright(forward).T @ r
     return LookAt(triple(p[:3]), triple(target), math.atan2(turned[2, 1], turned[1, 1]))
@@ -276,7 +274,7 @@ def matrix_of(pose: ArrayLike, convention: Convention, direction: Direction) -> 
 
 
 def pose_from_matrix(matrix: ArrayLike, convention: Convention, direction: Direction) -> Floats:
-    """(7,) of a matrix (4, 4) or (3, 4) that is said in this convention and direction.
+    """(7,) of a matrix (4, 4) or (3, 4) in this convention and direction.
 
     Raises:
         ValueError: it is of another shape, its last row is not 0 0 0 1, or its 3 x 3 part is no rotation.
@@ -327,10 +325,10 @@ def intrinsic_from_fov(fov: float, width: int, height: int) -> Floats:
 
 
 def intrinsic_of(settings: CameraSettings) -> Floats:
-    """(3, 3) in pixels, whichever way the settings say it.
+    """(3, 3) in pixels, from the intrinsic or the fov of the settings.
 
     Raises:
-        ValueError: they say neither a fov nor an intrinsic, or one that no lens has.
+        ValueError: they have neither, or an impossible one.
     """
     if settings.intrinsic is not None:
         return checked_intrinsic(settings.intrinsic)
@@ -343,8 +341,8 @@ def checked_intrinsic(matrix: ArrayLike) -> Floats:
     """(3, 3) an intrinsic matrix that ManiSkill can render.
 
     Raises:
-        ValueError: it is no pinhole's: of another shape, focal lengths that are not positive, another last row, or
-            with a skew, which ManiSkill leaves out without a word.
+        ValueError: it is no pinhole's: another shape or last row, focal lengths that are not positive, or a skew, which
+            ManiSkill silently ignores.
     """
     k = np.asarray(matrix, np.float64)
     if k.shape != (3, 3) or not np.isfinite(k).all():

@@ -27,7 +27,7 @@ class _PlacedCamera:
     config: Any
     """The task's own."""
     poses: list[sapien.Pose]
-    """Where the components of the envs stood before: the task's code may have moved them."""
+    """Local poses of the envs' components before: the task's code may have moved them."""
     settings: CameraSettings
 
 
@@ -45,29 +45,29 @@ class PlacedCameras:
         self._placed: dict[CameraKey, _PlacedCamera] = {}
 
     def forget(self) -> None:
-        """The cameras that were placed are gone, with their env or without it."""
+        """Drop all placements without changing the env."""
         self._placed.clear()
 
     def settings(self, key: CameraKey) -> CameraSettings | None:
-        """As a camera was placed; None where the task has it as it likes."""
+        """Of a placed camera; None if it is as the task has it."""
         placed = self._placed.get(key)
         return None if placed is None else placed.settings
 
     def place(self, env: Any, key: CameraKey, settings: CameraSettings | None) -> bool:
         """Place a camera in all envs; None puts it back where the task had it.
 
-        No picture may be under way.
+        No picture may be pending.
 
         Returns:
-            Whether its pictures are of another shape, or have other modalities, than before.
+            Whether the shape or the modalities of its pictures changed.
 
         Raises:
-            ValueError: there is no such camera, or it cannot be placed; nothing was changed.
+            ValueError: there is no such camera, or it cannot be placed; nothing has changed.
         """
         camera = _camera(env, key)
         known = self._placed.get(key)
         if known is not None and known.camera is not camera:
-            known = None  # the scene was built anew
+            known = None  # the scene was rebuilt
         if settings is None:
             self._placed.pop(key, None)
             return known is not None and _set(env, key, camera, known.config, known.poses)
@@ -82,7 +82,7 @@ class PlacedCameras:
         return changed
 
     def put_back(self, env: Any) -> None:
-        """Place cameras again that were made anew, by a reset that built the scene anew or a failed exchange."""
+        """Place cameras again after a reset that rebuilt the scene or a failed exchange."""
         for key, placed in list(self._placed.items()):
             camera = maniskill_private.cameras(env).get(key)
             if camera is None:
@@ -174,10 +174,10 @@ def _of_env(value: Any, env_index: int) -> float:
 
 
 def settings_of(config: Any) -> CameraSettings | None:
-    """A ``CameraConfig`` as plain numbers; of the first env where poses differ.
+    """A ``CameraConfig`` as plain numbers, of the first env where poses differ.
 
-    A quaternion that is not of unit length (``look_at`` straight down gives one) is made so. Its distance is that of the
-    target where ``look_at`` made its pose. None where it cannot be said: a lens, near or far that differs between envs, or a pose that is none.
+    The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance` is that of the
+    target if ``look_at`` made the pose. None if a lens, near or far differs between envs, or the pose is invalid.
     """
     pose = rows_of_pose(config)[0].astype(np.float64)
     length = float(np.linalg.norm(pose[3:]))
@@ -214,7 +214,7 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 def _one(value: Any, *shape: int) -> Any:
-    """The number, or the matrix of this shape, that it is, or that all of its are; None where they differ."""
+    """The number, or matrix of this shape, that all envs share; None where they differ."""
     numbers = np.zeros(0) if value is None else _numbers(value)
     if not numbers.size or numbers.shape[numbers.ndim - len(shape) :] != shape:
         return None

@@ -28,13 +28,13 @@ _INT16_END = 32.767
 
 KINDS: tuple[CameraKind, ...] = ("sensor", "human")
 Request = tuple[str, CameraKind, Sequence[str]]
-"""Name, kind and modalities of a camera whose picture is wanted."""
+"""Name, kind and modalities of a requested picture."""
 
 
 def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
     """All cameras of a ManiSkill env: its sensors (the robot's too), then its human render cameras.
 
-    Empty where nothing can be rendered. Sensors that are no plain cameras are left out.
+    Empty without a render device. Sensors that are no plain cameras are left out.
     """
     infos = []
     for (kind, name), camera in cameras_of(env).items():
@@ -88,8 +88,8 @@ def take_pictures(
 
     Args:
         poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
-            tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a moment of the past can be looked at while the simulation is
-            elsewhere. A camera rides along with the body that it is mounted on; colours and lights are today's.
+            tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a past moment can be
+            rendered without changing the simulation. A camera moves with its mount; colours and lights are today's.
 
     Raises:
         IndexError: there is no such env.
@@ -106,7 +106,7 @@ def take_pictures(
 
 @dataclass(frozen=True)
 class PendingPictures:
-    """Pictures that the renderer is at work on; see `begin_pictures`."""
+    """Pictures that the renderer is drawing; see `begin_pictures`."""
 
     _taken: tuple[tuple[Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
 
@@ -118,12 +118,12 @@ class PendingPictures:
 def begin_pictures(
     env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
 ) -> PendingPictures:
-    """Set the renderer to work on the cameras asked for, and return at once.
+    """Start rendering the requested cameras, and return at once.
 
     SAPIEN hands a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
     threads of a software driver, draw while the simulation steps on (measured on two cores with
-    lavapipe: 26 control steps of 16 envs in 151 ms beside a picture that takes 51 ms alone). The scene is
-    drawn as it is now; it must not be closed, or shown to another camera, before `finish`.
+    lavapipe: 26 control steps of 16 envs in 151 ms during a picture that takes 51 ms alone). The scene is
+    drawn as it is now; do not close it or render another camera before `finish`.
 
     Args:
         requests: all of one kind, since sensors and human cameras see different objects.
@@ -165,7 +165,7 @@ def begin_pictures(
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
-    """Which entities of an env to draw elsewhere than they are; ask before anything is shown or hidden.
+    """Entities of an env to draw elsewhere than they are; call it before objects are shown or hidden.
 
     Args:
         poses: as in `take_pictures`.
@@ -178,7 +178,7 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
 
 
 def cameras_of(env: Any) -> dict[CameraKey, Any]:
-    """The plain ones."""
+    """The plain cameras of an env."""
     return {
         key: camera
         for key, camera in maniskill_private.cameras(env).items()
@@ -305,7 +305,7 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
 
 
 def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
-    """Which pictures of a task an episode keeps: of a sensor what a policy may see, of a human camera colour."""
+    """The pictures that an episode keeps: rgb, depth and segmentation of a sensor, rgb of a human camera."""
     asked = []
     for camera in cameras:
         wanted = ("rgb", "depth", "segmentation") if camera.kind == "sensor" else ("rgb",)

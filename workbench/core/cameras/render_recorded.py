@@ -62,7 +62,7 @@ class RecordedScene:
         """What is seen: (H, W, 3).
 
         Args:
-            poses: (B, 7) of the bodies, position and wxyz; a body with NaN is not there.
+            poses: (B, 7) of the bodies, position and wxyz; NaN for an absent body.
             eye: (7,) of the camera, x forward, y left, z up.
         """
         for body, entity in self._bodies.items():
@@ -105,5 +105,5 @@ def _material(material: Material) -> sapien.render.RenderMaterial:
 
 
 def _levels(pixels: NDArray[np.uint8]) -> int:
-    """Smaller and smaller copies down to some pixels: without them a wooden table in the distance is all noise."""
+    """Mipmap levels, down to some pixels: without them a distant wooden table is noise."""
     return max(1, int(np.log2(min(pixels.shape[:2]))) - 2)

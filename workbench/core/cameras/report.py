@@ -13,29 +13,28 @@ from workbench.core.camera_data import CameraKey, CameraKind, CameraSettings, Pi
 from workbench.core.cameras.conventions import intrinsic_of
 
 DEPTH_EDGES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
-"""Metres, (41,). Ten bins a decade, and the same for every camera, so that histograms can be laid over each other;
-what is nearer or farther than all of them is counted in the first or the last bin."""
+"""Metres, (41,). Ten bins a decade, the same for every camera, so that histograms can be compared; values outside count
+in the first or last bin."""
 ENOUGH_PIXELS = 100.0
-"""From here on an object does not count as small: a cube of ten by ten pixels still shows which way it is turned."""
+"""An object of fewer pixels counts as small: a cube of ten by ten still shows its rotation."""
 
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """One object that a camera may be asked to see: of the task, or a robot, of which single links can be asked for."""
+    """One object that a search can ask for: of the task, or a robot, whose single links can be asked for."""
 
     name: str
     """An actor's or an articulation's."""
     hidden: bool
-    """The task hides it from the sensors (a goal marker): only cameras for people see it."""
+    """The task hides it from the sensors (a goal marker): only human cameras see it."""
     links: tuple[str, ...] = ()
-    """Names of an articulation's bodies, if it has several: each may be asked for alone. Of a robot those that can be
-    seen, its hand first."""
+    """Names of an articulation's bodies, if it has several. Of a robot those that are drawn, its hand first."""
     robot: bool = False
 
 
 @dataclass(frozen=True)
 class ObjectSummary:
-    """One object over all envs that have it; shares are 0..1, and NaN where there is nothing to share out."""
+    """One object over all envs that have it; shares are 0..1, NaN where undefined."""
 
     present: int
     """Envs that have the object."""
@@ -45,11 +44,11 @@ class ObjectSummary:
     cut: float
     """Share of them in which the border of the picture cuts it."""
     hidden: float
-    """How much of it the robot covers, on average over the envs where it would be seen without the robot."""
+    """Share of it that the robot covers, averaged over the envs where it would be seen without the robot."""
     wholly_hidden: float
-    """Share of the envs that have it in which nothing but the robot keeps it from being seen."""
+    """Share of the envs that have it in which only the robot hides it."""
     covered: float
-    """How much of it other things than the robot cover, on average over the envs where it is in the picture."""
+    """Share of it that other things than the robot cover, averaged over the envs where it is in the picture."""
 
 
 @dataclass(frozen=True)
@@ -59,37 +58,37 @@ class ObjectSeen:
     name: str
     """An actor's or an articulation's."""
     never_drawn: bool
-    """The task hides it from this kind of camera (a goal marker from the sensors): it is not to be seen."""
+    """The task hides it from this kind of camera (a goal marker from the sensors)."""
     scenery: bool
-    """Part of the room (a table, a static body): nothing that a policy has to find."""
+    """Part of the room (a table, a static body), which a policy need not find."""
     present: NDArray[np.bool_]
     """(E,) whether the env has it at all."""
     pixels: NDArray[np.float32]
-    """(E,) seen, in pixels of the camera's own size, also where smaller pictures were judged."""
+    """(E,) visible pixels, at the camera's own size, even if smaller pictures were measured."""
     unhindered: NDArray[np.float32]
-    """(E,) what they would be if the robot were not drawn."""
+    """(E,) pixels without the robot."""
     alone: NDArray[np.float32]
-    """(E,) what they would be if nothing else were drawn; `unhindered` for scenery, of which that is not asked."""
+    """(E,) pixels with nothing else drawn; `unhindered` for scenery, which is not measured alone."""
     cut: NDArray[np.bool_]
-    """(E,) it reaches the border of the picture, seen alone."""
+    """(E,) whether it reaches the border of the picture, drawn alone."""
     margin: NDArray[np.float32]
     """(E,) from it to the nearest border, as a share of the picture's shorter side; 0 where it is cut or not seen."""
 
     @property
     def hidden_share(self) -> NDArray[np.float32]:
-        """(E,) how much of it the robot covers; NaN where it would not be seen without the robot either."""
+        """(E,) share that the robot covers; NaN where it would not be seen without the robot either."""
         return _share_lost(self.pixels, self.unhindered)
 
     @property
     def covered_share(self) -> NDArray[np.float32]:
-        """(E,) how much of it other things than the robot cover; NaN where it is out of the picture."""
+        """(E,) share that other things than the robot cover; NaN where it is out of the picture."""
         return _share_lost(self.unhindered, self.alone)
 
     def marks(self) -> NDArray[np.float32]:
-        """(E,) 0 where it is not seen, 1 where it is whole, in the open and large enough; NaN where it is absent.
+        """(E,) mark from 0 (not seen) to 1 (whole, uncovered and large enough); NaN where it is absent.
 
-        The product of what is left to see: the share that nothing covers, half where the border cuts it, and
-        for small objects the square root of their pixels (a length: twice as far away is half as good).
+        Product of the share that nothing covers, one half if the border cuts it, and for small objects the square root of
+        their pixels (a length: twice as far away is half as good).
         """
         size = np.sqrt(np.clip(self.alone / ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
@@ -115,54 +114,54 @@ class ObjectSeen:
 
 @dataclass(frozen=True)
 class DepthReport:
-    """How far away is what the camera sees, robot and all."""
+    """Depth of all that the camera sees, the robot included."""
 
     counts: NDArray[np.int64]
-    """(E, 40) pixels of the judged pictures between `DEPTH_EDGES`; background is not among them."""
+    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES`, without background."""
     background: NDArray[np.float32]
-    """(E,) share of the picture in which a ray meets nothing, which is a depth of 0."""
+    """(E,) share of the picture where a ray meets nothing (depth 0)."""
     beyond: NDArray[np.float32]
-    """(E,) share that lies farther away than everything that counts (robot and objects): far floor and walls."""
+    """(E,) share farther away than robot and objects: far floor and walls."""
     nearest: NDArray[np.float32]
     """(E,) metres; NaN where the picture is all background."""
     farthest_object: NDArray[np.float32]
-    """(E,) metres, of robot and objects that are no scenery; NaN where none of them is seen."""
+    """(E,) metres, of robot and objects without scenery; NaN where none is seen."""
 
     @property
     def suggested_near(self) -> float | None:
-        """Metres: half of the nearest that was ever seen, rounded down. None where nothing was seen."""
+        """Metres: half of the nearest depth seen, rounded down. None if nothing was seen."""
         nearest = _least(self.nearest)
         return None if nearest is None else _rounded(nearest / 2, up=False)
 
     @property
     def suggested_far(self) -> float | None:
-        """Metres: half as far again as the farthest object ever seen, rounded up; what is behind turns background."""
+        """Metres: 1.5 times the farthest object seen, rounded up; what is behind becomes background."""
         farthest = _least(-self.farthest_object)
         return None if farthest is None else _rounded(-farthest * 1.5, up=True)
 
 
 @dataclass(frozen=True)
 class CameraReport:
-    """One camera, or a placement that is only thought of, judged in E envs."""
+    """What one camera, or a placement that does not exist yet, sees in E envs."""
 
     camera: CameraKey
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
     measured_size: tuple[int, int]
-    """Of the pictures that were judged. Where they are smaller, what is less than a pixel in them is not seen."""
+    """Of the measured pictures. In smaller ones, what is less than a pixel is not seen."""
     envs: tuple[int, ...]
     """(E,) an env may come several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
     depth: DepthReport
     pictures: int
-    """Rendered for it."""
+    """Number rendered."""
     milliseconds: float
 
     def env_marks(self, wanted: Collection[str] | None = None) -> NDArray[np.float32]:
-        """(E,) the mark of the worst object in each env; see `ObjectSeen.marks`. NaN where none is to be seen.
+        """(E,) the mark of the worst object in each env; see `ObjectSeen.marks`. NaN without objects.
 
         Args:
-            wanted: names of the objects that must be seen; None for all that are drawn and no scenery.
+            wanted: names of the objects that must be seen; None for all that are drawn, without scenery.
 
         Raises:
             ValueError: there is no such object.
@@ -180,7 +179,7 @@ class CameraReport:
         )
 
     def wanted_objects(self, wanted: Collection[str] | None = None) -> tuple[ObjectSeen, ...]:
-        """The objects of these names; None for all that are drawn and no scenery."""
+        """The objects of these names; None for all that are drawn, without scenery."""
         if wanted is None:
             return tuple(thing for thing in self.objects if not (thing.never_drawn or thing.scenery))
         unknown = sorted(set(wanted) - {thing.name for thing in self.objects})
@@ -192,7 +191,7 @@ class CameraReport:
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """What is looked for, and where."""
+    """Objects, box and lens of a search for placements."""
 
     objects: tuple[str, ...]
     """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
@@ -200,20 +199,20 @@ class SearchSpace:
     """Of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
     high: tuple[float, float, float]
     lens: CameraSettings
-    """Everything of the camera but its pose; of that, where it is mounted, which way its picture is up."""
+    """The camera without its pose; on a mount, the pose gives which way the picture is up."""
     kind: CameraKind = "sensor"
     candidates: int = 100
     """Placements that the first round draws."""
     best: int = 5
     """Placements that are offered at most."""
     apart: float | None = None
-    """Metres between the eyes of two that are offered; None for a seventh of the box's diagonal."""
+    """Least distance between two offered eyes, metres; None for a seventh of the box's diagonal."""
     seed: int = 0
     mount: str | None = None
     """Name of the body that the camera rides on."""
 
     def check(self) -> None:
-        """Raises ValueError where nothing can be looked for like that."""
+        """Raises ValueError for a space that cannot be searched."""
         box = np.array([self.low, self.high], np.float64)
         if not np.isfinite(box).all() or (box[0] > box[1]).any():
             raise ValueError(
@@ -228,29 +227,29 @@ class SearchSpace:
 
 @dataclass(frozen=True)
 class OfferedPlacement:
-    """One of the best that `camera_search` found."""
+    """One of the best placements of a search."""
 
     settings: CameraSettings
     """In the frame of the camera's mount, or the env's if it has none."""
     target: tuple[float, float, float]
     """A point on its line of sight, for a look-at."""
     score: float
-    """0..1, higher is better; see `camera_search.score_of`."""
+    """0..1, higher is better; see `search.score_of`."""
     words: str
     """What it sees, in a sentence."""
     report: CameraReport
     picture: Picture
-    """From there, of the env where it does worst."""
+    """From there, of its worst env."""
 
 
 _Part = TypeVar("_Part", ObjectSeen, DepthReport)
 
 
 def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
-    """One report over all envs of several: the steps of an episode, or several seeds, of one camera.
+    """One report over all envs of several reports of one camera: steps of an episode, or several seeds.
 
     Raises:
-        ValueError: there is none, or they are not of one camera and one scene.
+        ValueError: there is no report, or they are of several cameras or scenes.
     """
     if not reports:
         raise ValueError("there is no report to join")
@@ -275,7 +274,7 @@ def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
 
 
 def _end_to_end(parts: Sequence[_Part]) -> _Part:
-    """One of several, its arrays those of all of them one behind the other."""
+    """One part with the concatenated arrays of all."""
     first = parts[0]
     arrays = [f.name for f in fields(first) if isinstance(getattr(first, f.name), np.ndarray)]
     return replace(
@@ -284,7 +283,7 @@ def _end_to_end(parts: Sequence[_Part]) -> _Part:
 
 
 def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
-    """What was measured of these objects, for a person: ``cube: in 8 of 8 envs, about 210 pixels``."""
+    """Text about these objects: ``cube: in 8 of 8 envs, about 210 pixels``."""
     told = []
     for thing in report.wanted_objects(objects):
         all_envs = thing.summary()
@@ -314,7 +313,7 @@ def _least(values: NDArray[np.float32]) -> float | None:
 
 
 def _rounded(value: float, up: bool) -> float:
-    """To two digits, away from what must stay inside."""
+    """To two digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     digits = (np.ceil if up else np.floor)(np.round(value / step, 6))
     return float(np.round(digits * step, 9))

@@ -44,17 +44,17 @@ from workbench.core.scene.scene_index import SceneIndex, read_poses, scene_index
 WIDE_MARGIN = 0.1
 """Share of the picture's shorter side that is enough between an object and the border."""
 ROOM = 0.1
-"""Metres of free sight before the lens: what is nearer stands where the camera's own body would be."""
+"""Metres that must be free before the lens: the camera's own body is there."""
 FROM_THE_ROBOT = 0.2
-"""Metres that an eye keeps from the origin of every link of a robot, as it stands in the envs that are searched."""
+"""Least distance in metres of an eye from the origin of every robot link, in the searched envs."""
 FROM_ITS_MOUNT = 0.05
-"""The same of an eye that rides on a body, which is meant to be near one."""
+"""The same for an eye on a mount, which is meant to be near a link."""
 GOOD_ENOUGH = 0.995
-"""Score from which nothing is gained by drawing again."""
+"""Score at which no further round is sampled."""
 ROUNDS = 2
-"""Of drawing again around the best."""
+"""Of samples around the best."""
 TRIES = 50
-"""To find an eye clear of the robot; a box that lies within it is searched all the same."""
+"""To sample an eye clear of the robot; a box within the robot is searched anyway."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -73,11 +73,11 @@ def suggest_cameras(
     there are not more, or if the search is cancelled. The same seed gives the same result.
 
     Args:
-        progress: called after each look with how many were made and are to be made at most, so it should do little.
-        cancelled: asked before each look.
+        progress: called after each picture with the number made and the most that will be made; keep it cheap.
+        cancelled: called before each picture.
 
     Raises:
-        ValueError: no env is named; an object is not there, never drawn for such a camera, or the robot itself.
+        ValueError: no env is named; an object is missing, never drawn for such a camera, or the robot itself.
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
@@ -86,10 +86,10 @@ def suggest_cameras(
 
 
 def score_of(report: CameraReport, objects: Sequence[str]) -> float:
-    """0 where some object is never seen, 1 where in every env all of them are whole, free, large and well inside.
+    """Score of a placement: the mean of the average env's mark and the worst env's, 0 to 1.
 
-    The mean of the average env's mark and the worst env's. An env's mark is that of its worst object
-    (`ObjectSeen.marks`), up to a fifth less near the border, and less where something stands right before the lens.
+    An env's mark is that of its worst object (`ObjectSeen.marks`), up to a fifth less near the border, and less where
+    something is right before the lens.
     """
     marks = []
     for thing in report.wanted_objects(objects):
@@ -128,8 +128,7 @@ class _Search:
         self.progress, self.cancelled = progress, cancelled
         every = list_objects(env)
         self.wanted = [_wanted(every, name, space.kind, self.index) for name in space.objects]
-        # Each is also looked at alone; the others are drawn, and hide what they hide.
-        # A link of the robot that is wanted is none of what may hide it.
+        # A requested link of the robot does not count as the robot that may hide it.
         asked = {body for thing in self.wanted for body in thing.bodies}
         robots = [replace(t, bodies=tuple(b for b in t.bodies if b not in asked)) for t in every if t.robot]
         self.objects = [*robots, *self.wanted]
@@ -164,7 +163,7 @@ class _Search:
             yield self._suggestion(score, candidate, report)
 
     def _measure_best_of(self, candidates: list[_Candidate], keep: int) -> None:
-        """Score all without the robot, which only hides and so bounds the score, and the best `keep` of them with it."""
+        """Score all without the robot, which bounds the score from above, then the best `keep` with it."""
         bare = self._measure(candidates)
         scores = [score_of(join_reports(row), self.space.objects) for row in bare]
         order = np.argsort([-score for score in scores], kind="stable").tolist()
@@ -180,10 +179,7 @@ class _Search:
     def _measure(
         self, candidates: list[_Candidate], bare: list[list[CameraReport]] | None = None
     ) -> list[list[CameraReport]]:
-        """Each candidate in each env: with the robot if `bare` is given, without it otherwise.
-
-        None at all where the search is cancelled on the way.
-        """
+        """Reports of each candidate in each env: with the robot if `bare` is given, else without. Empty if cancelled."""
         measured: list[list[CameraReport]] = [[] for _ in candidates]
         key: CameraKey = (self.space.kind, "suggested")
         local = [self._pose(candidate) for candidate in candidates]
@@ -233,11 +229,11 @@ class _Search:
         return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= least
 
     def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-        # An eye right on its target looks nowhere; a box for the eye may hold the objects.
+        # An eye on its target has no direction; the box may contain the objects.
         return target if np.linalg.norm(target - eye) > 1e-3 else target - [0.0, 0.0, 0.01]
 
     def _where_the_objects_are(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Middle and extent (3,) of where the wanted objects are in all envs."""
+        """Centre and extent (3,) of the requested objects over all envs."""
         places = self._places(self.wanted)
         if not len(places):
             names = ", ".join(self.space.objects)
@@ -246,7 +242,7 @@ class _Search:
         return (low + high) / 2, np.maximum(high - low, 0.05)
 
     def _places(self, things: Sequence[SceneObject]) -> NDArray[np.float64]:
-        """(K, 3) where the bodies of some objects are, in all envs that have them; seen from the mount if there is one."""
+        """(K, 3) positions of the objects' bodies in all envs that have them, in the frame of the mount if there is one."""
         bodies = read_poses(self.env)
         columns = [body for thing in things for body in thing.bodies]
         places = bodies[self.envs][:, columns, :3].astype(np.float64)
@@ -258,7 +254,7 @@ class _Search:
         return places[np.isfinite(places).all(axis=1)]
 
     def _mounts(self) -> NDArray[np.float32] | None:
-        """(N, 7) where the mount is in each env; None for a camera that stands still."""
+        """(N, 7) pose of the mount in each env; None without a mount."""
         name = self.space.mount
         if name is None:
             return None
@@ -268,10 +264,10 @@ class _Search:
         return mounts
 
     def _pose(self, candidate: _Candidate) -> NDArray[np.float64]:
-        """(7,) of a candidate, in the frame that it is said in."""
+        """(7,) of a candidate, in the mount's or the env's frame."""
         if self.mounts is None:
             return pose_from_look_at(LookAt(triple(candidate[0]), triple(candidate[1])))
-        # What is up in a link's frame means nothing: the picture stays the way up that it has now.
+        # "Up" in a link's frame means nothing: the picture keeps its present orientation.
         eye, target = candidate
         forward, up = target - eye, self.up[1]
         if abs(float(forward @ up)) > 0.999 * float(np.linalg.norm(forward)):

@@ -35,7 +35,7 @@ class TemporaryCamera:
         """Segmentation (H, W), 0 for background, and depth (H, W) in metres, from a pose (7,) in the env's frame."""
         p = np.asarray(pose, np.float32).tolist()
         self._component.local_pose = sapien.Pose(p[:3], p[3:])
-        # A camera is where its entity was at the last update, whatever its pose says by now.
+        # A camera renders from where its entity was at the last update.
         self._sub_scene.update_render()
         self._move_bodies()
         self._component.take_picture()
@@ -44,7 +44,7 @@ class TemporaryCamera:
         return data[..., 3].astype(np.int32), depth
 
     def colours(self) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB of what was looked at last."""
+        """(H, W, 3) RGB of the last picture."""
         return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
 
 
@@ -65,7 +65,7 @@ def temporary_camera(
 
     Args:
         kind: sensors do not see what the task hides from them.
-        settings: its lens; its pose is for `look` to say.
+        settings: its lens; `look` takes the pose.
         size: width and height of the pictures, which show the same view; None for its own.
         poses: (B, 7) where to draw the env's bodies; None for where the tensors have them.
 
@@ -91,13 +91,13 @@ def temporary_camera(
     with ExitStack() as after:
         after.enter_context(hidden_objects(env, env_index, shown=kind == "human"))
         move_bodies = after.enter_context(drawn_at(places))
-        beside = sapien.Scene([render_system])
+        second_scene = sapien.Scene([render_system])
         entity = sapien.Entity()
         with _minimal_shader(env):
             component = sapien.render.RenderCameraComponent(size[0], size[1])
             entity.add_component(component)
-            beside.add_entity(entity)
-        after.callback(beside.remove_entity, entity)
+            second_scene.add_entity(entity)
+        after.callback(second_scene.remove_entity, entity)
         component.near, component.far = near, far
         component.set_focal_lengths(k[0, 0], k[1, 1])
         component.set_principal_point(k[0, 2], k[1, 2])
@@ -106,7 +106,7 @@ def temporary_camera(
 
 @contextmanager
 def _minimal_shader(env: Any) -> Iterator[None]:
-    """SAPIEN makes every camera with the shader that was named last in the process."""
+    """Select the minimal shader: SAPIEN makes every camera with the shader selected last in the process."""
     last = [*cameras_of(env).values()][-1:]
     set_shader_pack(_SHADER)
     try:
@@ -118,7 +118,7 @@ def _minimal_shader(env: Any) -> Iterator[None]:
 
 @contextmanager
 def undrawn(entities: Sequence[Any]) -> Iterator[None]:
-    """Do not draw these entities (None among them is passed over); afterwards they are as visible as before."""
+    """Within this, do not draw these entities; None is ignored."""
     bodies = [body for entity in entities if entity is not None for body in entity.components]
     drawn = [body for body in bodies if isinstance(body, sapien.render.RenderBodyComponent)]
     with temporarily((body, "visibility", 0.0) for body in drawn):

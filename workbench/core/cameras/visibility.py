@@ -23,12 +23,12 @@ from workbench.core.env_numbers import require_env
 from workbench.core.scene.scene_index import SceneIndex, read_poses, scene_index
 
 SMALL = 64
-"""Pixels of the shorter side that are enough to compare placements."""
+"""Pixels of the shorter side, enough to compare placements."""
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One object of the task, with all bodies that it is made of."""
+    """One object of the task, with its bodies."""
 
     name: str
     """An actor's or an articulation's."""
@@ -36,19 +36,19 @@ class SceneObject:
     """Columns of the scene's index: one of an actor, all links of an articulation."""
     robot: bool
     scenery: bool
-    """The ground, static, or put there by one of ManiSkill's scene builders and not to be moved (its table)."""
+    """The ground, a static body, or a kinematic one of ManiSkill's scene builders (its table)."""
     hidden: bool
     """From the sensors."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A camera that may be only thought of."""
+    """Settings, kind and mount of a camera that need not exist."""
 
     settings: CameraSettings
     kind: CameraKind = "sensor"
     mount: str | None = None
-    """Name of the body whose frame `settings` speaks of; None for the env's."""
+    """Name of the body whose frame `settings` are in; None for the env's."""
     name: str = "suggested"
 
 
@@ -80,7 +80,7 @@ def list_objects(env: Any) -> tuple[SceneObject, ...]:
 
 
 def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
-    """What of a scene a camera may be asked to see, as plain data."""
+    """The objects that a search can ask for, as plain data."""
     names, objects = scene_index(env).names, list_objects(env)
     seen = tuple(
         ObjectToSee(
@@ -96,11 +96,10 @@ def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
 
 
 def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
-    """Names of a robot's links that have something to be seen: its hand, then what is near its tool centre point.
+    """Names of a robot's drawn links: its hand, then the others by their distance from the tool centre point.
 
-    That point is a link that ManiSkill's agents have under the name ``tcp``, where they have a hand. The hand is the
-    link that carries it: the fingers may be nearer to it, but a hand is what people ask to see. Without a tool the last
-    link comes first.
+    ManiSkill's agents with a hand have that point as the link ``tcp``; the hand is the link that carries it, although the
+    fingers may be nearer. Without a ``tcp`` the last link comes first.
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
     drawn = [body for body in reversed(robot.bodies) if _is_drawn(entities[body])]
@@ -120,7 +119,7 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
 
 
 def _carrier(entity: Any) -> Any:
-    """The nearest link that has something to be seen, from this one towards the root; None if there is none."""
+    """The nearest drawn link from this one towards the root; None if there is none."""
     while entity is not None and not _is_drawn(entity):
         link = entity.find_component_by_type(sapien.physx.PhysxArticulationLinkComponent)
         parent = None if link is None else link.parent
@@ -134,7 +133,7 @@ def _is_drawn(entity: Any) -> bool:
 
 
 def placement_of(env: Any, camera: CameraKey, e: int, settings: CameraSettings | None = None) -> Placement:
-    """A camera of one env, as it stands or as `settings` would have it, which are of the frame of its mount.
+    """The placement of a camera of one env, or with other `settings` (in the frame of its mount).
 
     Raises:
         ValueError: there is no such camera.
@@ -143,7 +142,7 @@ def placement_of(env: Any, camera: CameraKey, e: int, settings: CameraSettings |
     cameras = cameras_of(env)
     if camera not in cameras:
         there = ", ".join(f"{name} ({kind})" for kind, name in cameras) or "none"
-        raise ValueError(f"there is no {camera[0]} camera {camera[1]!r} to judge; there are: {there}")
+        raise ValueError(f"there is no {camera[0]} camera {camera[1]!r} to report on; there are: {there}")
     require_env(e, env.num_envs)
     found, (kind, name) = cameras[camera], camera
     return Placement(settings or settings_of(found, e), kind, mount_of(env, found), name)
@@ -156,14 +155,14 @@ def measure_placement(
     poses: NDArray[np.float32] | None = None,
     size: tuple[int, int] | None = None,
 ) -> CameraReport:
-    """Judge a camera, which need not exist, in one env.
+    """Report what a camera, which need not exist, sees in one env.
 
     Args:
         poses: (B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
-        size: of the pictures that are judged, None for the camera's own; the view stays the same (`small_size`).
+        size: of the measured pictures, with the same view (`small_size`); None for the camera's own.
 
     Raises:
-        ValueError: there is no such lens, or no body is called as the mount.
+        ValueError: the lens is impossible, or there is no such mount.
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
@@ -181,7 +180,7 @@ def picture_of(
     poses: NDArray[np.float32] | None = None,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """What a camera that does not exist sees of one env, in its own size or another; raises as `measure_placement`."""
+    """A picture from a camera that need not exist; arguments and errors as `measure_placement`."""
     pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
     with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         segmentation, depth = view.look(pose)
@@ -190,10 +189,7 @@ def picture_of(
 
 
 def settings_of(camera: Any, env_index: int) -> CameraSettings:
-    """How one env's camera stands and sees now; `camera` as `cameras_of` gives it.
-
-    Its lens is always said as an intrinsic matrix, which is what the renderer has.
-    """
+    """Present settings of one env's camera, the lens as an intrinsic matrix; `camera` as in `cameras_of`."""
     component = maniskill_private.camera_components(camera)[env_index]
     local = component.local_pose
     qw, qx, qy, qz = map(float, local.q)
@@ -211,7 +207,7 @@ def settings_of(camera: Any, env_index: int) -> CameraSettings:
 
 
 def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]:
-    """Width and height of about the same shape whose shorter side is `shorter`, if that is less."""
+    """Width and height with about the same aspect, the shorter side at most `shorter`."""
     scale = min(1.0, shorter / min(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -220,7 +216,7 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 
 
 def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneIndex) -> NDArray[np.float64]:
-    """(7,) of a placement in the env's frame, where the bodies stand at `bodies` (B, 7)."""
+    """(7,) of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
     if placement.mount is None:
         return pose_of(placement.settings)
     mount = bodies[mount_column(index, placement.mount)]
@@ -230,7 +226,7 @@ def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneI
 
 
 def mount_column(index: SceneIndex, name: str) -> int:
-    """Which body is called so."""
+    """Column of the body with this name."""
     if name not in index.names:
         raise ValueError(f"there is no body {name!r} to mount a camera on")
     return index.names.index(name)
@@ -255,8 +251,8 @@ def measure(
     never drawn for a sensor.
 
     Args:
-        settings: of the camera, in whose pixels things are counted; `view` may have fewer.
-        bare: what was measured from this pose with the robot not drawn, if that was; then one look is enough.
+        settings: of the camera, whose pixels are counted; `view` may have fewer.
+        bare: the report from this pose without the robot, if there is one: then one picture is enough.
     """
     began = time.perf_counter()
     shown = [thing for thing in objects if not (thing.robot or thing.name == "ground")]
@@ -317,14 +313,14 @@ def measure(
 def _depths(
     depth: NDArray[np.float32], something: NDArray[np.bool_], counts: NDArray[np.bool_]
 ) -> DepthReport:
-    """Of one picture (H, W); `something` where it is no background, `counts` where it is the robot or an object."""
+    """Of one picture (H, W); masks `something` (no background) and `counts` (robot or object)."""
     far, of_objects = depth[something], depth[counts]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
     histogram, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
     return DepthReport(
         counts=histogram.astype(np.int64)[None],
         background=_one(1 - something.mean()),
-        # Where nothing counts is in view, all of it is room.
+        # Without robot and objects in view all of it is beyond.
         beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
         nearest=_one(far.min() if len(far) else np.nan),
         farthest_object=_one(limit),
@@ -357,7 +353,7 @@ def _margin(mask: NDArray[np.bool_]) -> float:
 
 
 def _built_by_scene_builders(env: Any) -> set[int]:
-    """``id`` of every entity that ManiSkill's scene builders put into the scene: tables, rooms, not the task's things."""
+    """``id`` of every entity of ManiSkill's scene builders: tables and rooms."""
     entities: set[int] = set()
     for builder in vars(env).values():
         if not isinstance(builder, SceneBuilder):

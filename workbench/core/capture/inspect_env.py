@@ -23,7 +23,7 @@ from workbench.core.scene.scene_index import SceneIndex, scene_index
 from workbench.core.simulation.cpu_system import batched_system
 
 MOST_VALUES = 64
-"""Numbers of one array that are sent; a joint vector has fewer, a picture has more."""
+"""Numbers of one array that are sent; a joint vector has fewer, a picture more."""
 
 
 def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
@@ -68,7 +68,7 @@ def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
     """The last observation; a flattened one (N, D) split by the names of what it was made of."""
     leaves: list[Leaf] = []
     for name, value in flat_entries({} if task.obs is None else task.obs):
-        # "state" is what ManiSkill calls the flattened part beside the pictures.
+        # With pictures, ManiSkill's flattened part is called "state".
         names = flat_names(task, value) if name in ("", "state") else None
         if names is None:
             leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
@@ -78,7 +78,7 @@ def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
 
 
 def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
-    """``get_state_dict()``; 13 numbers of a body and 13 + 2 J of an articulation by what they are."""
+    """``get_state_dict()``; the 13 numbers of a body, and 13 + 2 J of an articulation, split by name."""
     structs = scene_index(task.env).states
     leaves: list[Leaf] = []
     for name, value in env_states(task.env).items():
@@ -93,7 +93,7 @@ def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
 
 
 def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
-    """Every articulation that this env has, robots first as they were built."""
+    """Every articulation of this env, in the order of building."""
     found = []
     for name, articulation in task.env.scene.articulations.items():
         at = np.flatnonzero(np.asarray(maniskill_private.envs_of(articulation)) == env)
@@ -132,7 +132,7 @@ def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
     pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
     for contact in list_contacts(task.env, env):
         first, second = contact.bodies
-        # Shapes that are near have a contact too; without an impulse and with a gap they do not touch.
+        # Shapes that are only near have a contact too.
         if not contact.impulses.any() and not (contact.separations <= 0).any():
             continue
         ordered = (first, second) if first <= second else (second, first)
@@ -197,13 +197,13 @@ class Contact:
     """
 
     bodies: tuple[str, str]
-    """Names as in `SceneIndex.names`; the name of the ``sapien.Entity`` for what ManiSkill does not manage."""
+    """Names as in `SceneIndex.names`; the ``sapien.Entity``'s name for what ManiSkill does not manage."""
     points: NDArray[np.float32]
     """(K, 3) metres."""
     normals: NDArray[np.float32]
     """(K, 3) unit vectors from the second body towards the first."""
     impulses: NDArray[np.float32]
-    """(K, 3) newton seconds ON the first body, BY the second, in the last substep; friction is in it."""
+    """(K, 3) newton seconds ON the first body, BY the second, in the last substep, friction included."""
     separations: NDArray[np.float32]
     """(K,) metres between the surfaces; negative where they overlap."""
     timestep: float
@@ -227,11 +227,11 @@ def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
 
     (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
 
-    A state that was set since (a reset, a restored snapshot) has no contacts of its own until the next step:
-    the list is still that of the last substep, as in stock ManiSkill.
+    After a reset or a restored snapshot the list is still that of the last substep, as in stock ManiSkill, until the
+    next step.
 
     Args:
-        env: a ManiSkill env (reset at least once; wrappers are looked through): batched on the CPU, or stock.
+        env: a ManiSkill env, reset at least once, batched on the CPU or stock; wrappers are removed.
 
     Raises:
         IndexError: there is no such env.
@@ -251,7 +251,7 @@ def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
 
 
 def _place(contact: Contact) -> tuple[Any, ...]:
-    # Two shapes of one body may touch the same point: then they differ in depth.
+    # Two shapes of one body may touch at the same point, with different depths.
     return contact.bodies, contact.points.tolist(), contact.separations.tolist(), contact.impulses.tolist()
 
 

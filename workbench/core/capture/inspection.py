@@ -22,9 +22,9 @@ class Leaf:
     """Without the leading dimension N."""
     dtype: str
     values: NDArray
-    """(K,) the first of its numbers, flattened; all of them unless it is a picture or the like."""
+    """(K,) its first numbers, flattened; all of them unless it is as large as a picture."""
     low: float
-    """Least of all its numbers; NaN where there is none, or one of them is NaN."""
+    """Minimum; NaN if it is empty or holds a NaN."""
     high: float
 
 
@@ -41,15 +41,15 @@ class JointReadings:
     velocity: NDArray[np.float32]
     """(J,) a second."""
     target: NDArray[np.float32]
-    """(J,) of the position drive; NaN for a joint that has none (no stiffness)."""
+    """(J,) of the position drive; NaN for a joint without one (no stiffness)."""
     low: NDArray[np.float32]
-    """(J,) limits; infinite where there are none."""
+    """(J,) limits; infinite without one."""
     high: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Touching:
-    """Two bodies that touch, over all their shapes, in the last substep."""
+    """Contact of two bodies, over all their shapes, in the last substep."""
 
     bodies: tuple[str, str]
     force: NDArray[np.float32]
@@ -61,12 +61,12 @@ class Touching:
     forces: NDArray[np.float32]
     """(K, 3) newtons on the first body at each point."""
     separation: float
-    """Metres between the surfaces where they are nearest; negative: they overlap."""
+    """Least distance between the surfaces, metres; negative if they overlap."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """One env at one moment, as far as was asked."""
+    """The requested sections of one env at one moment."""
 
     env: int
     elapsed_steps: int
@@ -75,8 +75,8 @@ class Inspection:
     state: tuple[Leaf, ...] | None = None
     joints: tuple[JointReadings, ...] | None = None
     contacts: tuple[Touching, ...] | None = None
-    """Strongest first. Contacts are of the last substep: after a reset, still of the one before it."""
+    """Strongest first, of the last substep: after a reset, still of the one before it."""
     refused: tuple[tuple[Section, str], ...] = ()
-    """Sections that could not be read, and why, in a sentence."""
+    """Sections that could not be read, each with the reason."""
     milliseconds: float = 0.0
-    """What the reading cost."""
+    """Time that reading took."""

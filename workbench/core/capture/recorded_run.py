@@ -22,9 +22,9 @@ class RecordedRun:
     """
 
     name: str
-    """What a person calls it."""
+    """For people."""
     seed: int
-    """Episode seed; below 0 where it is not known."""
+    """Episode seed; negative if unknown."""
     reset_options: dict[str, Any]
     """``options`` of the reset that began it."""
     action: NDArray[np.float32]
@@ -43,11 +43,11 @@ class RecordedRun:
         return len(self.action)
 
     def state(self, at: int) -> dict[str, NDArray]:
-        """(D,) of every actor and articulation in state `at`; empty where it was not recorded."""
+        """(D,) of every actor and articulation in state `at`; empty if it was not recorded."""
         return {name: rows[at] for name, rows in self.env_states.items() if at < len(rows)}
 
     def until(self, state: int) -> RecordedRun:
-        """Its beginning, up to that state."""
+        """The run up to that state."""
         return replace(
             self,
             action=self.action[:state],
@@ -58,11 +58,10 @@ class RecordedRun:
 
 
 def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How far apart poses are: (...) metres and (...) radians.
+    """Distance of poses: (...) metres and (...) radians.
 
     Args:
-        a, b: (..., 7) position in metres and quaternion wxyz. Where both lack a pose (NaN) the distance is 0, where one
-            does it is infinite.
+        a, b: (..., 7) position in metres and quaternion wxyz. The distance is 0 if both poses are NaN, infinite if one is.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
@@ -82,11 +81,11 @@ def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray
 
 
 STATE, OBS = "state/", "obs/"
-"""What the names of columns begin with: ``state/actors/cube``, ``obs/agent/qpos``."""
+"""Prefixes of column names: ``state/actors/cube``, ``obs/agent/qpos``."""
 
 
 def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
-    """One env's states. Those of what it does not have, which is NaN in the columns, are left out."""
+    """One env's states, without those of what it lacks (NaN in the columns)."""
     rows = {name[len(STATE) :]: column[env] for name, column in columns.items() if name.startswith(STATE)}
     return {name: row for name, row in rows.items() if not np.isnan(row).all()}
 
@@ -95,13 +94,13 @@ def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
 
 
 HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
-"""Keywords that say how an env is run, and not what it is."""
+"""Keywords that change how an env is run, not what it is."""
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of ``gym.make`` that make `env` again: those `given` and the modes it took, as far as JSON holds them.
 
-    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. `HOW_IT_IS_RUN` is left to whoever replays.
+    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `HOW_IT_IS_RUN`.
     """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if env.agent is not None and isinstance(env.control_mode, str):

@@ -23,7 +23,7 @@ _POSE = 7
 
 
 def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
-    """What of a recorded state cannot be put into this env, and what of the env is in no such state: name and reason.
+    """What of a recorded state does not fit this env, and what of the env the state lacks: name and reason.
 
     Args:
         env: an unwrapped ManiSkill env, batched.
@@ -89,19 +89,19 @@ def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
 
 
 def new_physics(env: Any, env_idx: Sequence[int]) -> None:
-    """Let PhysX forget what these envs did before; on a GPU there is no way to."""
+    """Give these envs a PhysX scene without a past (`renew_physics`); does nothing on a GPU, where there is no way."""
     if batched_system(env.scene) is not None:
         renew_physics(env.scene, [int(i) for i in env_idx])
 
 
 def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
-    """(N, D) of every actor and articulation of the env, by the names of a recording; NaN in envs without it."""
+    """(N, D) of every actor and articulation, by the names of a recording; NaN in envs without it."""
     return {name: to_numpy(state) for name, state in present_states(env).items()}
 
 
 def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
-    """How far one env's state is from a recorded one: metres of the body that is furthest, and radians of the body
-    or joint (of a sliding joint: metres) that is turned most. What only one of them has does not count.
+    """Distance of one env's state from a recorded one: metres of the farthest body, and radians of the body or joint
+    (metres of a sliding joint) that turned most. What only one of them has does not count.
 
     Args:
         now, was: (D,) by name.
@@ -109,7 +109,7 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
     both = [
         (value, was[name])
         for name, value in now.items()
-        # A controller's state is no pose, however many numbers it has.
+        # A controller's state is no pose.
         if name.startswith(("actors/", "articulations/"))
         and name in was
         and was[name].shape == value.shape
@@ -128,13 +128,13 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
 
 
 def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
-    """Whether all that both have is equal to the last bit, velocities included."""
+    """Whether all that both have is equal to the last bit, including velocities."""
     both = [name for name in was if name in now and now[name].shape == was[name].shape]
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
 
 
 def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
-    """What controllers with a target of their own remember, where it was recorded (``controller/arm/target_qpos``)."""
+    """Write the targets that controllers keep, if they were recorded (``controller/arm/target_qpos``)."""
     if env.agent is None:
         return
     for name, value in flat_entries(env.agent.get_controller_state(), "controller"):

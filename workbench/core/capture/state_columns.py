@@ -21,7 +21,7 @@ from workbench.core.scene.scene_index import StateRows, in_every_env, scene_inde
 from workbench.core.snapshots.snapshot import remembering
 
 _PICTURES = ("sensor_data", "sensor_param", "pointcloud")
-"""Parts of an observation that are made of pictures."""
+"""Parts of an observation that consist of pictures."""
 
 
 def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
@@ -33,20 +33,20 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     one column ``obs/`` where they are not known; pictures are left out, since a recording has its own.
 
     Raises:
-        Exception: whatever a ``get_state_dict`` of the author's own raises.
+        Exception: raised by a ``get_state_dict`` of the task's own.
     """
     return copy_states(task).columns()
 
 
 @dataclass(frozen=True)
 class StateReading:
-    """What one moment's columns are made of; copies."""
+    """Copies from which the columns of one moment are made."""
 
     rows: StateRows | None
     asked: dict[str, Any]
     """Further columns, and flattened observations."""
     flat: dict[str, Any]
-    """What each flattened observation consists of."""
+    """Parts of each flattened observation, as of `flat_names`."""
     num_envs: int
     device: torch.device
 
@@ -65,7 +65,7 @@ class StateReading:
 
 
 def copy_states(task: TaskEnv) -> StateReading:
-    """Of the present moment, for who has time for `read_state_columns` later. Raises as it does."""
+    """Copy the present moment; ``columns()`` then does the slow part of `read_state_columns`. Raises as it does."""
     rows, asked = _read(task.env)
     values: dict[str, Any] = {STATE + name: value for name, value in asked.items()}
     values.update(_observed(task))
@@ -79,15 +79,14 @@ def copy_states(task: TaskEnv) -> StateReading:
 def env_states(env: BaseEnv) -> dict[str, Any]:
     """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
 
-    Tensors, or on the CPU arrays; copies of the simulation's own. ManiSkill asks every actor and articulation in turn for
-    pose and velocities, 75 us for the four of PickCube; the numbers are those of its ``get_state_dict``, to the last bit
-    (tested). A task that has one of its own is asked itself."""
+    Copies: tensors, or arrays on the CPU. Equal to ManiSkill's ``get_state_dict`` to the last bit (tested), which asks every
+    actor and articulation in turn (75 us for the four of PickCube). A task's own ``get_state_dict`` is called."""
     rows, asked = _read(env)
     return asked if rows is None else {**rows.states(), **asked}
 
 
 def _read(env: BaseEnv) -> tuple[StateRows | None, dict[str, Any]]:
-    """What `env_states` is made of: rows of the simulation, and what was asked for."""
+    """Rows of the simulation, and the values that `env_states` adds to them."""
     if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
         whole: Any = env.get_state_dict()
         known = scene_index(env).states
@@ -97,7 +96,7 @@ def _read(env: BaseEnv) -> tuple[StateRows | None, dict[str, Any]]:
 
 
 def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
-    """The entries of the last observation that have a value an env, pictures left out: ``obs/...`` and (N, ...)."""
+    """Entries of the last observation with a row for each env, without pictures: ``obs/...`` and (N, ...)."""
     for name, value in flat_entries(task.obs):
         shape = () if name.partition("/")[0] in _PICTURES else getattr(value, "shape", ())
         if len(shape) > 0 and shape[0] == task.num_envs:
@@ -107,7 +106,7 @@ def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
     """On the host, in one copy a dtype: on a GPU each single fetch waits for the device."""
     if device.type == "cpu":
-        # What is an array already was made for this.
+        # Arrays are copies already.
         return {
             name: value if isinstance(value, np.ndarray) else to_numpy(value)
             for name, value in values.items()
@@ -173,7 +172,7 @@ def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], s
     for name, value in flat_entries(obs):
         if isinstance(value, torch.Tensor) and value.nelement():
             parts.append((name, tuple(value.shape[1:]) or (1,), _dtype(value)))
-    # A task may flatten in its own way: then no names are better than wrong ones.
+    # A task may flatten in its own way: wrong names would be worse than none.
     return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
 
 

@@ -27,7 +27,7 @@ class ActionPart:
     robot: str | None
     """Key of the action dict for several robots, else None."""
     controller: Any
-    """A ManiSkill BaseController; its configuration is that of its own class."""
+    """A ManiSkill BaseController."""
     names: tuple[str, ...]
     low: NDArray[np.float32]
     high: NDArray[np.float32]
@@ -35,7 +35,7 @@ class ActionPart:
 
 @once_a_scene
 def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
-    """The parts in the order of the flat action; empty for a task without a robot."""
+    """Parts in the order of the flat action; empty without a robot."""
     if env.agent is None:
         return ()
     controllers: Any = env.agent.controller
@@ -61,14 +61,14 @@ def bounds(parts: tuple[ActionPart, ...]) -> tuple[NDArray[np.float32], NDArray[
 
 
 def width(parts: tuple[ActionPart, ...]) -> int:
-    """A, of the flat action."""
+    """Width A of the flat action."""
     return sum([len(part.names) for part in parts])
 
 
 def action_of(
     parts: tuple[ActionPart, ...], num_envs: int, rows: Mapping[int, NDArray]
 ) -> NDArray[np.float32]:
-    """(N, A) with these rows (A,) by env; zeros in the others."""
+    """(N, A) with these rows (A,) by env, zeros elsewhere."""
     action = np.zeros((num_envs, width(parts)), np.float32)
     for env, row in rows.items():
         action[env] = row
@@ -90,14 +90,14 @@ def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.floa
 
     Zero is not that: it is a half-open gripper, and in absolute joint control the middle of the limits. Delta and velocity controllers: zero. Absolute joint position: the present qpos, through the
     inverse of ManiSkill's ``clip_and_scale_action``. Absolute end-effector pose: zero, since its
-    inverse would need the controller's frame; such a robot is better held by ``step(None)``.
+    inverse would need the controller's frame; hold such a robot with ``step(None)``.
     """
     columns = [_hold(part, num_envs) for part in parts]
     return np.concatenate(columns, axis=1) if columns else np.zeros((num_envs, 0), np.float32)
 
 
 def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.float32]) -> Any:
-    """What ``env.step`` takes: a tensor (N, A), a dict of them for several robots, None for none."""
+    """The argument of ``env.step``: a tensor (N, A), a dict of them for several robots, None without a robot."""
     if not parts:
         return None
     action = torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32)).to(env.device)
@@ -111,10 +111,10 @@ def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.
 def to_flat_action(
     env: BaseEnv, parts: tuple[ActionPart, ...], action: Any, whose: str = "the action"
 ) -> NDArray[np.float32]:
-    """(N, A) from whatever a policy returned: array or tensor, (A,) or (N, A), or a dict of robots.
+    """(N, A) from a policy's action: array or tensor, (A,) or (N, A), or a dict of robots.
 
     Args:
-        whose: what is wrong is said of this.
+        whose: subject of error messages.
 
     Raises:
         ValueError: the shape does not fit, or a value is not finite.
@@ -128,7 +128,7 @@ def to_flat_action(
         flat = np.broadcast_to(flat, expected)
     if flat.shape != expected:
         raise ValueError(_wrong_shape(whose, flat.shape, expected, env.control_mode))
-    # The sum is quick, and may be infinite where no number is.
+    # The sum is quick, but may overflow.
     if not math.isfinite(np.add.reduce(flat, axis=None)) and not np.isfinite(flat).all():
         raise ValueError(f"{whose} holds NaN or infinity")
     return np.array(flat)
@@ -138,7 +138,7 @@ def _wrong_shape(whose: str, shape: tuple[int, ...], expected: tuple[int, int], 
     said = f"{whose} has shape {shape}, expected {expected} (envs, dimensions)"
     if not shape or shape[-1] == expected[1]:
         return said
-    # Several robots have a mode each.
+    # Several robots have one mode each.
     modes = ", ".join(f"{one}" for one in mode.values()) if isinstance(mode, dict) else str(mode)
     return (
         f"{said}: it is {shape[-1]} wide, and the control mode {modes} takes {expected[1]}. Name the one that it is written "

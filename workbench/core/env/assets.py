@@ -22,16 +22,16 @@ _A_PATH = re.compile(r"(?:/|[A-Za-z]:\\)[^\s'\"]+")
 
 
 class MissingAssets(RuntimeError):
-    """The task cannot be built before something is downloaded."""
+    """The task needs assets that are not downloaded."""
 
     def __init__(self, message: str, names: Sequence[str] = ()) -> None:
         super().__init__(message)
         self.names = tuple(names)
-        """What ``python -m mani_skill.utils.download_asset`` takes, one for each missing asset."""
+        """Arguments of ``python -m mani_skill.utils.download_asset``, one for each missing asset."""
 
 
 def require_assets(task: str, asset_ids: Sequence[str], robot_uids: Any = None) -> None:
-    """Raise MissingAssets unless what the task and its robots declare is on this machine.
+    """Raise MissingAssets unless all that the task and its robots declare is on this machine.
 
     Args:
         asset_ids: the ``asset_download_ids`` that the task was registered with.
@@ -46,7 +46,7 @@ def require_assets(task: str, asset_ids: Sequence[str], robot_uids: Any = None) 
 def robots_of(task: type, kwargs: Mapping[str, Any]) -> Any:
     """``robot_uids`` as the task class will see them: from `kwargs`, else its constructor's default.
 
-    None where the constructor does not name them: it may pass others on to the one that it overrides.
+    None if the constructor does not name them: it may pass others to its parent's.
     """
     if "robot_uids" in kwargs:
         return kwargs["robot_uids"]
@@ -55,9 +55,9 @@ def robots_of(task: type, kwargs: Mapping[str, Any]) -> Any:
 
 
 def assets_at(path: str | Path) -> list[str]:
-    """Which of ManiSkill's downloads put something at `path`, the outermost first; empty if none does.
+    """The names of ManiSkill's downloads that contain `path`, the outermost first.
 
-    A dataset may be kept inside another one's folder, and downloading the outer one clears that folder.
+    A dataset may be inside another one's folder, and downloading the outer one clears that folder.
     """
     wanted = Path(path)
     found = []
@@ -119,7 +119,7 @@ def _missing(task: str, names: Iterable[str], instead: str = "") -> MissingAsset
 
 
 def _sources_to_fetch(name: str) -> list[str]:
-    """The single downloads behind a name (an asset or a group of them) that are not on this machine."""
+    """The missing single downloads behind a name (an asset or a group of them)."""
     group = name in assets.DATA_GROUPS
     sources = assets.expand_data_group_into_individual_data_source_ids(name) if group else [name]
     return [source for source in sources if not assets.is_data_source_downloaded(source)]
@@ -160,7 +160,7 @@ def _no_robot_file(task: str, robot: str, path: Path | None) -> MissingAssets:
 
 
 def _named_by(error: Exception) -> list[str]:
-    """The downloads that would bring what the exception says is not there."""
+    """The downloads that contain the file that the exception misses."""
     text = str(error)
     advised = re.search(r"mani_skill\.utils\.download_asset\s+([\w/\-]+)", text)
     if advised is not None and advised[1] in {*assets.DATA_GROUPS, *assets.DATA_SOURCES}:
@@ -171,16 +171,15 @@ def _named_by(error: Exception) -> list[str]:
     for path in paths:
         if Path(ASSET_DIR) in path.parents and not path.exists():
             names = [name for name in assets_at(path) if not assets.is_data_source_downloaded(name)]
-            # A folder that is there with a file missing was fetched in part: fetch the innermost again.
+            # A folder with a missing file was fetched in part: fetch the innermost again.
             return names or assets_at(path)[-1:]
     return []
 
 
 def _robot_file(trace: TracebackType | None) -> Path | None:
-    """The path that a robot's loader was at when it failed.
+    """The file that a robot's loader was reading when it failed.
 
-    An agent class that was never registered has no entry in ManiSkill's table of downloads, and the look-up
-    raises a bare KeyError with the robot's uid instead of a word about the file.
+    For an agent class that was never registered, ManiSkill's look-up raises a bare KeyError with the robot's uid.
     """
     for frame, _ in walk_tb(trace):
         if frame.f_code.co_filename == base_agent.__file__ and "asset_path" in frame.f_locals:

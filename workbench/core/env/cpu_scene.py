@@ -59,7 +59,7 @@ _NO_WINDOW = (
 class BatchedSimDevice:
     """Stands for ``sapien.Device("cpu")`` where ManiSkill asks ``_sim_device.is_cuda()``.
 
-    It asks in order to know whether drive targets must be applied after an action: here they must.
+    ManiSkill then applies drive targets after an action, as is needed here.
     """
 
     def is_cuda(self) -> bool:
@@ -100,13 +100,12 @@ class BatchedCpuScene(ManiSkillScene):
         self.gpu_sim_enabled = True
 
     def create_actor_builder(self) -> Any:
-        # ManiSkill adds a plane's collision shape once a builder, since on the GPU all envs share one
-        # physics scene: here every env but the first would lack its ground.
+        # ManiSkill adds a plane once a builder, since all envs of a GPU share one physics scene: here every env but
+        # the first would lack its ground.
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
-        # A camera on a link is given a GPU pose index in GPU simulation; a CPU body has none, and the
-        # camera is moved with its entity anyway.
+        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body has not; it moves with its entity.
         self.gpu_sim_enabled = False
         try:
             return super()._sapien_add_camera(*args, **kwargs)
@@ -162,12 +161,12 @@ class BatchedCpuMixin:
     _workbench_task: type[BaseEnv]
     """The author's class, without this mixin."""
     _workbench_threads: int | None
-    """How many threads step the envs; None for all cores."""
+    """Threads that step the envs; None for one on each core."""
     _kept_controllers: KeptControllers | None = None
     begins_anew = False
-    """Whether each reset is an exact point, from which an episode can be had again to the last bit."""
+    """Whether each reset is an exact point, from which an episode can be repeated to the last bit."""
     _to_begin: list[int] | None = None
-    """While in a reset: the envs that were initialised and are to begin anew."""
+    """During a reset: the initialised envs, to become exact points."""
     _sim_freq: int
     _sim_steps_per_control: int
     _set_scene_config: Any
@@ -190,7 +189,7 @@ class BatchedCpuMixin:
 
     @property
     def gpu_sim_enabled(self) -> bool:
-        """True for ManiSkill's own code, which is to take its batched path; see `seams.asks_for_a_gpu`."""
+        """True for ManiSkill's own code, so that it takes its batched path; see `asks_for_a_gpu`."""
         return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
 
     def render_human(self) -> Any:
@@ -216,7 +215,7 @@ class BatchedCpuMixin:
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         untouched = others(self, options)
         options, seeds = in_ascending_order(options or {}, seed, self)
-        # For as many seeds as there are envs ManiSkill has an answer: they are those of the whole batch.
+        # ManiSkill takes a list of seeds for those of the whole batch.
         if not untouched or seeds is None or len(seeds) == 1:
             given: Any = nullcontext()
         else:
@@ -246,17 +245,17 @@ class BatchedCpuMixin:
         note_scene(self)  # type: ignore[arg-type]
 
     def get_info(self) -> dict[str, Any]:
-        # In a reset BaseEnv asks for this right after it reset the controllers, of all envs.
+        # In a reset BaseEnv calls this right after it has reset the controllers of all envs.
         if self._kept_controllers is not None:
             self._kept_controllers.put_back()
         if self._to_begin and not self.scene._needs_fetch:
-            # Now, when what the reset wrote is applied and fetched, and before `evaluate` writes anything.
+            # After the reset's writes are applied and fetched, before `evaluate` writes anything.
             begin_anew(self, self._to_begin)
             self._to_begin = None
         return super().get_info()  # type: ignore[misc]
 
     def _step_action(self, action: Any) -> Any:
-        # Substeps may be done in a row only if nothing of the author's runs between them.
+        # Substeps may be merged only if no code of the author's runs between them.
         px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
         unwatched = substeps_are_unwatched(self, self._workbench_task)
         try:
@@ -267,9 +266,9 @@ class BatchedCpuMixin:
             raise
 
     def drop_writes(self) -> None:
-        """Forget what was written to the simulation's tensors and not applied."""
-        # What a hook that raised had written (a NaN, say) would else be applied by every reset that follows,
-        # and what it had applied and not fetched would make the next one raise.
+        """Discard writes to the simulation's tensors that were not applied."""
+        # Else every later reset would apply what a hook that raised had written (a NaN, say), and what it had applied
+        # and not fetched would make the next reset raise.
         if self.scene is not None and self.scene._gpu_sim_initialized:
             px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
             px.drop_writes()
@@ -301,11 +300,11 @@ def batched_class(
     rules: Degree | None = None,
     on_finding: Callable[[Finding], None] = warn_of,
 ) -> type[BaseEnv]:
-    """`task` with the batched CPU simulation in front of it; `task` itself is left as it is.
+    """A subclass of `task` with the batched CPU simulation; `task` itself stays as it is.
 
     Args:
         rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
-        on_finding: called with each place where a rule is broken that does not stop the task, the first time.
+        on_finding: called once for each place where a rule that does not stop the task is broken.
     """
     install_row_lookups(batched_system)
     install_struct_access()
@@ -326,14 +325,14 @@ def batched_class(
 
 
 _SPARE = 8
-"""For threads, drivers and libraries that start later, and the scene that a restore makes beside the old one."""
+"""For threads, drivers and libraries that start later, and the second scene during a restore."""
 
 
 def require_scenes(count: int) -> None:
-    """Raise if this process cannot hold `count` PhysX scenes more.
+    """Check that this process can hold `count` more PhysX scenes.
 
     Raises:
-        ValueError: says how many it can.
+        ValueError: with the number that it can.
     """
     free = free_thread_keys()
     if free is not None and count > free - _SPARE:
@@ -412,7 +411,7 @@ def refuse_unbuilt_agent(agent: Any) -> None:
 
 
 def _culprit(cls: type, base: type, silent: bool) -> tuple[type, Place | None]:
-    """The first class that has a constructor; with `silent` rather the first whose constructor names no other."""
+    """The first class with a constructor; with `silent`, preferably one whose constructor calls no other."""
     every = cls.__mro__[: cls.__mro__.index(base)]
     own = [owner for owner in every if hasattr(vars(owner).get("__init__"), "__code__")]
     named = [owner for owner in own if "__init__" in vars(owner)["__init__"].__code__.co_names]

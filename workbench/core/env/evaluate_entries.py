@@ -17,24 +17,24 @@ from workbench.core.env.step_result import OtherEntry
 
 FLAGS = ("success", "fail")
 MOST_LETTERS = 400
-"""Of the text of a value."""
+"""Longest text of a value."""
 MOST_NUMBERS = 1024
-"""Of a value of the whole batch that is kept as numbers; of a larger one only type and shape are told."""
+"""Largest value of the whole batch that is kept as numbers; of a larger one only type and shape."""
 MOST_ENTRIES = 1000
-"""Leaves; of more only the number is told."""
+"""Most leaves; of the others only the count."""
 _MOST_NAME = 200
 _MOST_READ = 1 << 26
-"""Numbers of one value; a sparse tensor may say that it has more than there is memory."""
+"""Numbers of one value; a sparse tensor's shape may exceed the memory."""
 _NOT_EVALUATED = ("elapsed_steps", "reconfigure")
-"""What ManiSkill itself puts into ``info``."""
+"""ManiSkill's own entries of ``info``."""
 _REAL = "biuf"
 _PLAIN = {torch.bool, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8}
-"""Types that numpy has too."""
+"""Types that numpy also has."""
 _DEEPEST = 16
 _NOT_SHOWN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters, and halves of surrogate pairs, which no file and no browser takes."""
+"""Control characters and surrogates, which no file and no browser takes."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
-"""In a default repr: another in every run."""
+"""In a default repr: differs in every run."""
 
 _short = reprlib.Repr()
 _short.maxlevel = 4
@@ -66,7 +66,7 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
         elif array.ndim and len(array) == num_envs:
             columns[name] = array
         elif name in FLAGS:
-            # ManiSkill takes a single truth for all envs; the page asks for a row each.
+            # ManiSkill takes a single bool for all envs; the page needs a row each.
             columns[name] = np.broadcast_to(array, (num_envs, *array.shape)).copy()
         else:
             others[name] = _numbers(value, array)
@@ -76,9 +76,7 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
 
 
 def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """The leaves of nested dicts, each with the keys that lead to it, joined by ``/``; a dict without keys, or within
-    itself, is one."""
-    # A dict that holds itself has no last leaf.
+    """Leaves of nested dicts, each with its keys joined by ``/``. An empty dict, or one that contains itself, is a leaf."""
     if (
         not isinstance(value, Mapping)
         or len(above) > _DEEPEST
@@ -92,7 +90,7 @@ def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[
 
 
 def flat_entries(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The `leaves` that are no dicts: none of an empty one; what is no dict itself is one with the name `path`."""
+    """The `leaves` that are no dicts; a value that is no dict is one leaf named `path`."""
     return ((name, held) for name, held in leaves(value, path) if not isinstance(held, Mapping))
 
 
@@ -101,7 +99,7 @@ def _key(key: Any) -> str:
 
 
 def _name(path: str, columns: Mapping[str, Any], others: Mapping[str, Any]) -> str:
-    """`path` as a file can hold it: ``a/b`` may be a key, and ``b`` of the dict ``a`` as well."""
+    """`path`, made unique and fit for a file: ``a/b`` may be a key, and also ``b`` of the dict ``a``."""
     name = plain = _clean_name(path)
     number = 2
     while name in columns or name in others:
@@ -117,7 +115,7 @@ def _clean_name(path: str) -> str:
 
 
 def _array(value: Any) -> NDArray | None:
-    """`value` as booleans or real numbers; None where it is none, or is not all there to be read."""
+    """`value` as booleans or real numbers; None if it is none or cannot be read."""
     if isinstance(value, torch.Tensor):
         return _of_tensor(value)
     if isinstance(value, np.ndarray):
@@ -134,7 +132,7 @@ def _array(value: Any) -> NDArray | None:
 
 def _of_tensor(value: torch.Tensor) -> NDArray | None:
     if value.dtype in _PLAIN and value.layout is torch.strided and value.device.type == "cpu":
-        # Nearly always; the general way takes three times as long.
+        # The common case; the general way takes three times as long.
         found = value.detach().numpy() if value.requires_grad else value.numpy()
         return found.copy()
     if value.is_complex() or value.numel() > _MOST_READ:
@@ -146,7 +144,7 @@ def _of_tensor(value: torch.Tensor) -> NDArray | None:
             value = value.float()  # numpy has no bfloat16
         found = value.numpy(force=True)
     except (RuntimeError, TypeError, NotImplementedError):
-        return None  # of the meta device, say: there is nothing to be read
+        return None  # for example of the meta device
     return found.copy()
 
 
@@ -182,7 +180,7 @@ def _other(value: Any, num_envs: int) -> OtherEntry:
 
 
 def _rows_of(value: Any) -> list[Any] | tuple[Any, ...] | NDArray | None:
-    """What there is one of for each env, if there are N of them."""
+    """The items of a value that may have one for each env."""
     if isinstance(value, (list, tuple)):
         return value
     if isinstance(value, torch.Tensor) and value.is_complex():
@@ -191,7 +189,7 @@ def _rows_of(value: Any) -> list[Any] | tuple[Any, ...] | NDArray | None:
 
 
 def type_text(value: Any) -> str:
-    """The type of a value, with the shape of an array, for a person."""
+    """Type of a value, with the shape of an array."""
     if isinstance(value, torch.Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
@@ -201,7 +199,7 @@ def type_text(value: Any) -> str:
 
 
 def _text(value: Any) -> tuple[str, bool]:
-    """`value` for a person, and whether that is all of it."""
+    """`value` as text, and whether that is all of it."""
     if isinstance(value, np.generic):
         value = str(value)  # its repr names numpy, and Python's number has digits that it has not
     if isinstance(value, str):
@@ -214,19 +212,19 @@ def _text(value: Any) -> tuple[str, bool]:
 
 
 def safe_repr(value: object) -> str:
-    """A repr of bounded length, also of an object whose own raises."""
+    """A repr of bounded length, also if the object's own raises."""
     try:
         if isinstance(value, (list, tuple, dict, set, frozenset)):
             said = _short.repr(value)
         else:
             said = repr(value)
-    except Exception as error:  # whatever an author's __repr__ raises: the value is shown all the same
+    except Exception as error:  # an author's __repr__
         return f"<{type(value).__qualname__}, whose repr raises {type(error).__name__}>"
     return _ADDRESS.sub("", said)
 
 
 def clean_text(text: str) -> str:
-    """Text that files and browsers take."""
+    """`text` with what files and browsers refuse replaced."""
     return _NOT_SHOWN.sub("\ufffd", text)
 
 
@@ -234,9 +232,9 @@ def clean_text(text: str) -> str:
 
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
-    """Said of ``evaluate()``: it must return a dict, in which ``success`` and ``fail`` are bool tensors (N,).
+    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are bool tensors (N,).
 
-    The other entries may be anything, as in ManiSkill: what has no row for each env is shown as it is (`entries`).
+    Other entries may be anything, as in ManiSkill (`split_entries`).
     """
     if not isinstance(evaluate, Mapping):
         return f"returned {_describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
@@ -250,11 +248,7 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> str | None:
-    """Said of the reward's hook: it must return a floating tensor (N,).
-
-    What is in it is the task's own affair: a NaN in one env is a value, to be seen in that env's row and on its
-    timeline while the others go on, and no wrong shape.
-    """
+    """What is wrong with a reward, or None: a floating tensor (N,). A NaN is a value, shown in that env's row."""
     said = no_reward(reward, num_envs)
     if said is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
         return said
@@ -266,7 +260,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
-    """Said of what is no real number for each env, and can be neither drawn nor recorded; truths are 0 and 1."""
+    """What is wrong with a reward that is no real number (or bool) for each env: it cannot be drawn or recorded."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
         return f"returned {_describe(reward)}; {_floating(num_envs)}"
     return None
@@ -277,12 +271,12 @@ def _floating(num_envs: int) -> str:
 
 
 def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
-    # A single truth is the row of a single env: ManiSkill and its wrappers take it, and tasks written for one env give it.
+    # Tasks written for one env return shape (), which ManiSkill and its wrappers take.
     return value.shape == (num_envs,) or (num_envs == 1 and value.ndim == 0)
 
 
 def wrong_observation(obs: object, num_envs: int) -> str | None:
-    """Said of an observation hook: every entry of the dict that it returns is an array (N, ...)."""
+    """What is wrong with an observation hook's return value, or None: a dict of arrays (N, ...)."""
     if not isinstance(obs, Mapping):
         return f"returned {_describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
     for name, value in flat_entries(obs):

@@ -21,7 +21,7 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
     Args:
         env: an unwrapped env, batched on the CPU or on the GPU.
-        task: the author's class. Not checked: that it would have built the same scene is the caller's to know.
+        task: the author's class. The caller makes sure that it builds the same scene (`authoring.reload.level`).
     """
     own: Any = type(env)
     if not issubclass(own, BatchedCpuMixin):
@@ -42,17 +42,17 @@ def can_exchange_cameras(env: BaseEnv) -> bool:
 
 
 def exchange_cameras(env: BaseEnv) -> None:
-    """Take the env's cameras out of its scene and make those that its class configures now.
+    """Replace the env's cameras by those that its class configures now.
 
-    No picture may be under way. What the class raises leaves the env without the cameras that were not made:
-    call this again with a class that works.
+    No picture may be pending. If the class raises, the env lacks the cameras that were not made: call this again with a
+    class that works.
     """
     if not env.scene.can_render():
         return
     for camera in maniskill_private.cameras(env).values():
         for component in maniskill_private.camera_components(camera):
-            # The entity stays, empty: with one fewer, SAPIEN would number the others anew in a scene that a
-            # restored snapshot makes (see `cpu_state`), and segmentation pictures name bodies by number.
+            # The entity stays, empty: with one fewer, SAPIEN would renumber the others in the scene of a restored
+            # snapshot (`cpu_state`), and segmentation pictures name bodies by number.
             component.entity.remove_component(component)
     maniskill_private.forget_cameras(env)
     with torch.random.fork_rng(devices=[]):
@@ -62,17 +62,17 @@ def exchange_cameras(env: BaseEnv) -> None:
 def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
     """Call hooks of resets and steps as ManiSkill does, to see that they work, and undo what they did.
 
-    What they write to the simulation is not applied, so PhysX knows nothing of it and goes on to the last bit as
-    it would have. Only where a hook applies or steps on its own is the state put back from a snapshot.
+    Their writes are not applied, so PhysX goes on as before, to the last bit. If a hook applies or steps on its own, the
+    state is restored from a snapshot.
 
     Args:
-        hooks: ``_initialize_episode``, which is tried on all envs and on one, and hooks without arguments.
+        hooks: ``_initialize_episode`` (called with all envs, and with one) and hooks without arguments.
 
     Returns:
-        What could not be undone, by name, and why: attributes that these hooks made, say.
+        What could not be undone (for example attributes that a hook made): name and reason.
 
     Raises:
-        Exception: whatever a hook raises; the env is as it was.
+        Exception: raised by a hook; the env is as before.
     """
     every = list(range(env.num_envs))
 
@@ -89,7 +89,7 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
 
 
 def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
-    """Do something with the author's hooks, and undo what they did; returns and raises as `rehearse_hooks`."""
+    """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
     every = list(range(env.num_envs))
     kept = take_snapshot(env)
     try:
@@ -108,6 +108,6 @@ def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
 
 
 def keep_observation_space(env: BaseEnv, obs: Any) -> None:
-    """Let the env's spaces be those of this observation; the edited hook may return another shape."""
+    """Set the env's observation space by this observation: an edited hook may return another shape."""
     if env.obs_mode != "none":
         env.update_obs_space(common.to_cpu_tensor(obs))

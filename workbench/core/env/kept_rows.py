@@ -27,9 +27,9 @@ from workbench.core.snapshots.task_attributes import Walk, look_over
 from workbench.core.snapshots.task_state import is_per_env, version_of
 
 MOST_LINES = 2000
-"""Lines of the author's after which values are looked at, in one reset."""
+"""Lines of the author's code after which values are compared, in one reset."""
 _ROUNDED = 1e-5
-"""What is computed anew of the same poses differs by so much at most: 1e-7 of a rotation was seen."""
+"""Tolerance for values computed again from the same poses: 1e-7 of a rotation was seen."""
 _ITEM = re.compile(r"\[(\d+)\]")
 
 
@@ -54,18 +54,17 @@ class KeptRows:
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
     def changes(self) -> dict[str, tuple[int, ...]]:
-        """Where rows of other envs are others now, as the task writes it without ``self.``; and of which envs: none where
-        there are rows of those only that are reset, and the others are lost."""
+        """Paths (without ``self.``) whose rows of other envs changed, and in which envs; empty if only the rows of the envs
+        being reset are left, and the others are lost."""
         now = self._read(look_over(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
         return {path: envs for path, envs in found.items() if envs is not None}
 
     def changed(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
-        """The paths whose rows elsewhere are others now.
+        """The paths whose rows of other envs changed.
 
         Args:
-            seen: what was at each path the last time, which is brought up to date: the same tensor, not written
-                since, is not compared again.
+            seen: values at the last call, updated here: a tensor that was not written since is not compared again.
         """
         now = self._read(look_over(self.env))
         for path, before in self.before.items():
@@ -78,7 +77,7 @@ class KeptRows:
         return {path for path, (_, _, differs) in seen.items() if differs}
 
     def _read(self, walk: Walk) -> dict[str, Any]:
-        """What is at the paths; of what is an env's each, a list."""
+        """The values at the paths; a list where each env has its own."""
         now = {leaf.path: leaf.value for leaf in walk.leaves}
         read = {path: now[path] for path in self._single if path in now}
         for path, each in self._groups.items():
@@ -87,14 +86,14 @@ class KeptRows:
         return read
 
     def _difference(self, before: Any, now: Any) -> tuple[int, ...] | None:
-        """Of which envs, as `changes` has it; None where nothing of other envs is another."""
+        """Envs as in `changes`; None if no row of another env changed."""
         elsewhere = self._elsewhere
         if isinstance(before, list) and isinstance(now, list):
             if len(now) == len(before):
                 return self._named([not _same(before[i], now[i]) for i in elsewhere])
             return () if len(now) == self._count else None
         if not isinstance(before, (torch.Tensor, np.ndarray)) or not isinstance(now, type(before)):
-            return None  # another kind of thing has its name now
+            return None  # the name holds another type now
         if now.shape == before.shape:
             return self._named(_differ(_array(before)[elsewhere], _array(now)[elsewhere]))
         if now.ndim and len(now) == self._count and now.shape[1:] == before.shape[1:]:
@@ -107,12 +106,12 @@ class KeptRows:
 
 
 def _is_the_tasks(path: str) -> bool:
-    # What a robot and its controllers remember is ManiSkill's to reset (`partial_reset.KeptControllers`).
+    # ManiSkill resets robots and controllers (`partial_reset.KeptControllers`).
     return path != "agent" and not path.startswith(("agent.", "agent["))
 
 
 def _paths(walk: Walk, num_envs: int) -> tuple[list[str], dict[str, list[str]]]:
-    """Of what has a row for each env; and of what is an env's each (a list of N tensors), by that of all of them."""
+    """Paths of values with a row for each env; and groups of N paths, one for each env (a list of N tensors)."""
     single, items = [], {}
     for leaf in walk.leaves:
         if not _is_the_tasks(leaf.path):
@@ -146,7 +145,7 @@ def _array(value: torch.Tensor | np.ndarray) -> np.ndarray:
 
 
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Where they do; NaN does not differ from itself."""
+    """Where they differ; NaN equals NaN."""
     if a.dtype.kind in "fc" and b.dtype.kind in "fc":
         return ~np.isclose(a, b, rtol=_ROUNDED, atol=_ROUNDED, equal_nan=True)
     return np.asarray((a != b) & ~((a != a) & (b != b)))
@@ -175,17 +174,15 @@ class _Lines:
         self._left = MOST_LINES
         self._seen: dict[str, tuple[Any, int, bool]] = {}
         self._at: Frame | None = None
-        """The line that runs."""
+        """The running line."""
         self.found: dict[str, tuple[Frame, ...]] = {}
 
     def start(self) -> None:
         if sys.gettrace() is not None or not self.rows.before:
-            return  # a debugger's, or that of a measurement of coverage
+            return  # of a debugger, or of coverage
         self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
-        while (
-            frame is not None
-        ):  # whoever called the reset and goes on after it, as the task's own `reset` does
+        while frame is not None:  # callers of the reset go on after it, as the task's own `reset` does
             if self._is_the_tasks(frame):
                 frame.f_trace = self._traced
                 self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
@@ -232,14 +229,14 @@ class _Lines:
 
 
 _TRIES = 3
-"""Partial resets of a class in which a line is looked for."""
+"""Partial resets of a class in which lines are traced."""
 
 
 class ResetWatch:
-    """Of one env. Between `start` and `tell` or `stop` it looks at the rows.
+    """Watches the partial resets of one env, from `start` to `tell` or `stop`.
 
     Args:
-        rules: What is told.
+        rules: Receives what is found.
     """
 
     def __init__(self, rules: BrokenRules) -> None:
@@ -250,9 +247,9 @@ class ResetWatch:
         self._tries = 0
         """Left of `_TRIES`."""
         self._seeks = False
-        """Lines are looked for in the next reset."""
+        """Trace lines in the next reset."""
         self.whole = False
-        """The task has a ``reset`` of its own, which is watched from its beginning to its end."""
+        """The task has its own ``reset``, which is watched as a whole."""
 
     @property
     def looks(self) -> bool:
@@ -268,18 +265,18 @@ class ResetWatch:
             self._lines.start()
 
     def go_on(self, env: BaseEnv) -> None:
-        """The same reset goes on after something that it need not answer for."""
+        """Start again within the same reset, after code that may change rows."""
         assert self._task is not None
         self.start(env, self._task, self._chosen)
 
     def stop(self) -> None:
-        """Look no further; tells nothing."""
+        """Stop watching, without a report."""
         if self._lines is not None:
             self._lines.stop()
             self._lines = None
 
     def tell(self, over: bool = True) -> None:
-        """Tell of what the reset did, or did so far where it is not over.
+        """Report what the reset changed, or has changed so far if it is not `over`.
 
         Raises:
             BrokenRule: of a rule that stops.
@@ -290,7 +287,7 @@ class ResetWatch:
         self.stop()
         found = lines.rows.changes()
         if over or found:
-            # Only where a line is missing need the next reset be slowed down.
+            # Tracing slows a reset down: only if a line is missing.
             self._tries -= self._seeks
             self._seeks = self._tries > 0 and not found.keys() <= lines.found.keys()
         for path, envs in found.items():

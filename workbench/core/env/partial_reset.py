@@ -46,7 +46,7 @@ class KeptControllers:
 
 
 def active_controllers(env: Any) -> list[BaseController]:
-    """The controllers in use, those within combined ones singly; none for a task without a robot."""
+    """The controllers in use, combined ones split; none without a robot."""
     single: list[BaseController] = []
     for agent in agents(env):
         combined = isinstance(agent.controller, CombinedController)
@@ -61,7 +61,7 @@ def others(env: Any, options: dict[str, Any] | None) -> list[int]:
 
 
 def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
-    """The envs that are to be reset, as named; None for all. ManiSkill takes -1 for the last, and none at all."""
+    """The named envs to reset; None for all. As in ManiSkill, -1 is the last env and an empty list is allowed."""
     named = options.get("env_idx")
     if named is None:
         return None
@@ -82,10 +82,10 @@ def in_ascending_order(
         seeds: what ``reset`` is given.
 
     Returns:
-        the options, and the seeds if there is one for each of several envs that are reset and not of all.
+        The options, and the seeds if there is one for each env of a partial reset.
 
     Raises:
-        TypeError, IndexError, ValueError: ``env_idx`` is a mask, or names an env that is not there, or one twice.
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask, or names an env that does not exist, or one twice.
     """
     chosen = _chosen(env, options)
     if chosen is None:
@@ -96,7 +96,7 @@ def in_ascending_order(
     made = {**options, "env_idx": rows}
     states = options.get("reset_to_env_states", {})
     if "obs" in states:
-        # ManiSkill puts them to `env_idx` row by row; the states themselves, as `set_state` does, lowest env first.
+        # ManiSkill assigns observations to `env_idx` row by row, but the states, like `set_state`, lowest env first.
         made["reset_to_env_states"] = {**states, "obs": _rows(states["obs"], order)}
     return made, [int(seeds[k]) for k in order] if one_each else None
 
@@ -111,7 +111,7 @@ def _rows(value: Any, order: list[int]) -> Any:
 def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
     """Within this a reset of these envs, lowest first, starts their episodes from these seeds.
 
-    ``BaseEnv.reset(seed=[...])`` takes the seeds for those of the whole batch, whichever envs are reset.
+    ``BaseEnv.reset(seed=[...])`` takes the list as the seeds of the whole batch.
     """
     set_episode_seeds(env, env_idx, seeds)
     devices = [env.device] if env.device.type == "cuda" else []
@@ -132,7 +132,7 @@ def explain_reset_errors(env: Any, untouched: list[int]) -> Iterator[None]:
     try:
         yield
     except BrokenRule:
-        raise  # says it all
+        raise  # has the line already
     except Exception as error:
         line = _line_of_the_task(error, env)
         lost = [] if rows is None else [path for path, envs in rows.changes().items() if not envs]
@@ -158,13 +158,13 @@ def _note(env: BaseEnv, chosen: list[int], line: Place | None, lost: list[str]) 
 
 
 def _line_of_the_task(error: Exception, env: BaseEnv) -> Place | None:
-    """The innermost line in a file of the task's classes; None where the core broke below it."""
+    """The innermost line in a file of the task's classes; None if the core failed below it."""
     files, found = files_of_task(task_class(env)), None
     for frame, line in traceback.walk_tb(error.__traceback__):
         file = frame.f_code.co_filename
         if file in files:
             found = file, line, frame.f_code.co_name
         elif file.startswith(_CORE) and not isinstance(error, ValueError):
-            # A ValueError is how the core refuses what it is given; anything else from there may be its own mistake.
+            # The core refuses arguments with a ValueError; anything else may be its own fault.
             found = None
     return found

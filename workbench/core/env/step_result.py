@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class OtherEntry:
-    """An entry of ``evaluate()`` that is no array of real numbers with a row for each env: None, a string, a mean."""
+    """An entry of ``evaluate()`` that is not real numbers with a row for each env: None, a string, a mean."""
 
     what: str
-    """Its type, for a person: ``None``, ``str``, ``float32 tensor of shape ()``."""
+    """Type as text: ``None``, ``str``, ``float32 tensor of shape ()``."""
     texts: tuple[str, ...] = ()
-    """Its value, one for the whole batch or, `per_env`, one for each env; empty where `numbers` says it."""
+    """Value as text, one for the batch or, with `per_env`, one for each env; empty if there are `numbers`."""
     numbers: NDArray | None = None
-    """(...) booleans or real numbers of the whole batch; None where it is no number."""
+    """(...) booleans or real numbers of the whole batch; None if it is no number."""
     per_env: bool = False
     whole: bool = True
-    """False where `texts` is only a part of the value, since the rest is too long."""
+    """False if `texts` is shortened."""
 
     def of_env(self, env: int) -> OtherEntry:
-        """What one env has of it; of an entry that is not per env all of it."""
+        """The part of one env; all of it if it is not per env."""
         return replace(self, texts=(self.texts[env],)) if self.per_env else self
 
     @property
@@ -51,10 +51,9 @@ class StepResult:
     action: NDArray[np.float32] | None = None
     """(N, A) that led here; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None
-    """(N,) whether all numbers of the env's observation are finite, pictures left out; None where nothing is known
-    of it."""
+    """(N,) whether the env's observation is finite, pictures left out; None if unknown."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
-    """The entries that it returned otherwise; no name is in `evaluate` too."""
+    """All other entries of ``evaluate()``; no name is also in `evaluate`."""
 
     @property
     def nbytes(self) -> int:

@@ -56,11 +56,11 @@ class StrictMixin:
     """The degree of all rules; None for each rule's own."""
     _on_finding: Callable[[Finding], None] = staticmethod(warn_of)
     _wrong_obs: tuple[str, str] | None = None
-    """The hook, and what is wrong, of an observation that is being put together."""
+    """Hook and problem of the observation that is being assembled."""
 
     @cached_property
     def broken_rules(self) -> BrokenRules:
-        """What the task broke so far; of the env, whatever becomes of its scene and its class."""
+        """Breaches so far; belongs to the env, and outlives its scene and class."""
         return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
 
     def _setup_scene(self) -> None:
@@ -157,14 +157,14 @@ class StrictMixin:
         except Exception as error:
             if self._wrong_obs is None or isinstance(error, BrokenRule):
                 raise
-            # ManiSkill cannot put it together ("Sizes of tensors must match"): the rule's words are the better ones.
+            # ManiSkill fails with "Sizes of tensors must match": the rule's message is clearer.
             hook, problem = self._wrong_obs  # type: ignore[misc]
             place = place_of_hook(self._workbench_task, hook)
             raise WrongReturn(problem, hook, "observation-rows", place) from error
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
-            # From here on only the task's own reset is at work: what `evaluate` keeps for all is no matter of it.
+            # What `evaluate` stores for all envs is no fault of the reset: compare from here on.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
 

@@ -20,6 +20,7 @@ from workbench.core.env.cpu_scene import batched_class, refuse_unbuilt_env
 from workbench.core.env.evaluate_entries import FLAGS, flat_entries, split_entries
 from workbench.core.env.partial_reset import in_ascending_order, seeded
 from workbench.core.env.step_result import StepResult
+from workbench.core.env.strict import StrictMixin
 from workbench.core.env_numbers import envs_of_batch
 from workbench.core.maniskill_private import episode_seeds, flatten_observation, keep_observation
 from workbench.core.rules import Degree, Finding, degrees_of
@@ -35,29 +36,29 @@ from workbench.core.snapshots.snapshot import (
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """How a task is made."""
+    """Options with which a task is made."""
 
     num_envs: int = 16
     backend: Backend = "auto"
     """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: see `choose_backend`."""
     render: bool = True
-    """False makes no render system: no pictures, and nothing asked of a graphics driver."""
+    """False makes no render system: no pictures, and no use of a graphics driver."""
     threads: int | None = None
-    """Threads that step the envs of the CPU core; None for one on each core that the process may use."""
+    """Threads that step the envs on the CPU; None for one on each core that the process may use."""
     rules: Degree | None = None
     """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
     on_finding: Callable[[Finding], None] = warn_of
-    """Called with each place where a rule is broken that does not stop the task, the first time."""
+    """Called once for each place where a rule that does not stop the task is broken."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... A
-    ``render_backend`` among them is used instead of the one that is found."""
+    ``render_backend`` among them replaces the one that is found."""
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
         if self.backend not in get_args(Backend):
             raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, not {self.backend!r}")
-        degrees_of(self.rules)  # raises for what is no degree
+        degrees_of(self.rules)  # raises for an unknown degree
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
 
@@ -69,12 +70,12 @@ def make_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """The task class with N envs, unwrapped, and with a reward whatever its class implements.
+    """The task class with N envs, unwrapped, with the best reward mode that it implements.
 
     Raises:
         MissingAssets: the task or its robot needs a download; names it and the command.
         BackendUnavailable: ``backend="gpu"`` on a machine that cannot.
-        Exception: whatever the author's class raises while it builds.
+        Exception: raised by the author's class while it builds.
     """
     reward = {"reward_mode": default_reward_mode(task)}
     return build_env(task, options, asset_ids=asset_ids, default_kwargs={**reward, **(default_kwargs or {})})
@@ -89,14 +90,14 @@ def build_env(
 ) -> BaseEnv:
     """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it; raises as `make_env`.
 
-    What is not among the keyword arguments is left to the class: the reward mode then is the first of
+    The class decides what the keyword arguments do not: the reward mode is then the first of
     ``SUPPORTED_REWARD_MODES``, implemented or not.
     """
     kwargs = {**(default_kwargs or {}), **options.kwargs, "num_envs": options.num_envs}
     require_assets(task.__name__, asset_ids, robots_of(task, kwargs))
-    # None is ManiSkill's other word for "none".
+    # ManiSkill also takes None for "none".
     wanted = (kwargs.get("render_backend", "found") or "none") if options.render else "none"
-    # A process has one render device: another must not be looked for when one is named.
+    # A process has one render device: do not look for another when one is named.
     backend = choose_backend(options.backend, render=wanted == "found")
     kwargs["render_backend"] = backend.render_backend if wanted == "found" else wanted
     if kwargs["render_backend"] != "none":
@@ -110,7 +111,7 @@ def build_env(
 
 
 def default_reward_mode(task: type[BaseEnv]) -> str:
-    """The richest reward that the class really implements.
+    """The richest reward mode that the class implements.
 
     ManiSkill's own default is ``normalized_dense`` whether or not the class has one, and the first
     step of a task without a dense reward then raises a bare NotImplementedError.
@@ -170,15 +171,14 @@ class TaskEnv:
     ) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
-        All at once is ManiSkill's own ``reset(seed=[...])``. For a subset, ManiSkill seeds torch with the
-        seed of env 0, whichever envs are reset, so that a seed given for env 3 means nothing; here a
-        partial reset draws from the seed of the lowest env, and ``reset(seed=7, env_idx=[3])`` starts the
-        episode that a single stock env starts with ``reset(seed=7)``. In which order envs are named, each
-        with its seed, makes no difference.
+        All at once is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with the seed of env 0, so
+        a seed given for env 3 means nothing. Here a partial reset draws from the seed of the lowest env:
+        ``reset(seed=7, env_idx=[3])`` starts the episode of a single stock env's ``reset(seed=7)``. The order in which envs
+        and their seeds are named makes no difference.
 
         Args:
-            seed: one seed for the whole batch (the i-th env that is reset gets ``seed + i``), or one for
-                each env that is reset; None goes on with the task's own random numbers.
+            seed: one seed (the i-th env that is reset gets ``seed + i``), or one for each env that is reset; None
+                continues with the task's own random numbers.
             options: further ``options`` for the task's own ``reset``.
         """
         chosen = envs_of_batch(range(self.num_envs) if env_idx is None else env_idx, self.num_envs)
@@ -195,7 +195,7 @@ class TaskEnv:
     def _partial_reset(
         self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        # Here too, as GPU simulation has only ManiSkill's own reset.
+        # Not only in the CPU mixin: GPU simulation has ManiSkill's own reset.
         options, seeds = in_ascending_order({**further, "env_idx": chosen}, seeds, self.env)
         if seeds is None:
             return self.env.reset(options=options)
@@ -221,19 +221,15 @@ class TaskEnv:
         source: int | Sequence[int] | None = None,
         fresh_physics: bool = True,
     ) -> tuple[StepResult, RestoreReport]:
-        """Put envs back, as `restore_snapshot` does, and observe and evaluate what is there now.
-
-        The step's reward is zero, as after a reset: a reward is for an action, and none was made.
-        """
+        """Restore envs, as `restore_snapshot` does, then observe and evaluate. The reward is zero, as after a reset."""
         report = restore_snapshot(self.env, snapshot, env_idx, source, fresh_physics)
         return self.rescore(), report
 
     def rescore(self, action: NDArray[np.float32] | None = None) -> StepResult:
-        """What the task says of the present moment: evaluate, observation, reward. Nothing moves.
+        """Compute ``evaluate``, observation and reward of the present state, without a step.
 
         Args:
-            action: (N, A) that led here, which the reward may ask for; None gives rewards of zero, as after a
-                reset: a reward is for an action, and none was made.
+            action: (N, A) that led here, for the reward; None gives rewards of zero, as after a reset.
         """
         reward: Any = None
         with remembering(self.env):
@@ -251,18 +247,18 @@ class TaskEnv:
 
     @property
     def observes_pictures(self) -> bool:
-        """Whether every step draws the scene for the observation."""
+        """Whether every step renders pictures for the observation."""
         return self.env.obs_mode not in ("state", "state_dict", "none")
 
     @property
     def episode_seeds(self) -> NDArray[np.int64]:
-        """(N,) the seeds that the envs were last reset with."""
+        """(N,) seeds of the last resets."""
         return np.array(episode_seeds(self.env), dtype=np.int64)
 
     @property
     def broken_rules(self) -> BrokenRules | None:
-        """What the task broke of the rules of GPU simulation; None where none is checked."""
-        return getattr(self.env, "broken_rules", None)
+        """Breaches of the rules of GPU simulation; None if no rule is checked."""
+        return self.env.broken_rules if isinstance(self.env, StrictMixin) else None
 
     def close(self) -> None:
         self.env.close()
@@ -276,9 +272,11 @@ class TaskEnv:
         truncated: Any = None,
         look: bool = True,
     ) -> StepResult:
-        """What a step or a reset (no action) gave, also one that went past this object; `look` for `StepResult.sound_obs`.
+        """The result of a step or (without an action) a reset, also of one made on `env` itself.
 
-        Where it is not said which episodes ended, `info` and the time limit say it.
+        Args:
+            terminated, truncated: None to take them from `info` and the time limit.
+            look: whether to compute `StepResult.sound_obs`.
         """
         count = self.num_envs
         elapsed = _column(self.env.elapsed_steps, np.int32, count)
@@ -311,7 +309,7 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
 
 
 def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
-    """As `StepResult.sound_obs`; what is no batch of floats is sound."""
+    """`StepResult.sound_obs`; what is no batch of floats is sound."""
     sound = np.ones(num_envs, bool)
     for name, value in flat_entries(obs):
         # Pictures are large, and the simulator's own.
@@ -323,14 +321,14 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
 
 
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
-    """(N, ...), a copy: one value for all envs, as of a task that is written for one env, is repeated for each."""
+    """(N, ...), a copy; a single value, as of a task written for one env, is repeated."""
     array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
     batched = array.ndim > 0 and len(array) == num_envs
     return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()
 
 
 def to_numpy(value: Any) -> NDArray[Any]:
-    """A copy on the host, so that what was returned does not change with the next step."""
+    """A copy on the host, which the next step does not change."""
     if isinstance(value, torch.Tensor):
         return value.numpy(force=True).copy()
     return np.array(value)

@@ -21,10 +21,10 @@ from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry,
 from workbench.core.scene.simplify import drop_uvs, flat_rectangle, reduce_mesh, with_normals
 
 _FLAT_FACES = 100
-"""Meshes of more faces than this are tried as a flat rectangle."""
+"""Meshes with more faces are tested for being a flat rectangle."""
 _KEPT_MESHES = 1000
 MOST_FACES = 800
-"""Of a visual: a Panda of 136,000 triangles becomes 14,000 and still looks like one."""
+"""Most faces of a visual: a Panda of 136,000 triangles becomes 14,000 and looks the same."""
 MOST_TEXELS = 1024
 """On the longest side of a texture."""
 
@@ -32,13 +32,13 @@ MOST_TEXELS = 1024
 _GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
 """Linear grey: what moves is lighter than what it stands on."""
 _PLANE_HALF_SIZE = 50.0
-"""PhysX planes have no end; this is half the width that ManiSkill's ground has by default."""
+"""PhysX planes are infinite; this is half the default width of ManiSkill's ground."""
 _X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """One mesh with one material on one body of one env, not read yet."""
+    """A mesh with its material on one body of one env, not read yet."""
 
     key: Hashable
     """Parts with equal keys look the same."""
@@ -109,7 +109,7 @@ def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
 
 
 class _RenderWalk:
-    """One walk over the render bodies of a scene; remembers the textures that it met."""
+    """One walk over the render bodies of a scene; keeps the textures that it found."""
 
     def __init__(self, max_faces: int, max_texels: int) -> None:
         self._max_faces, self._max_texels = max_faces, max_texels
@@ -119,7 +119,7 @@ class _RenderWalk:
         body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
         if body is None:
             return
-        # 0 is a body that ManiSkill hides at the moment; anything else is meant: a ghost, a glass.
+        # 0 is a body that ManiSkill hides now; other values are intended: a ghost, a glass.
         visibility = body.visibility or 1.0
         for shape in body.render_shapes:
             place = _Placement.of(shape)
@@ -141,7 +141,7 @@ class _RenderWalk:
         color = material.base_color
         texture = self._texture_index(material.base_color_texture)
         if texture is not None:
-            # SAPIEN's shaders put the texture in place of the colour; glTF would multiply the two.
+            # SAPIEN's shaders replace the colour by the texture; glTF multiplies the two.
             color = [1.0, 1.0, 1.0, 1.0]
         rgba = (float(color[0]), float(color[1]), float(color[2]), float(color[3]) * visibility)
         return Material(rgba, float(material.metallic), float(material.roughness)), texture
@@ -165,14 +165,14 @@ class _RenderWalk:
 
 @dataclass(frozen=True)
 class _Source:
-    """Triangles before scale and pose: of a file, a primitive, or made in code."""
+    """Triangles before scale and pose: from a file, a primitive, or made in code."""
 
     key: Hashable
     part: Any
     dimensions: tuple[float, float, float]
-    """What the vertices are multiplied by; SAPIEN keeps primitives as unit shapes."""
+    """Factors of the vertices; SAPIEN keeps primitives as unit shapes."""
     keep: bool
-    """Whether the reduced mesh is worth keeping for the next scene."""
+    """Whether to keep the reduced mesh for the next scene."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class _Placement:
         vertices = (mesh.vertices * scale) @ rotation.T + np.array(self.position)
         normals = None
         if mesh.normals is not None:
-            # Normals go by the inverse transpose, or they lean where the scale is uneven.
+            # Normals transform by the inverse transpose: an uneven scale would tilt them.
             normals = (mesh.normals / np.where(scale == 0, 1.0, scale)) @ rotation.T
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
             normals = normals.astype(np.float32)
@@ -240,7 +240,7 @@ def _source(shape: Any, part: Any, index: int) -> _Source:
 
 
 def _file_version(filename: str) -> tuple[int, int] | None:
-    """Changes when the file does: an author edits meshes too."""
+    """Changes when the file changes: an author edits meshes too."""
     try:
         stat = os.stat(filename)
     except OSError:
@@ -295,7 +295,7 @@ def _read_part(source: _Source) -> Mesh:
 
 
 def _rgba(texture: Any, max_size: int) -> NDArray[np.uint8]:
-    """(H, W, 4) pixels of a ``RenderTexture2D``, sRGB encoded whatever it holds."""
+    """(H, W, 4) pixels of a ``RenderTexture2D``, converted to sRGB."""
     pixels = np.asarray(texture.download())
     if pixels.dtype == np.uint8 and pixels.shape[-1] == 4 and texture.is_srgb:
         return _at_most(pixels, max_size)
@@ -327,7 +327,7 @@ def _at_most(pixels: NDArray[np.uint8], max_size: int) -> NDArray[np.uint8]:
 
 
 def _collision_shape(shape: Any) -> tuple[Hashable, Callable[[], Mesh]]:
-    """Key, and what makes the mesh. PhysX's capsules, cylinders and planes lie along x."""
+    """Key, and the function that makes the mesh. PhysX's capsules, cylinders and planes lie along x."""
     if isinstance(shape, physx.PhysxCollisionShapeBox):
         half = shape.half_size.tolist()
         return ("box", *half), lambda: _mesh(trimesh.creation.box(extents=2 * np.array(half)))
@@ -368,7 +368,7 @@ def _plane() -> Mesh:
 
 
 def _oriented(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> Mesh:
-    """Triangles turned outwards where the whole says they look in: a mirrored scale turns them round."""
+    """Triangles facing outwards: a mirrored scale (negative volume) turns them round."""
     corners = vertices[triangles].astype(np.float64)
     volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     faces = np.asarray(triangles, np.uint32)

@@ -19,7 +19,7 @@ _T = TypeVar("_T")
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
-    """``find(env)``, called once for each scene that the env has; the scene holds what it gave, which goes with it."""
+    """Cache ``find(env)`` on the env's scene, so that it is called once a scene."""
     name = f"_workbench {find.__module__}.{find.__qualname__}"
 
     @wraps(find)
@@ -49,35 +49,34 @@ class SceneIndex:
     owners: tuple[str, ...]
     """(B,) the actor's name again, or the articulation's."""
     hidden: tuple[bool, ...]
-    """(B,) True for what the task hides from its sensors."""
+    """(B,) whether the task hides it from its sensors."""
     entities: NDArray[np.object_]
-    """(N, B) the ``sapien.Entity`` of each body in each env, None where an env lacks it."""
+    """(N, B) the ``sapien.Entity`` of each body; None if the env lacks it."""
     states: dict[str, Any]
-    """ManiSkill's structs by their names in its state dict: ``actors/cube`` but for static ones, ``articulations/panda``."""
+    """ManiSkill's structs by their names in its state dict: ``actors/cube`` (no static ones), ``articulations/panda``."""
     actors: tuple[tuple[Any, NDArray[np.int64]], ...]
-    """Every Actor that can be hidden, merged ones and their parts alike, with the slots of its entities: where they are
-    in the flattened (N * B) array of bodies, -1 for one that is not there."""
+    """Every Actor, merged ones and their parts, with the slots of its entities: positions in the flattened (N * B) array
+    of bodies, -1 if absent."""
     fixed: NDArray[np.float32]
     """(N, B, 7) poses of static bodies; NaN elsewhere. Only used with `rows`."""
     rows: Any
     """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``, for `rows_of`; None on a stock CPU env."""
     slots: NDArray[np.int64]
-    """(K,) where each of `rows` goes."""
+    """(K,) the slot of each of `rows`."""
     slot_of: dict[int, int]
-    """``id`` of an entity to its slot. The entities are held by `entities`, so ids stay theirs."""
+    """``id`` of an entity to its slot; `entities` keeps the entities alive, so ids stay valid."""
 
     def name_of(self, entity: Any) -> str | None:
-        """The body that an entity is, or the entity of a SAPIEN component; None for what ManiSkill does not manage."""
+        """Body name of an entity or SAPIEN component; None if ManiSkill does not manage it."""
         slot = self.slot_of.get(id(_entity(entity)))
         return None if slot is None else self.names[slot % len(self.names)]
 
 
 @once_a_scene
 def scene_index(env: Any) -> SceneIndex:
-    """The index of the scene that a ManiSkill env (unwrapped, reset at least once) has now.
+    """The index of the present scene of a ManiSkill env (unwrapped, reset at least once).
 
-    Bodies are all actors, then all links of all articulations, each by the name of the merged view
-    that it is part of, if any.
+    Bodies are all actors, then all links of all articulations, by the name of their merged view if there is one.
 
     Raises:
         NotImplementedError: the env was made with ``parallel_in_single_scene``.
@@ -93,7 +92,7 @@ def scene_index(env: Any) -> SceneIndex:
     owners: list[str] = []
     columns: list[list[Any]] = []
     for owner, name, structs in _named_structs(scene):
-        # Nothing forbids an actor that is called "panda/panda_hand".
+        # An actor may be called "panda/panda_hand".
         while name in names:
             name += "'"
         names.append(name)
@@ -152,18 +151,18 @@ def scene_index(env: Any) -> SceneIndex:
 def read_poses(env: Any) -> NDArray[np.float32]:
     """(N, B, 7) float32 pose of every body in its env's own frame: p in metres, q as wxyz.
 
-    NaN for bodies that an env does not have. What is hidden now is where it would be if it were shown.
+    NaN for bodies that an env lacks; the true pose for hidden ones.
     """
     index = scene_index(env)
     poses = index.fixed.copy()
     flat = poses.reshape(-1, 7)
     if index.rows is None:
-        # A stock CPU env, which has no such tensor and moves nothing in order to hide it.
+        # A stock CPU env has no such tensor, and does not move what it hides.
         for slot, entity in enumerate(index.entities.ravel()):
             if entity is not None:
                 flat[slot] = [*entity.pose.p, *entity.pose.q]
         return poses
-    # Gathered on the tensor's own device: one small copy to the host, not the whole buffer.
+    # Gathered on the tensor's device: one small copy to the host.
     moved = rows_of(env.scene.px.cuda_rigid_body_data, index.rows)[:, :7]
     flat[index.slots] = moved if isinstance(moved, np.ndarray) else moved.cpu().numpy()
     for slots, kept in hidden_poses(env):
@@ -172,9 +171,9 @@ def read_poses(env: Any) -> NDArray[np.float32]:
 
 
 def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """Of each Actor that is hidden now: the slots (M,) of its entities, and where they really are (M, 7).
+    """For each hidden Actor: the slots (M,) of its entities and their true poses (M, 7).
 
-    On the CPU the poses are what ManiSkill keeps of them, to be written to, and no copy.
+    On the CPU the poses are ManiSkill's own array, which callers write to.
     """
     for actor, slots in scene_index(env).actors:
         if actor.hidden and (kept := maniskill_private.pose_before_hiding(actor)) is not None:
@@ -182,15 +181,15 @@ def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float
 
 
 def present_states(env: Any) -> dict[str, Any]:
-    """(N, D) of each of `SceneIndex.states`, as its ``get_state()`` lays it out; NaN in the envs without it.
+    """(N, D) of each of `SceneIndex.states` of a batched env, laid out as by ``get_state()``; NaN in envs without it.
 
-    Of a batched env. Tensors, or on the CPU arrays; copies of the simulation's own.
+    Copies: tensors, or arrays on the CPU.
     """
     return state_rows(env).states()
 
 
 class StateRows(NamedTuple):
-    """What the states of a moment are made of: copies, in as few calls as there are tensors."""
+    """Copies from which the states of a moment are made, one call for each tensor."""
 
     still: list[int]
     places: dict[str, tuple[Any, int | None, Any, int]]
@@ -199,7 +198,7 @@ class StateRows(NamedTuple):
     qpos: Any
     qvel: Any
     asked: dict[str, Any]
-    """States that are in none of these."""
+    """States that are in none of these tensors."""
 
     def states(self) -> dict[str, Any]:
         """As `present_states`."""
@@ -219,7 +218,7 @@ class StateRows(NamedTuple):
 
 
 def state_rows(env: Any) -> StateRows:
-    """Of the present moment, for who has time for `present_states` later."""
+    """Copy the present moment; ``states()`` then does the slow part of `present_states`."""
     rows, still, places = _places_of_states(env)
     px = env.scene.px
     asked = {
@@ -234,8 +233,8 @@ def state_rows(env: Any) -> StateRows:
 
 @once_a_scene
 def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, int | None, Any, int]]]:
-    """Rows (N, B) of ``cuda_rigid_body_data``; which of the B are moved by the task and have no velocity; of each state
-    its struct and, if all envs have it, which of the B it is, and of an articulation its rows (N,) and joints."""
+    """Rows (N, B) of ``cuda_rigid_body_data``; the columns B of kinematic bodies, which have no velocity; and of each state its
+    struct and, if all envs have it, its column, and of an articulation its rows (N,) and number of joints."""
     every, rows, still = np.arange(env.num_envs), [], []
     places: dict[str, tuple[Any, int | None, Any, int]] = {}
     for name, struct in scene_index(env).states.items():
@@ -255,8 +254,7 @@ def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, in
 
 
 def in_every_env(env: Any, struct: Any, value: Any) -> Any:
-    """(N, ...) of what a struct gives for the envs that have it, NaN in the others; all NaN where there is no such
-    struct that could say which envs they are."""
+    """(N, ...) from a struct's value for the envs that have it, NaN in the others; all NaN if the struct is unknown."""
     if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
         return value
     whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)
@@ -267,19 +265,19 @@ def in_every_env(env: Any, struct: Any, value: Any) -> Any:
 
 
 def row_index(rows: torch.Tensor) -> Any:
-    """(K,) rows of a tensor of the simulation, as `rows_of` takes them: on its own device, on the CPU an array."""
+    """(K,) rows for `rows_of`: on the tensor's device, or an array on the CPU."""
     return rows.long().numpy() if rows.is_cpu else rows.long()
 
 
 def rows_of(tensor: Any, rows: Any) -> Any:
-    """(K, D) of a tensor of the simulation, copied; an array on the CPU, where numpy's calls on a few hundred numbers
-    take a quarter of torch's."""
+    """(K, D) copy from a tensor of the simulation; an array on the CPU, where numpy takes a quarter of torch's time for a
+    few hundred numbers."""
     data = tensor.torch()
     return data.numpy().take(rows, axis=0) if data.is_cpu else data[rows]
 
 
 def _named_structs(scene: Any) -> Iterator[tuple[str, str, list[Any]]]:
-    """The articulation ("" for an actor), the name, and the structs of each body in turn."""
+    """The articulation ("" for an actor), name and structs of each body."""
     for name, actors in _merged(scene.actors, scene.actor_views):
         yield "", name, actors
     for name, articulations in _merged(scene.articulations, scene.articulation_views):
@@ -292,11 +290,10 @@ def _named_structs(scene: Any) -> Iterator[tuple[str, str, list[Any]]]:
 
 
 def _merged(structs: dict[str, Any], views: dict[Any, Any]) -> Iterator[tuple[str, list[Any]]]:
-    """The structs by name, together those that are parts of one merged view."""
+    """Structs by name; parts of one merged view together."""
     view_of: dict[int, str] = {}
     for name, view in views.items():
-        # Two objects of one env under one view (merging is not bound to one an env) cannot be one
-        # column of the array: those keep their own names.
+        # Two objects of one env under one view cannot share a column: they keep their own names.
         if len(set(maniskill_private.envs_of(view))) == len(maniskill_private.objects_of(view)):
             for thing in maniskill_private.objects_of(view):
                 view_of.setdefault(id(thing), str(name if name is not None else view.name))

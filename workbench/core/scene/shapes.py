@@ -15,14 +15,14 @@ BodyKind = Literal["link", "dynamic", "kinematic", "static"]
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles in the frame of the body that wears them (local pose and scale are applied)."""
+    """Triangles in the frame of their body, with local pose and scale applied."""
 
     vertices: NDArray[np.float32]
     """(V, 3) metres."""
     faces: NDArray[np.uint32]
     """(F, 3) indices into `vertices`, counter-clockwise seen from outside."""
     normals: NDArray[np.float32] | None = None
-    """(V, 3) unit length, or None where the source gave none."""
+    """(V, 3) unit length, or None if the source has none."""
     uvs: NDArray[np.float32] | None = None
     """(V, 2), or None where there is no texture. As in glTF and SAPIEN: (0, 0) is the top left corner
     of the first row, v grows downwards, and values outside 0..1 repeat the texture. trimesh and OBJ
@@ -31,7 +31,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Material:
-    """A SAPIEN ``RenderMaterial`` as far as a browser can show it."""
+    """The part of a SAPIEN ``RenderMaterial`` that a browser can show."""
 
     base_color: tuple[float, float, float, float]
     """RGBA in 0..1, *linear*, as SAPIEN and glTF (``baseColorFactor``) mean it; see `srgb_color`.
@@ -43,7 +43,7 @@ class Material:
 
     @property
     def srgb_color(self) -> tuple[float, float, float, float]:
-        """`base_color` as a colour picker or CSS would say it: RGB sRGB encoded, alpha unchanged."""
+        """`base_color` as in CSS: RGB sRGB encoded, alpha unchanged."""
         r, g, b = srgb(np.array(self.base_color[:3])).tolist()
         return r, g, b, self.base_color[3]
 
@@ -55,7 +55,7 @@ def srgb(linear: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Visual:
-    """One mesh with one material, and every (env, body) that wears it."""
+    """One mesh with one material, and every (env, body) that has it."""
 
     name: str
     """Readable and unique in the scene, for example ``panda/panda_hand/0``."""
@@ -82,7 +82,7 @@ class SceneGeometry:
     body_kinds: tuple[BodyKind, ...]
     """(B,)"""
     body_hidden: tuple[bool, ...]
-    """(B,) True for what the task hides from sensors (goal markers: ``_hidden_objects``)."""
+    """(B,) whether the task hides it from sensors (goal markers: ``_hidden_objects``)."""
     visuals: tuple[Visual, ...]
 
 
@@ -90,7 +90,7 @@ class SceneGeometry:
 
 
 def fingerprint(visuals: tuple[Visual, ...]) -> str:
-    """The same for visuals that look the same, also when another load made them anew."""
+    """Digest that is equal for visuals that look the same, also after another load."""
     digest = hashlib.blake2b(digest_size=16)
     for visual in visuals:
         mesh, material = visual.mesh, visual.material
@@ -112,10 +112,10 @@ class SharedShapes:
         self._known: dict[str, tuple[Mesh, Material]] = {}
         self._marked: dict[Hashable, tuple[str, Mesh, Material]] = {}
         self._kept: dict[tuple[int, int], tuple[Mesh, Material]] = {}
-        """By the ids of the two: those that are given out, which need not be looked at again."""
+        """By their ids: those given out, which need no digest again."""
 
     def share(self, geometry: SceneGeometry) -> SceneGeometry:
-        """The same scene, with meshes and materials of earlier ones where they look the same."""
+        """The same scene, with earlier meshes and materials that look the same."""
         return replace(geometry, visuals=tuple(self._shared(geometry.visuals)))
 
     def shared(self, mesh: Mesh, material: Material) -> tuple[Mesh, Material]:
@@ -129,11 +129,11 @@ class SharedShapes:
         return kept
 
     def learn(self, mark: Hashable, name: str, mesh: Mesh, material: Material) -> None:
-        """What lies in a file under this mark, for who meets the mark again."""
+        """Store what a file has under this mark."""
         self._marked[mark] = (name, mesh, material)
 
     def known(self, mark: Hashable) -> tuple[str, Mesh, Material] | None:
-        """What was learnt of that mark: the visual's name and its looks."""
+        """Name, mesh and material stored for that mark."""
         return self._marked.get(mark)
 
     def _shared(self, visuals: Iterable[Visual]) -> Iterable[Visual]:

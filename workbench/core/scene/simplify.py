@@ -14,10 +14,10 @@ from scipy.spatial import KDTree
 from workbench.core.scene.shapes import Mesh
 
 _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
-"""Neighbouring faces that bend less than this are shaded as one smooth surface."""
+"""Neighbouring faces at a smaller angle are shaded as one smooth surface."""
 _DENSE = 60_000
-"""Above so many faces a mesh is a whole CAD assembly, whose vertices are snapped to a grid at once:
-quadric collapse alone would take seconds and get stuck."""
+"""A mesh with more faces is a CAD assembly, whose vertices are first snapped to a grid: quadric collapse alone takes
+seconds and gets stuck."""
 _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
@@ -33,8 +33,7 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees), and
     normals are made again, sharp at edges and smooth elsewhere.
 
-    One of many loose pieces may keep up to twice as many, and a textured one more, because the edges of
-    its pieces of texture are kept as they are.
+    A mesh of many loose pieces may keep up to twice as many, and a textured one more: edges of its texture pieces stay.
     """
     if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
         return mesh
@@ -68,8 +67,7 @@ def with_normals(mesh: Mesh) -> Mesh:
     length = np.linalg.norm(weighted, axis=1, keepdims=True)
     unit = weighted / np.maximum(length, 1e-20)
 
-    # Every pair (a, b) of corners that share a vertex: b's face counts for a's normal if it bends
-    # little against a's face.
+    # Every pair (a, b) of corners that share a vertex: b's face counts for a's normal if the angle is small.
     order = np.argsort(corners, kind="stable")
     counts = np.bincount(corners, minlength=len(mesh.vertices))
     start = np.concatenate([[0], np.cumsum(counts)])[:-1]
@@ -82,7 +80,7 @@ def with_normals(mesh: Mesh) -> Mesh:
         [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)],
         axis=1,
     ).astype(np.float64)
-    # A face without area sums to nothing, and a zero normal is drawn black.
+    # A face without area has a zero normal, which is drawn black.
     empty = np.linalg.norm(normals, axis=1) < 1e-20
     normals[empty] = [0.0, 0.0, 1.0]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -143,14 +141,14 @@ def drop_uvs(mesh: Mesh) -> Mesh:
 def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
     """(V, 3) normals of the nearest vertices of `source` that face the same way.
 
-    A few large faces make a round surface look dented when their own normals shade it.
+    Shaded with its own normals, a round surface of few large faces looks dented.
     """
     assert reduced.normals is not None and source.normals is not None
     count = min(8, len(source.vertices))
     near = np.asarray(KDTree(source.vertices).query(reduced.vertices, k=count)[1]).reshape(-1, count)
     candidates = source.normals[near]
     alike = np.einsum("vkj,vj->vk", candidates, reduced.normals)
-    # The nearest that agrees; where a face was folded over none does, and the most alike is taken.
+    # The nearest that agrees; on a folded face none does, and the most similar is taken.
     choice = np.where(
         (alike > _CREASE_COSINE).any(axis=1), (alike > _CREASE_COSINE).argmax(axis=1), alike.argmax(axis=1)
     )
@@ -162,7 +160,7 @@ def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
 def _weld(
     vertices: NDArray[np.float32], faces: NDArray, uvs: NDArray[np.float32] | None, cells: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
-    """One vertex for all that lie in one cell of a grid (and have one uv); faces that vanish are dropped."""
+    """Merge vertices in one cell of a grid (with the same uv); drop faces that vanish."""
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
     grid = np.round((vertices - vertices.min(axis=0)) / extent * cells).astype(np.int64)
     key = (grid[:, 0] << 42) | (grid[:, 1] << 21) | grid[:, 2]
@@ -172,7 +170,7 @@ def _weld(
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     welded = inverse.reshape(-1)[faces]
     if cells < _WELD_CELLS:
-        # Surfaces that a coarse grid lays upon each other would be drawn twice, and flicker.
+        # Surfaces that a coarse grid makes coincide would flicker.
         welded = welded[np.sort(np.unique(np.sort(welded, axis=1), axis=0, return_index=True)[1])]
     whole = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
     return vertices[first], welded[whole], None if uvs is None else uvs[first]
@@ -190,7 +188,7 @@ def _collapse(
     triangles = np.ascontiguousarray(faces, dtype=np.int32)
     if uvs is None:
         new_points, new_faces = _collapse_pieces(points, triangles, max_faces)
-        # Where a quadric is nearly singular its optimum can lie anywhere: a spike out of the surface.
+        # The optimum of a nearly singular quadric can be anywhere: a spike out of the surface.
         distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
         spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
@@ -200,7 +198,7 @@ def _collapse(
         points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True
     )[-1]
     new_points, new_faces, new_index = fast_simplification.replay_simplification(points, triangles, collapses)
-    # The old vertex that lies nearest to where its group ended up lends its uv.
+    # The uv of the old vertex nearest to the new one.
     order = np.argsort(-np.linalg.norm(points - new_points[new_index], axis=1), kind="stable")
     new_uvs = np.zeros((len(new_points), 2), dtype=np.float32)
     new_uvs[new_index[order]] = uvs[order]
@@ -210,9 +208,9 @@ def _collapse(
 def _collapse_pieces(
     points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Collapse each connected piece by itself, with a share of the triangles after its area.
+    """Collapse each connected piece by itself, with a share of the triangles by its area.
 
-    To a quadric a flat disc costs nothing to lose; taken together with a round housing, the lid goes first.
+    Losing a flat disc costs a quadric nothing: together with a round housing, its lid goes first.
     """
     count = len(points)
     edges = coo_matrix(

@@ -42,7 +42,7 @@ STATE_PROPERTIES: tuple[tuple[type, str, Group], ...] = (
     (ArticulationJoint, "drive_target", "targets"),
     (ArticulationJoint, "drive_velocity_target", "targets"),
 )
-"""Where ManiSkill keeps what an author reads and sets, and what it is fetched and applied with."""
+"""ManiSkill's properties of state, and the group of tensors that each is fetched and applied with."""
 
 TARGET_SETTERS = ("set_joint_drive_targets", "set_joint_drive_velocity_targets")
 
@@ -65,7 +65,7 @@ def install_struct_access() -> None:
 
 
 def _rows(struct: Any, group: Group) -> torch.Tensor:
-    """Rows of the group's tensor that hold `struct`, one an env."""
+    """Rows of `struct` in the group's tensor, one an env."""
     if group in ("bodies", "links"):
         body: Any = struct.root if isinstance(struct, Articulation) else struct
         return body._body_data_index
@@ -79,7 +79,7 @@ def _checked_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Call
         system = self.scene.px
         if velocity and group == "bodies" and self.px_body_type == "static" and batched_system(self.scene):
             raise RuntimeError(f"'{self.name}' is static: it has no velocity on the GPU, nor here.")
-        # A hidden actor's pose is not in the tensors, nor is a static one's.
+        # Poses of hidden and static actors are not in the tensors.
         if type(system) is StrictCpuSystem and group != "targets" and system.laid_out:
             if not (group == "bodies" and (self.px_body_type == "static" or self.hidden)):
                 system.about_to_read(self, group, _rows(self, group))
@@ -89,7 +89,7 @@ def _checked_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Call
 
 
 def _checked_writes(stock: Callable[..., None], name: str, group: Group) -> Callable[..., None]:
-    # "targets" is what an author may call the value of `set_joint_drive_targets`.
+    # Authors may pass the value of `set_joint_drive_targets` as the keyword "targets".
     def put(self: Any, targets: Any, *args: Any, **kwargs: Any) -> None:
         system = batched_system(self.scene)
         if system is None:
@@ -120,12 +120,12 @@ def _checked_writes(stock: Callable[..., None], name: str, group: Group) -> Call
 
 
 def _mask(struct: Any) -> torch.Tensor:
-    """(M,) which of the objects behind `struct` a setter writes now."""
+    """(M,) which of the struct's objects a setter writes now."""
     return struct.scene._reset_mask[struct._scene_idxs.long()]
 
 
 def _explain_single_joint(joint: ArticulationJoint, name: str, error: Exception) -> None:
-    """Raise in better words if it was ManiSkill's own index of a joint that `error` stopped at."""
+    """Raise a clear error if `error` comes from ManiSkill's own index of a joint."""
     wanted, every = int(_mask(joint).sum()), len(joint._objs)
     if not 1 < wanted < every:
         return
@@ -138,7 +138,7 @@ def _explain_single_joint(joint: ArticulationJoint, name: str, error: Exception)
 
 
 def _explain(struct: Any, value: Any, name: str, error: Exception) -> None:
-    """Raise in better words if it was the batch size of `value` that `error` stopped at."""
+    """Raise a clear error if `error` comes from the batch size of `value`."""
     wanted = int(_mask(struct).sum())
     value = vectorize_pose(value) if name == "pose" else common.to_tensor(value)
     if value.ndim < 2 or len(value) in (1, wanted):
@@ -185,10 +185,10 @@ GUARDED: dict[type, dict[str, str]] = {
         "add_force_torque": "Actor.apply_force()",
     },
 }
-"""Properties with a setter of the same name, ``set_...``, and methods; and what to use in their place."""
+"""Properties (also their ``set_...``) and methods, and what to use instead."""
 
 _strict_systems: weakref.WeakSet[StrictCpuSystem] = weakref.WeakSet()
-"""Asked for their scenes each time, since a restored snapshot gives an env another scene."""
+"""Their scenes are read at each call, since a restored snapshot gives an env another scene."""
 
 
 def guard_scenes(system: StrictCpuSystem) -> None:
@@ -253,7 +253,7 @@ def _refuse(owner: Any, called: str, instead: str) -> None:
 
 
 def _entity(owner: Any) -> Any:
-    """The entity of a physical thing; None for cameras, lights and whatever else has a pose."""
+    """The entity of a physical body; None for cameras, lights and others."""
     if isinstance(owner, physx.PhysxArticulation):
         return owner.links[0].entity
     if isinstance(owner, physx.PhysxArticulationJoint):

@@ -17,7 +17,7 @@ _Key = int | tuple[int, int]
 
 
 class CpuArray:
-    """Stands where SAPIEN's ``CudaArray`` stands on the GPU: something with ``.torch()``."""
+    """A CPU tensor in place of SAPIEN's ``CudaArray``."""
 
     def __init__(self, tensor: torch.Tensor) -> None:
         self._tensor = tensor
@@ -32,14 +32,14 @@ class CpuArray:
 
 @dataclass(eq=False)
 class ImpulseQuery:
-    """Net contact impulse of each of some bodies; or of each of some pairs, on the first body by the second."""
+    """Net contact impulses of bodies, or of pairs: on the first body by the second."""
 
     held: Sequence[Any]
-    """The bodies or pairs, because pybind11 gives one Python object a body only while it is alive: see `rows`."""
+    """The bodies or pairs, kept alive: pybind11 keeps one Python object a body only while it lives, and `rows` has ids."""
     cuda_impulses: CpuArray
     """(len(held), 3) newton seconds of the last substep."""
     rows: Mapping[_Key, Sequence[tuple[int, int]]]
-    """Row of each body, and the sign 1; or row and sign (1 or -1) of each pair, in both orders."""
+    """Row and sign 1 of each body; or row and sign (1 or -1) of each pair, in both orders."""
 
 
 @dataclass
@@ -57,7 +57,7 @@ class ContactReader:
     _wanted: set[_Key] = field(default_factory=set)
     _cache: list[tuple[tuple[int, int], NDArray[np.float32]]] | None = None
     _carried: dict[int, list[tuple[tuple[int, int], NDArray[np.float32]]]] = field(default_factory=dict)
-    """What stands for the list of a system whose state was restored; see `carry`."""
+    """Contacts of systems whose state was restored; see `carry`."""
 
     def create_body_query(self, bodies: Sequence[physx.PhysxRigidBaseComponent]) -> ImpulseQuery:
         return self._create([*bodies], [(i, id(body), 1) for i, body in enumerate(bodies)])
@@ -73,8 +73,7 @@ class ContactReader:
         for row, key, sign in what:
             rows.setdefault(key, []).append((row, sign))
         query = ImpulseQuery(held, CpuArray(torch.zeros((len(held), 3))), rows)
-        # Weakly held, and the wants gathered anew: a task that asks about other objects after every
-        # reset makes new queries each time, and those that it dropped must cost nothing.
+        # Held weakly: a task may make new queries after every reset, and those that it dropped must cost nothing.
         self._queries.add(query)
         self._wanted = {key for query in self._queries for key in query.rows}
         self._cache = None
@@ -84,14 +83,14 @@ class ContactReader:
         self._cache = None
 
     def stepped(self, but: Collection[int] = ()) -> None:
-        """A substep was made of all systems but these: their own lists hold again."""
+        """All systems but these made a substep: their own lists are valid again."""
         self._cache = None
         self._carried = {env: touching for env, touching in self._carried.items() if env in but}
 
     def carry(self, system: int, contacts: list[tuple[tuple[int, int], NDArray[np.float32]]]) -> None:
-        """Answer for one system with these, as `counted` gives them, until the next substep.
+        """Answer for one system with these contacts, as of `counted`, until its next substep.
 
-        PhysX's own list would be that of its last substep, though the state is another since.
+        PhysX's own list is that of its last substep, before the state was restored.
         """
         self._carried[system] = contacts
         self._cache = None
@@ -103,7 +102,7 @@ class ContactReader:
             for key in (pair, first):
                 for row, sign in rows.get(key, ()):
                     total[row] += impulse * sign
-            # Not both: stock ManiSkill counts a contact for its first body only when the two are one.
+            # If both are one body, stock ManiSkill counts the contact for the first only.
             for row, _ in rows.get(second, ()) if second != first else ():
                 total[row] -= impulse
         query.cuda_impulses.torch().copy_(torch.from_numpy(total))
@@ -121,7 +120,7 @@ class ContactReader:
                     a, b = contact.bodies
                     first, second = pair = id(a), id(b)
                     if pair in wanted or first in wanted or second in wanted:
-                        # What np.sum does, without its three wrappers.
+                        # np.sum without its three wrappers.
                         impulse = np.add.reduce([point.impulse for point in contact.points], axis=0)
                         found.append((pair, impulse))
         return self._cache

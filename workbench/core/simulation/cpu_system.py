@@ -25,26 +25,22 @@ _TOO_EARLY = (
 
 
 def _uncommon_member(name: str) -> Any:
-    """What a `BatchedCpuSystem` answers for a member that it does not define.
+    """Refuse a member that `BatchedCpuSystem` does not define.
 
     Raises:
-        NotImplementedError: SAPIEN has such a member.
-        AttributeError: there is no such member, in SAPIEN neither.
+        NotImplementedError: SAPIEN's GPU system has it.
+        AttributeError: SAPIEN's has not either.
     """
     if hasattr(physx.PhysxGpuSystem, name):
         raise NotImplementedError(
-            f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation has not: here every env has its "
-            "own physics, at its own origin. What all of them share is asked of one: self.scene.px.systems[0]."
+            f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation does not have: here every env has "
+            "its own physics, at its own origin. For what all of them share, use self.scene.px.systems[0]."
         )
     raise AttributeError(f"the batched CPU system has no '{name}'")
 
 
-def _applies(mirror: str, keep_awake: bool = False) -> Callable[..., None]:
-    """A ``gpu_apply_*``, of the one of `Mirrors` with this name.
-
-    Refuses SAPIEN's optional buffer of indices in words: not needed here, where what differs from the last fetch is
-    applied, and nothing else is touched anyway.
-    """
+def _applies(mirror: Callable[[Mirrors], Mirror], keep_awake: bool = False) -> Callable[..., None]:
+    """A ``gpu_apply_*`` of one mirror. Refuses SAPIEN's index buffer: only what differs from the last fetch is applied."""
 
     def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
         if index_buffer is not None:
@@ -52,7 +48,7 @@ def _applies(mirror: str, keep_awake: bool = False) -> Callable[..., None]:
                 "gpu_apply_... takes no index buffer in the batched CPU simulation: call it without, it applies the "
                 "rows that were changed."
             )
-        self._apply(getattr(self._mirrors, mirror), keep_awake)
+        self._apply(mirror(self._mirrors), keep_awake)
 
     return apply
 
@@ -85,15 +81,15 @@ class BatchedCpuSystem:
         self._pose_lengths: list[int] = []
         self._link_pose_at = np.zeros((0, 7), dtype=np.int64)
         self._version = 0
-        """Grows whenever the simulation may hold other values than were fetched."""
+        """Grows when the simulation may differ from what was fetched."""
         self._read_at: dict[str, int] = {}
-        """Which `_version` was read last of what is only read when it is asked for."""
+        """`_version` at the last read of each value that is read on demand."""
 
-    # `Actor.create_from_entities` and `Link.create` ask isinstance(scene.px, PhysxGpuSystem) to decide
-    # whether a body has a row in the tensors. It has one here; a real subclass would want CUDA.
+    # `Actor.create_from_entities` and `Link.create` give a body a row in the tensors only if
+    # isinstance(scene.px, PhysxGpuSystem). A real subclass would need CUDA.
     __class__ = property(lambda self: physx.PhysxGpuSystem)  # type: ignore[assignment]
 
-    # --- what sapien's systems have --------------------------------------------------------------
+    # --- members of sapien's systems ---------------------------------------------------------------
 
     @property
     def timestep(self) -> float:
@@ -117,7 +113,7 @@ class BatchedCpuSystem:
         return [c for system in self.systems for c in system.articulation_link_components]
 
     def get_scene_offset(self, scene: sapien.Scene) -> NDArray[np.float32]:
-        """(3,) always zero: every env stands at its own origin."""
+        """(3,) always zero: every env has its own origin."""
         return np.zeros(3, dtype=np.float32)
 
     def get_contacts(self) -> list[physx.PhysxContact]:
@@ -132,16 +128,16 @@ class BatchedCpuSystem:
             self._stepped()
 
     def freeze_envs(self, envs: Collection[int]) -> None:
-        """From now on PhysX does not step these envs; the others and the task's hooks go on."""
+        """Stop stepping these envs in PhysX; an empty collection steps all again."""
         self._catch_up()
         self.stepper.forget()
         self.stepper.frozen = frozenset(envs)
 
     def keep_drives(self, envs: Sequence[int], flags: Sequence[NDArray[np.bool_]]) -> None:
-        """Forget drive targets that were written for these envs while they stood still.
+        """Discard drive targets that were written for these envs while they were frozen.
 
         Args:
-            flags: `drive_flags` as they were before.
+            flags: `drive_flags` from before.
         """
         rows = np.isin(self._mirrors.targets.envs, envs)
         for now, was in zip(self.drive_flags, flags, strict=True):
@@ -152,7 +148,7 @@ class BatchedCpuSystem:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """The next `substeps` calls of `step` may be done together; asking for state does them at once."""
+        """Within this, `substeps` calls of `step` may be done together; a read of state does them at once."""
         with self.stepper.merging(substeps):
             yield
         self._catch_up()
@@ -163,7 +159,7 @@ class BatchedCpuSystem:
             self._stepped()
 
     def step_start(self) -> None:
-        """A substep at once: without a GPU there is nothing to wait for in `step_finish`."""
+        """One substep; `step_finish` has nothing to wait for."""
         self.step()
 
     def step_finish(self) -> None:
@@ -175,7 +171,7 @@ class BatchedCpuSystem:
     # --- building ----------------------------------------------------------------------------------
 
     def gpu_init(self) -> None:
-        """Lay out the tensors over the bodies that were built; called once a scene is complete."""
+        """Make the tensors over the scene's bodies; called once, when the scene is complete."""
         layout = self._layout = lay_out(self.systems, self.scenes)
         found = self._found = Mirrors(
             layout, self._pack, self._link_poses, self._setter, self.stepper.write_before_step
@@ -227,19 +223,19 @@ class BatchedCpuSystem:
         return self._found
 
     def __getattr__(self, name: str) -> Any:
-        # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
+        # The tensors exist from `gpu_init` on: explain an earlier access.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RuntimeError(_TOO_EARLY)
         return _uncommon_member(name)
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
-        """What sets one kind of drive target of a joint."""
+        """The method that sets one kind of drive target of a joint."""
         return getattr(joint, method)
 
     # --- reading: gpu_fetch_* ----------------------------------------------------------------------
 
     def _fetch(self, group: Group) -> None:
-        """Read what `group` has from the simulation, over what tasks wrote and did not apply."""
+        """Read `group` from the simulation, overwriting what was not applied."""
         for mirror in self._mirrors.of[group]:
             mirror.fetch()
 
@@ -274,7 +270,7 @@ class BatchedCpuSystem:
         """Nothing to do: on the CPU, links follow when qpos or the root pose is set."""
 
     def _unread(self, what: str, things: Iterable[Any]) -> Iterable[Any]:
-        """`things`; none where `what` was read of them since anything moved."""
+        """`things`, or none if `what` was read since the last change."""
         if self._read_at.get(what) == self._version:
             return ()
         self._read_at[what] = self._version
@@ -294,9 +290,9 @@ class BatchedCpuSystem:
         return _array(self._joint_forces)
 
     def fetch_link_velocities(self) -> None:
-        """Velocities of all links into columns 7 to 12; two getters a link, so only when asked for."""
+        """Read velocities of all links into columns 7 to 12; on demand, since it takes two getters a link."""
         layout = self._laid_out
-        # Those of roots came with the poses, and may have been written since, as any pose may.
+        # Roots' velocities came with the poses, and may have been written since.
         now, seen = self._mirrors.links.now, self._mirrors.links.seen
         for row, link in self._unread("links", zip(layout.link_rows, layout.links, strict=True)):
             if not link.is_root:
@@ -328,7 +324,7 @@ class BatchedCpuSystem:
         return self._posed[self._link_pose_at]
 
     def note_change(self) -> None:
-        """The simulation was written to, here or by a call on one of `systems`: what was packed is old."""
+        """Drop packed state after a write to the simulation, here or by a call on one of `systems`."""
         self._catch_up()
         self.stepper.forget()
         self._moved()
@@ -343,14 +339,14 @@ class BatchedCpuSystem:
         self.contacts.invalidate()
 
     def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
-        """By env: bodies that the tensor has elsewhere than SAPIEN, and where it has them; see `drawn_poses`."""
+        """By env, bodies that the tensor has elsewhere than SAPIEN, and where; see `bodies_elsewhere`."""
         self._catch_up()
         if self._layout is None:
             return {}
         return bodies_elsewhere(self.scenes, self._layout, self._mirrors.bodies.now, envs)
 
     def replace(self, env: int, scene: sapien.Scene) -> None:
-        """Another scene, over another system, has all entities of this env now, in the same order."""
+        """Use another scene and system for this env, with its entities in the same order."""
         self.scenes[env] = scene
         self.systems[env] = scene.physx_system  # pyright: ignore
         self.stepper.renew(env)
@@ -360,19 +356,19 @@ class BatchedCpuSystem:
         return self._laid_out.articulations[index]
 
     def packs(self) -> list[bytes]:
-        """``PhysxCpuSystem.pack()`` of every env, as it is now."""
+        """``PhysxCpuSystem.pack()`` of every env, now."""
         self._catch_up()
         return self.stepper.packs()
 
     @property
     def drive_flags(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(A,), (A,) whether position, velocity targets were ever set; see `mirrors.DriveTargets`."""
+        """(A,), (A,) whether position and velocity targets were ever set; see `DriveTargets`."""
         return self._mirrors.targets.driven, self._mirrors.velocity_targets.driven
 
     # --- writing: gpu_apply_* ----------------------------------------------------------------------
 
     def _apply(self, mirror: Mirror, keep_awake: bool = False) -> None:
-        """Set in the simulation what tasks wrote and what differs from the last fetch."""
+        """Write to the simulation what differs from the last fetch."""
         changed = mirror.differs().any()
         if changed:
             self.note_change()
@@ -380,7 +376,7 @@ class BatchedCpuSystem:
             mirror.apply(keep_awake)
 
     def apply_changes(self) -> None:
-        """Everything that ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
+        """Apply what ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
         own = self._mirrors
         for mirror in (
             own.bodies,
@@ -393,14 +389,14 @@ class BatchedCpuSystem:
         ):
             self._apply(mirror)
 
-    gpu_apply_rigid_dynamic_data = _applies("bodies")
-    gpu_apply_articulation_root_pose = _applies("roots")
-    gpu_apply_articulation_root_velocity = _applies("root_velocities")
-    gpu_apply_articulation_qpos = _applies("qpos")
-    gpu_apply_articulation_qvel = _applies("qvel")
-    gpu_apply_articulation_qf = _applies("qf")
-    gpu_apply_articulation_target_position = _applies("targets", keep_awake=True)
-    gpu_apply_articulation_target_velocity = _applies("velocity_targets", keep_awake=True)
+    gpu_apply_rigid_dynamic_data = _applies(lambda own: own.bodies)
+    gpu_apply_articulation_root_pose = _applies(lambda own: own.roots)
+    gpu_apply_articulation_root_velocity = _applies(lambda own: own.root_velocities)
+    gpu_apply_articulation_qpos = _applies(lambda own: own.qpos)
+    gpu_apply_articulation_qvel = _applies(lambda own: own.qvel)
+    gpu_apply_articulation_qf = _applies(lambda own: own.qf)
+    gpu_apply_articulation_target_position = _applies(lambda own: own.targets, keep_awake=True)
+    gpu_apply_articulation_target_velocity = _applies(lambda own: own.velocity_targets, keep_awake=True)
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
         self._apply_forces(self._force, "force")
@@ -409,7 +405,7 @@ class BatchedCpuSystem:
         self._apply_forces(self._torque, "torque")
 
     def drop_writes(self) -> None:
-        """Forget what was written to the tensors and not applied."""
+        """Discard what was written to the tensors and not applied."""
         for mirror in () if self._found is None else self._found.all:
             mirror.drop()
 
@@ -423,7 +419,7 @@ class BatchedCpuSystem:
                     body.add_force_torque(values[row], zero)
                 else:
                     body.add_force_torque(zero, values[row])
-        # PhysX takes a force for one substep; a row left standing would push again at the next apply.
+        # PhysX takes a force for one substep; a row that stays would push again at the next apply.
         values[:] = 0.0
 
     # --- contacts ----------------------------------------------------------------------------------
@@ -448,6 +444,6 @@ def _array(values: NDArray[np.float32]) -> CpuArray:
 def batched_system(scene: Any) -> BatchedCpuSystem | None:
     """The batched CPU system of a ManiSkillScene, or None for any other scene.
 
-    Not isinstance: `BatchedCpuSystem` answers that question as a ``PhysxGpuSystem`` would.
+    Not by isinstance, for which `BatchedCpuSystem` is a ``PhysxGpuSystem``.
     """
     return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from workbench.core.simulation.state_layout import StateLayout
 
 Places = Mapping[int, tuple[Any, NDArray[np.float32]]]
-"""Entities and where to draw them (7,), by the ``id`` of the entity, which the value holds."""
+"""Entities and the poses (7,) to draw them at, by the ``id`` of the entity."""
 NOWHERE_ELSE: Places = {}
 
 
@@ -29,9 +29,9 @@ def bodies_elsewhere(
     Static bodies have no row.
 
     Args:
-        data: (R, 13) what ManiSkill calls ``cuda_rigid_body_data``.
+        data: (R, 13) ManiSkill's ``cuda_rigid_body_data``.
     """
-    # Packed anew, though a fetch may have done it: an entity that was moved by itself is drawn by the tensor too.
+    # Packed again although a fetch may have done it: an entity may have been moved directly since.
     packs = [scenes[env].pack_poses() for env in envs]
     starts = np.full(len(scenes), -1, dtype=np.int64)
     starts[envs] = np.cumsum([0, *(len(pack) // 4 for pack in packs[:-1])])
@@ -49,13 +49,13 @@ def bodies_elsewhere(
 
 @contextmanager
 def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callable[[], None]]:
-    """Draw entities at `places`, with the cameras on them, and leave the entities where they are.
+    """Within this, draw entities and their cameras at `places`; the entities stay where they are.
 
-    Gives the function that moves what is drawn, to be called after ``update_render``, which draws every entity
-    where it is. Cameras are drawn by ``update_render``, so those on an entity are moved before it.
+    Yields a function that moves what is drawn: call it after ``update_render``, which draws entities where they are.
+    Cameras are moved before it.
 
     Args:
-        components: cameras that may be on one of them.
+        components: cameras that may be on one of the entities.
     """
     on_them = [c for c in components if id(c.entity) in places] if places else []
     cameras = [(c, "local_pose", c.entity.pose.inv() * camera_pose(c, places)) for c in on_them]
@@ -73,7 +73,7 @@ def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callabl
 
 @contextmanager
 def temporarily(changes: Iterable[tuple[Any, str, Any]]) -> Iterator[None]:
-    """Within this, attributes (owner, name, value) have other values."""
+    """Within this, attributes (owner, name, value) have these values."""
     was: list[tuple[Any, str, Any]] = []
     try:
         for owner, name, value in changes:
@@ -86,7 +86,7 @@ def temporarily(changes: Iterable[tuple[Any, str, Any]]) -> Iterator[None]:
 
 
 def camera_pose(component: Any, places: Places) -> sapien.Pose:
-    """Where a camera is in its env's frame, if the entity that it is on is drawn at `places`."""
+    """Pose of a camera in its env's frame, with its entity drawn at `places`."""
     if id(component.entity) not in places:
         return component.get_global_pose()
     pose = places[id(component.entity)][1]

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from workbench.core.simulation.state_layout import BODY, StateLayout
 
 Group = Literal["bodies", "links", "joints", "targets", "forces"]
-"""What one ``gpu_fetch_*`` and its ``gpu_apply_*`` carry together."""
+"""Tensors that are fetched and applied together."""
 GROUPS: tuple[Group, ...] = get_args(Group)
 Floats = NDArray[np.float32]
 Source = tuple[Any, Callable[[], Floats]]
-"""Where in a tensor numbers of the simulation belong, and what reads them."""
+"""Index into a tensor, and the function that reads those numbers from the simulation."""
 _MOVED = 1e-4
 """Metres, radians, per second. PhysX rounds the root pose of an articulation when it is set, by about 1e-7."""
 
 
 class Mirror:
-    """K rows of a tensor (R, W), or some of their columns."""
+    """K rows of a tensor (R, W), or some of their columns, with what the simulation holds of them."""
 
     def __init__(
         self,
@@ -39,13 +39,13 @@ class Mirror:
     ) -> None:
         """
         Args:
-            what: for a person.
-            whole: (R, W) the tensor, and what the simulation holds of it as far as is known; of all its rows.
-            names, envs: (R,) whose each row is, and of which env.
-            rows: (K,) which are meant; None for all.
-            sources: what a fetch reads; the first says where the rows are now.
+            what: name for messages.
+            whole: (R, W) the tensor, and the last known values of the simulation.
+            names, envs: (R,) body name and env of each row.
+            rows: (K,) rows of this mirror; None for all.
+            sources: read by a fetch; the first has the present rows.
             owners: (K,) SAPIEN's objects, for `put`.
-            put: called with an owner, its row (W,) and which numbers of it are to be set.
+            put: called with an owner, its row (W,) and a mask of the numbers to set.
         """
         self.group: Group = group
         self.what, self.envs = what, envs
@@ -56,39 +56,39 @@ class Mirror:
         self.sources, self._owners, self._put = sources, owners, put
 
     def differs(self) -> NDArray[np.bool_]:
-        """(K, W) what was written and neither applied nor fetched over; a NaN always is."""
+        """(K, W) what was written and neither applied nor overwritten by a fetch; True for any NaN."""
         return self.now[self.at] != self.seen[self.at]
 
     def changed(self) -> NDArray[np.int64]:
-        """Which of the K rows hold such a number."""
+        """Which of the K rows differ."""
         return np.flatnonzero(self.differs().any(axis=1))
 
     def written(self) -> NDArray[np.bool_]:
-        """As `differs`, but for a NaN of the simulation's own, which differs from itself."""
+        """As `differs`, without NaNs of the simulation's own."""
         differs = self.differs()
         if differs.any():
             differs &= ~(np.isnan(self.now[self.at]) & np.isnan(self.seen[self.at]))
         return differs
 
     def fetch(self) -> None:
-        """Hold what the simulation holds."""
+        """Read the simulation's values."""
         for at, read in self.sources:
             self.now[at] = self.seen[at] = read()
 
     def drop(self) -> None:
-        """Forget what was written and not applied."""
+        """Discard what was written and not applied."""
         self.now[self.at] = self.seen[self.at]
 
     def behind(self) -> NDArray[np.bool_]:
-        """(K, W) or fewer columns: what the simulation moved since it was fetched."""
+        """(K, W), or fewer columns: what the simulation moved since the last fetch."""
         at, read = self.sources[0]
         return np.abs(self.now[at] - read()) > _MOVED
 
     def apply(self, keep_awake: bool) -> None:
-        """Set what differs, and nothing else.
+        """Write what differs to the simulation.
 
         Raises:
-            ValueError: of a row that is to be set a number is NaN or infinite.
+            ValueError: a number of a changed row is NaN or infinite.
         """
         now, differs = self.now[self.at], self.differs()
         for i in np.flatnonzero(differs.any(axis=1)).tolist():
@@ -98,12 +98,12 @@ class Mirror:
 
 
 class DriveTargets(Mirror):
-    """Position, or velocity, targets of the joints of every articulation, which are written otherwise than the rest.
+    """Position or velocity targets of the joints of every articulation.
 
-    A target that is set wakes a sleeping articulation even when its value stays, and ManiSkill's CPU controllers set
-    theirs on every control step. So what was ever driven is written at every apply, or a robot at rest would fall asleep
-    here and not there; and what nobody ever drove must not be, since it would never sleep. And they are many, 1200
-    calls a control step of 64 Pandas: in the envs' threads, just before the step, they cost nobody's waiting.
+    Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers set theirs at
+    every control step. So a target that was ever set is written at every apply, or a robot at rest would fall asleep here
+    and not in stock; one that was never set is not, or it would never sleep. That is 1200 calls a control step for 64
+    Pandas, so each env's thread makes them, just before its step.
     """
 
     def __init__(
@@ -115,20 +115,20 @@ class DriveTargets(Mirror):
     ) -> None:
         """
         Args:
-            setters: of each articulation, of each of its active joints: what sets the target in PhysX.
-            later: takes what writes the targets of one env, to be called before its next step.
+            setters: for each articulation and active joint, the function that sets the target in PhysX.
+            later: takes a function that writes the targets of one env before its next step.
         """
         super().__init__("targets", *mirror, sources=sources)
         self.driven = np.zeros(len(self.now), dtype=bool)
-        """(A,) whether they were ever set."""
+        """(A,) whether a target was ever set."""
         self._setters, self._later = setters, later
         self._of_env = {int(env): np.flatnonzero(self.envs == env).tolist() for env in np.unique(self.envs)}
 
     def apply(self, keep_awake: bool) -> None:
-        """Take what was written.
+        """Schedule what was written.
 
         Args:
-            keep_awake: write the targets of all that was ever driven, not only those that changed.
+            keep_awake: also write targets that did not change, of articulations that were ever driven.
 
         Raises:
             ValueError: one of them is NaN or infinite.
@@ -152,7 +152,7 @@ class DriveTargets(Mirror):
 
 
 class Mirrors:
-    """Those of all tensors of a scene."""
+    """The mirrors of all tensors of a scene."""
 
     def __init__(
         self,
@@ -164,9 +164,9 @@ class Mirrors:
     ) -> None:
         """
         Args:
-            pack: gives the packs of all envs as they are now, and the zero behind them; see `cpu_layout`.
-            link_poses: gives the poses (L, 7) of all links.
-            setter: what sets a drive target of a joint, by the name of SAPIEN's method.
+            pack: returns the present packs of all envs, then a zero; see `StateLayout`.
+            link_poses: returns the poses (L, 7) of all links.
+            setter: returns SAPIEN's method of this name that sets a drive target of a joint.
             later: as for `DriveTargets`.
         """
         data, joints = _twin((len(layout.entities), BODY)), layout.qpos_at.shape
@@ -212,9 +212,9 @@ class Mirrors:
             *(self.bodies, self.links, self.qpos, self.qvel, self.qf),
             *(self.targets, self.velocity_targets),
         )
-        """Each number once; `roots` and `root_velocities` are of `links`."""
+        """Each number once; `roots` and `root_velocities` are part of `links`."""
         self.of = {group: [mirror for mirror in self.all if mirror.group == group] for group in GROUPS}
-        """What is fetched together."""
+        """Mirrors that are fetched together."""
 
 
 def _twin(shape: tuple[int, ...]) -> tuple[Floats, Floats]:

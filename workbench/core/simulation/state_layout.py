@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 BODY = 13
 """Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
 _FROM_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-"""Where ManiSkill's row [p, q, v, w] finds its columns in a packed body [q, p, v, w]."""
+"""Columns of ManiSkill's row [p, q, v, w] in a packed body [q, p, v, w]."""
 _IN_ENV = re.compile(r"^scene-\d+[-_]")
 _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
 
@@ -86,7 +86,7 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
     start, each, dof = _numbers(joints_at)[:, None], np.arange(dofs.max(initial=0)), dofs[:, None]
 
     def joint_columns(at: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.where(each < dof, start + at, packed)  # one zero behind all packs, which the padding reads
+        return np.where(each < dof, start + at, packed)  # padding reads the zero behind all packs
 
     entities = [component.entity for component in rows]
     return StateLayout(
@@ -123,8 +123,8 @@ def check_layout(
     """Compare the packs with the getters, since SAPIEN documents neither their order nor their size.
 
     Args:
-        packed: the packs of all envs, and the zero behind them.
-        link_poses: gives the poses (L, 7) that were found in the packs of poses; asked if `packed` has the size.
+        packed: the packs of all envs, then a zero.
+        link_poses: returns the poses (L, 7) from the packs of poses; called only if `packed` has the right size.
 
     Raises:
         RuntimeError: they differ.

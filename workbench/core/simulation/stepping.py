@@ -43,7 +43,7 @@ class Stepper:
     ) -> None:
         """
         Args:
-            threads: at most so many; None for one on each core that this process may use.
+            threads: most threads; None for one on each core that this process may use.
         """
         self._systems, self._scenes = systems, scenes
         self.threads = 1 if native_step() is None else (threads or usable_cores())
@@ -54,20 +54,20 @@ class Stepper:
         self._packs: list[bytes] | None = None
         self._pose_packs: list[bytes] | None = None
         self.frozen: frozenset[int] = frozenset()
-        """Envs that are neither stepped nor given drive targets; their numbers stay."""
+        """Envs that are neither stepped nor given drive targets."""
 
     def renew(self, env: int) -> None:
-        """Another system stands in the list for this env."""
+        """Use the env's new system in the list."""
         self.step_once[env] = _step_of(self._systems[env])
         self.forget()
 
     @property
     def owes(self) -> bool:
-        """Whether substeps were asked for and not yet done."""
+        """Whether substeps are pending."""
         return self._owed > 0
 
     def step(self) -> bool:
-        """One substep of every env; False if it is put off until the control step's last."""
+        """One substep of every env; False if it waits for the control step's last."""
         self._owed += 1
         if self._owed < self._in_a_row:
             return False
@@ -76,7 +76,7 @@ class Stepper:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """Within this, `substeps` calls of `step` are done together, at the last or when state is asked for."""
+        """Within this, `substeps` calls of `step` are done together, at the last one or when state is read."""
         self._in_a_row = substeps
         try:
             yield
@@ -88,21 +88,21 @@ class Stepper:
         self._writes.append(write)
 
     def write_now(self) -> None:
-        """Make the writes that were put off."""
+        """Make the pending writes."""
         writes, self._writes = self._writes, []
         for env in range(len(self._systems)) if writes else ():
             for write in writes if env not in self.frozen else ():
                 write(env)
 
     def catch_up(self) -> None:
-        """Do the substeps that are owed."""
+        """Do the pending substeps."""
         count, self._owed = self._owed, 0
         if count == 0:
             return
         writes, self._writes = self._writes, []
         packs: list[bytes] = [b""] * len(self._systems)
         pose_packs: list[bytes] = [b""] * len(self._systems)
-        # Between single substeps of a control step nobody reads: packing then would be thrown away.
+        # No fetch follows a single substep within a control step: its packs would be wasted.
         packing = count > 1
 
         def advance(env: int) -> None:
@@ -120,19 +120,19 @@ class Stepper:
         self._packs, self._pose_packs = (packs, pose_packs) if packing else (None, None)
 
     def forget(self) -> None:
-        """What was packed is old: the simulation was written to."""
+        """Drop the packs after a write to the simulation."""
         self.write_now()
         self._packs = self._pose_packs = None
 
     def packs(self) -> list[bytes]:
-        """``pack()`` of every system, as it is now."""
+        """``pack()`` of every system, now."""
         self.write_now()
         if self._packs is None:
             self._packs = [system.pack() for system in self._systems]
         return self._packs
 
     def pose_packs(self) -> list[bytes]:
-        """``pack_poses()`` of every scene, as it is now."""
+        """``pack_poses()`` of every scene, now."""
         if self._pose_packs is None:
             self._pose_packs = [scene.pack_poses() for scene in self._scenes]
         return self._pose_packs
@@ -153,7 +153,7 @@ TYPE_INFO = "_ZTIN6sapien5physx14PhysxSystemCpuE"
 """``typeid(sapien::physx::PhysxSystemCpu)``."""
 CONDUIT = "_pybind11_conduit_v1_"
 PLATFORM_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
-"""What SAPIEN's wheels for Linux were built with, as pybind11 spells it."""
+"""ABI of SAPIEN's wheels for Linux, as pybind11 spells it."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class NativeStep:
     type_capsule: object
 
     def address_of(self, system: physx.PhysxCpuSystem) -> int:
-        """Where the C++ object of `system` lies; good for as long as `system` lives."""
+        """Address of the C++ object of `system`, valid while `system` lives."""
         capsule = getattr(system, CONDUIT)(PLATFORM_ABI, self.type_capsule, b"raw_pointer_ephemeral")
         if capsule is None:
             raise RuntimeError(f"pybind11 gives no pointer to a PhysxCpuSystem for ABI {PLATFORM_ABI!r}")
@@ -186,7 +186,7 @@ class NativeStep:
 
 @lru_cache(maxsize=1)
 def native_step() -> NativeStep | None:
-    """The step without the interpreter lock, or None where SAPIEN is built otherwise."""
+    """The step without the interpreter lock, or None if SAPIEN's build does not offer it."""
     found = _find()
     return found if isinstance(found, NativeStep) else None
 
@@ -201,12 +201,12 @@ def why_not_native() -> str | None:
 def _find() -> NativeStep | str:
     version = f"sapien {sapien.__version__}"
     try:
-        # Only the copy that pysapien has loaded already: another would have its own PhysX.
+        # Only the copy that pysapien has loaded: another would have its own PhysX.
         library = ctypes.CDLL(LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
         step = library[STEP]
         type_info = ctypes.addressof(ctypes.c_char.in_dll(library, TYPE_INFO))
     except (OSError, AttributeError, ValueError) as error:
-        return f"{version} does not export what a step beside the interpreter lock needs: {error}"
+        return f"{version} does not export what a step without the interpreter lock needs: {error}"
     step.argtypes, step.restype = [ctypes.c_void_p], None
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
@@ -214,19 +214,19 @@ def _find() -> NativeStep | str:
     try:
         native.address_of(physx.PhysxCpuSystem())
     except (AttributeError, RuntimeError) as error:
-        return f"{version} does not show where its systems lie: {error}"
+        return f"{version} does not give the addresses of its systems: {error}"
     return native
 
 
 _CAPSULE_NAME = ctypes.c_char_p(b"St9type_info")
-"""``typeid(std::type_info).name()``; a capsule keeps the pointer to its name, so this must not be collected."""
+"""``typeid(std::type_info).name()``; a capsule keeps a pointer to its name, so this must not be collected."""
 
 
 # --- A few threads that take envs off one list, kept for the life of the process --------------
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on; fewer than the machine's where it was confined."""
+    """Number of cores that this process may run on."""
     return len(os.sched_getaffinity(0))
 
 
@@ -264,7 +264,7 @@ class EnvThreads:
                 for index in todo:
                     job(index)
             finally:
-                # Also after an exception here: the others still use what the caller is about to give up.
+                # Also after an exception here: the others still use what the caller will release.
                 errors = [helper.end() for helper in working]
         for error in errors:
             if error is not None:
@@ -279,7 +279,7 @@ class _Helper:
         self._job: Callable[[int], None] | None = None
         self._todo: Iterator[int] = iter(())
         self._error: BaseException | None = None
-        # A daemon: nobody would tell it to stop when the interpreter ends.
+        # A daemon, so that it does not keep the interpreter alive.
         threading.Thread(target=self._work, name="env-step", daemon=True).start()
 
     def begin(self, job: Callable[[int], None], todo: Iterator[int]) -> None:
@@ -314,7 +314,7 @@ def env_threads() -> EnvThreads:
 
 
 def _after_fork() -> None:
-    # Threads do not survive a fork, but the objects that wait for them do: a child would wait for ever.
+    # Threads do not survive a fork: the child would wait for them for ever.
     global _shared
     _shared = EnvThreads()
 

@@ -33,11 +33,11 @@ _OWN_CODE = ("workbench.core.", "mani_skill.")
 
 @dataclass(frozen=True)
 class _Write:
-    """To some rows of a group; it may still be applied."""
+    """A write to rows of a group that may still be applied."""
 
     group: Group
     rows: NDArray[np.int64] | None
-    """Rows of the group's tensor; None where the whole tensor was handed out."""
+    """Rows of the group's tensor; None if the whole tensor was handed out."""
     frames: tuple[Frame, ...]
     """Innermost first."""
 
@@ -56,23 +56,23 @@ class Writes:
         return bool(self._kept)
 
     def note(self, group: Group, rows: NDArray[np.int64]) -> None:
-        """Whoever calls the core now writes these rows."""
+        """Note that the present call writes these rows."""
         self._kept.append(_Write(group, rows, frames_of_the_task()))
 
     def note_handed_out(self, tensor: str) -> None:
-        """Whoever reads the attribute that this is called from has the whole tensor; not told of the core's own code."""
+        """Note the code that reads a whole tensor through the calling property, unless it is the core's own."""
         reader = sys._getframe(2)
         if not reader.f_globals.get("__name__", "").startswith(_OWN_CODE):
             frames = frames_of_the_task(reader)
             self._kept.extend(_Write(group, None, frames) for group in TENSORS[tensor])
 
     def forget(self, group: Group) -> None:
-        """They were applied, or fetched over."""
+        """Drop the writes of a group that was applied or fetched."""
         if self._kept:
             self._kept = [write for write in self._kept if write.group != group]
 
     def frames(self, group: Group, rows: NDArray[np.int64]) -> tuple[Frame, ...]:
-        """Of the last to write one of these rows, or to take the whole tensor; empty if none is known."""
+        """Frames of the last write to one of these rows, or read of the whole tensor; empty if unknown."""
         for write in reversed(self._kept):
             if write.group == group and write.rows is not None and np.isin(rows, write.rows).any():
                 return write.frames
@@ -84,7 +84,7 @@ class Writes:
 
 ENVS_NAMED = THINGS_NAMED = 8
 _MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
-"""What a step moves; targets and joint forces stay what they were set to."""
+"""What a step moves; targets and joint forces stay as they were set."""
 
 
 class StrictCpuSystem(BatchedCpuSystem):
@@ -98,7 +98,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     """
 
     rules: BrokenRules
-    """What a broken rule is told to; of the env, so that it outlives a scene."""
+    """Receives breaches; belongs to the env, so that it outlives a scene."""
     being_reset: torch.Tensor | None = None
     """(N,) bool while ``_initialize_episode`` runs for some envs and not for others."""
     stepped_in_reset = False
@@ -109,12 +109,12 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._writes = Writes()
         self._stale: set[Group] = set()
         self.reported_elsewhere: set[str] = set()
-        """Of other envs, in the partial reset under way: the names of what was told already."""
+        """Names already reported for other envs in the present partial reset."""
         self._applying = 0
         self._outdated: set[int] = set()
-        """Articulations whose links in the tensor are those of before a write of qpos or root pose."""
+        """Articulations whose links in the tensor are older than a write of qpos or root pose."""
         self._not_updated: set[int] = set()
-        """Articulations applied since PhysX last computed where links are."""
+        """Articulations applied since PhysX last computed link poses."""
         super().__init__(scenes, *args, **kwargs)
 
     def gpu_init(self) -> None:
@@ -122,11 +122,11 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._stale.clear()
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
-        # Called for every joint in every control step, and the core's own: past the guard of behind_tensors.
+        # The core's own call, for every joint in every control step: without the guard of `accessors`.
         function = getattr(type(joint), method)
         return partial(getattr(function, "__wrapped__", function), joint)
 
-    # --- what ManiSkill's setters and getters tell (see struct_access) -------------------------------
+    # --- called by ManiSkill's setters and getters (see accessors) ------------------------------------
 
     def about_to_write(self, struct: Any, group: Group, index: torch.Tensor) -> None:
         """A setter of `struct` will write rows `index` of `group`'s tensor."""
@@ -145,7 +145,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     def about_to_read(self, struct: Any, group: Group, index: torch.Tensor) -> None:
         """A getter of `struct` will read rows `index` of `group`'s tensor."""
         self._catch_up()
-        # An Articulation that is asked has no links of its own to be old: it answers for its root.
+        # An Articulation answers for its root, which is never old.
         if group == "links" and (self._outdated or self._writes) and hasattr(struct, "is_root"):
             if not bool(struct.is_root.all()):
                 self._refuse_old_links(struct)
@@ -189,7 +189,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._not_updated.clear()
 
     def _refuse_loss(self, mirror: Mirror) -> None:
-        """Break the rule if a mirror holds what was set and the fetch will write over."""
+        """Break the rule if a fetch will overwrite what was set."""
         lost = mirror.written()
         if not lost.any():
             return
@@ -198,7 +198,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             what = "pose" if lost[:, :7].any() else "velocity"
         roots = self._laid_out.root_rows
         if "stop" in (self.rules.degree("not-applied"), self.rules.degree("link-pose-set")):
-            # As on the GPU: without this the write would be applied after all, by the reset that follows.
+            # As on the GPU: else the reset that follows would apply the write after all.
             mirror.drop()
         for name, mine in _by_name(mirror.rows[lost.any(axis=1)], mirror.names):
             where, frames = envs_named(mirror.envs[mine]), self._writes.frames(group, mine)
@@ -224,7 +224,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     def _apply(self, mirror: Mirror, keep_awake: bool = False) -> None:
         self._catch_up()
         if mirror.group in self._stale and mirror is not self._mirrors.root_velocities:
-            # qpos and qvel are fetched together, and an apply of one tells of the other too.
+            # qpos and qvel are fetched together: an apply of one reports both.
             self._refuse_stale_apply(self._mirrors.of["joints"] if mirror.group == "joints" else [mirror])
         if mirror is self._mirrors.roots or mirror is self._mirrors.qpos:
             changed = mirror.changed().tolist()
@@ -245,7 +245,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             self.rules.breaks(
                 "apply-before-fetch",
                 f"State is applied after the simulation moved on and before it was fetched: on the GPU this puts "
-                f"'{undone[0]}', and whatever else moved, back to before the step, in all envs. "
+                f"'{undone[0]}', and everything else that moved, back to before the step, in all envs. "
                 "Here only what was written is applied. Call self.scene._gpu_fetch_all() before you write.",
             )
 
@@ -300,7 +300,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 )
 
     def copy_of_state(self) -> list[Floats]:
-        """What tasks see and write, as it is."""
+        """Copies of all tensors that tasks read and write."""
         return [mirror.now[mirror.at].copy() for mirror in self._mirrors.all]
 
     def refuse_changes_elsewhere(self, before: list[Floats], reset: torch.Tensor) -> None:
@@ -310,7 +310,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 continue
             differs = mirror.now[mirror.at] != was
             if mirror is self._mirrors.links:
-                # The velocity of a link that is no root is fetched when it is asked for, which is no change.
+                # Velocities of links are fetched on demand, which is no change (except a root's).
                 differs[~np.isin(mirror.rows, self._laid_out.root_rows), 7:] = False
             changed = mirror.rows[differs.any(axis=1)]
             changed = changed[~reset.numpy()[mirror.envs[changed]]]
@@ -345,7 +345,7 @@ for _name in TENSORS:
 
 
 def _by_name(rows: NDArray[np.int64], names: list[str]) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    """The rows of each thing, at most `THINGS_NAMED` of them."""
+    """Rows by name, for at most `THINGS_NAMED` names."""
     found: dict[str, list[int]] = {}
     for row in rows.tolist():
         found.setdefault(names[row], []).append(row)

@@ -18,9 +18,9 @@ from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_syste
 from workbench.core.simulation.state_layout import BODY
 
 _ATTEMPTS = 4
-"""How often a root pose is asked for; in all tasks that were tried, two were enough."""
+"""Attempts to set a root pose; two were enough in all tasks that were tried."""
 _TRIES = 40
-"""How often a state is looked for that reads back as it was written; all but some humanoids need one."""
+"""Attempts to find a state that reads back as written; all but some humanoids need one."""
 _LAST_BIT = np.float32(2**-24)
 """Of the numbers of a quaternion, and of a metre."""
 _FAR = np.float32(99999)
@@ -37,7 +37,7 @@ class PackedPart:
 
     @property
     def size(self) -> int:
-        """How many float32 it takes."""
+        """Number of float32."""
         return BODY + (0 if self.joints is None else 4 * len(self.joints))
 
     def __str__(self) -> str:
@@ -45,7 +45,7 @@ class PackedPart:
 
 
 Contents = tuple[PackedPart, ...]
-"""What the packed state of one env holds, in its order: bodies, then articulations."""
+"""Contents of an env's packed state, in order: bodies, then articulations."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class CpuState:
         return slice(first, first + _articulations(self.contents[k]))
 
     def essence(self, k: int) -> tuple[Any, ...]:
-        """What is equal where PhysX would say the same of env k."""
+        """Equal for equal states of env k in PhysX."""
         rows = self.articulations(k)
         numbers = self.qf[rows].tobytes(), self.driven[:, rows].tobytes()
         return self.contents[k], self.packed[k], self.asleep[k], *numbers
@@ -97,12 +97,12 @@ def _articulations(contents: Contents) -> int:
 
 @dataclass
 class CpuStatePlan:
-    """What of a built scene belongs to which env."""
+    """Parts, bodies and rows of each env of a built scene."""
 
     contents: list[Contents]
     """Of each env; envs that are alike share one object."""
     sleepers: list[list[tuple[int, Callable[[], bool], Any]]]
-    """Of each env: index into its contents, whether it sleeps, the component that can be put to sleep."""
+    """Of each env: index into its contents, function that tells whether it sleeps, component that can be put to sleep."""
     articulations: list[range]
     """Of each env: its rows in the (A, D) tensors."""
     names: dict[int, tuple[int, str]]
@@ -110,16 +110,16 @@ class CpuStatePlan:
     bodies: list[dict[str, int]]
     """Of each env: the ``id`` of the component, by name."""
     held: list[Any]
-    """Objects whose ids are used: pybind11 gives an id anew once its object is gone."""
+    """Objects whose ids are used, kept alive: ids are reused once an object is gone."""
     offsets: dict[int, tuple[int, int]]
     """Env and offset in its packed floats of an actor, by the slot of its entity (`SceneIndex`)."""
     settled: list[dict[int, tuple[bytes, bytes]]]
-    """Of each env, by offset in its packed bytes: a root pose that was wanted, and which was asked for to get it."""
+    """Of each env, by offset in its packed bytes: a root pose, and the pose to set so that it reads back as that."""
 
 
 @once_a_scene
 def plan_cpu_state(env: Any) -> CpuStatePlan:
-    """What `read_cpu_state` and `write_cpu_state` need to know of the scene that an env has now."""
+    """The plan of an env's present scene, for `read_cpu_state` and `write_cpu_state`."""
     px = batched_system(env.scene)
     assert px is not None, "only for the batched CPU simulation"
     scene = scene_index(env)
@@ -149,7 +149,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
             articulation: Any = root.articulation
             name = name_of(root).rpartition("/")[0] or articulation.name
             sleepers.append((len(parts), _getter(root, "sleeping"), root))
-            # SAPIEN's "scene-0_panda" has joints that are called "scene-0-panda_panda_joint1".
+            # Joints of SAPIEN's "scene-0_panda" are called "scene-0-panda_panda_joint1".
             prefix = articulation.name.replace("_", "-", 1) + "_"
             joints = tuple(joint.name.removeprefix(prefix) for joint in articulation.active_joints)
             parts.append(PackedPart(name, joints))
@@ -162,7 +162,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
 
 
 def _getter(component: Any, name: str) -> Callable[[], bool]:
-    # Asked for every body at every snapshot: past the look-up of the property.
+    # Called for every body at every snapshot, so without the look-up of the property.
     return partial(getattr(type(component), name).fget, component)
 
 
@@ -198,10 +198,10 @@ def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
 def write_cpu_state(
     env: Any, env_idx: list[int], state: CpuState, positions: list[int], fresh_physics: bool
 ) -> tuple[dict[str, None], dict[str, str]]:
-    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``; the other envs are not touched. The tensors are fetched.
+    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``, and fetch the tensors. Other envs are not touched.
 
     Returns:
-        What was carried, and what was not with the reason, each by the words that name it.
+        Names of what was carried, and of what was not with the reason.
     """
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
@@ -210,8 +210,8 @@ def write_cpu_state(
     own = px.packs()
     for i in env_idx:
         for _, _, component in plan.sleepers[i]:
-            # Or the time until it falls asleep would depend on what it touched before: a cube that was in
-            # a hand fell asleep one substep later than one that was not.
+            # Else the time until it sleeps depends on what it touched before: a cube that was in a hand fell asleep one
+            # substep later than one that was not.
             component.put_to_sleep()
     if fresh_physics:
         for i in renew_physics(env.scene, env_idx):
@@ -247,10 +247,10 @@ def write_cpu_state(
 
 
 def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
-    """Give these envs a PhysX scene without a past, and the state that they have.
+    """Give these envs a PhysX scene without a past, with their present state.
 
-    What follows can then be had again to the last bit, from a snapshot of now and the same actions. A root of an
-    articulation that PhysX does not give back as it is set is moved by some last bits, to where it does.
+    A snapshot of now and the same actions then repeat what follows to the last bit. A root of an articulation that PhysX
+    does not return as set is moved by some last bits, to where it does.
     """
     left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     positions = list(range(len(env_idx)))
@@ -277,7 +277,7 @@ def _nudged(contents: Contents, packed: bytes, dice: np.random.Generator) -> byt
 
 
 def _unpack(px: BatchedCpuSystem, plan: CpuStatePlan, packed: dict[int, bytes]) -> None:
-    """Put packed states into envs, so that each reads back as it was packed."""
+    """Write packed states into envs so that each reads back as packed."""
     for i, wanted in packed.items():
         px.systems[i].unpack(_asked_for(plan, i, wanted))
     px.note_change()
@@ -297,7 +297,7 @@ def _write_joint_forces(
     matches: dict[int, Sequence[int | None]],
     fresh_physics: bool,
 ) -> None:
-    """Put ``set_qf``'s forces and the drives' flags back into each env; `matches` as of `_joined`."""
+    """Write ``set_qf``'s forces and the drives' flags into each env; `matches` as of `_joined`."""
     rows, theirs = [], []
     firsts = list(accumulate(map(_articulations, state.contents), initial=0))
     for i, k in sources.items():
@@ -315,12 +315,12 @@ def _write_joint_forces(
     px.gpu_apply_articulation_qf()
     if fresh_physics and qf.any():
         for row in (row for i in sources for row in plan.articulations[i]):
-            if qf[row].any():  # a new scene has none, though the tensor may not have changed
+            if qf[row].any():  # a new scene has none, even if the tensor did not change
                 px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
 
 
 def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
-    """The bytes to unpack for `packed` to be read: with the roots that `_settle_roots` found, where it did."""
+    """The bytes that read back as `packed`: with the roots that `_settle_roots` found."""
     for at, (wanted, asked) in plan.settled[env].items():
         if packed[at : at + len(wanted)] == wanted:
             packed = packed[:at] + asked + packed[at + len(wanted) :]
@@ -328,11 +328,10 @@ def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
 
 
 def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: bytes) -> None:
-    """Make articulations' root poses read back as they were packed.
+    """Make articulations' root poses read back as packed.
 
-    PhysX keeps a root by its centre of mass, and what it gives back differs in the last bit from what it was
-    given; over many snapshots of snapshots that adds up. What differs is asked for that much further off. The
-    last answer is kept: most roots stand still.
+    PhysX keeps a root by its centre of mass, and returns it with another last bit, which adds up over snapshots of
+    snapshots. So the pose is set with the opposite error. The result is kept, since most roots do not move.
     """
     numbers = np.frombuffer(packed, dtype=np.float32)
     at = sum(part.size for part in plan.contents[env] if part.joints is None)
@@ -366,7 +365,7 @@ def _joined(
     carried: dict[str, None],
     missed: dict[str, str],
 ) -> tuple[bytes, list[int | None]]:
-    """The bytes for an env that is built otherwise than env k of `state`, and for each of its parts the source's index."""
+    """Bytes for an env that is not built like env k of `state`, and the source's index of each of its parts."""
     numbers = np.frombuffer(own, dtype=np.float32).copy()
     parts, theirs = state.contents[k], np.frombuffer(state.packed[k], dtype=np.float32)
     starts = np.cumsum([0, *(part.size for part in parts)])
@@ -396,7 +395,7 @@ def _touching(
     position = {i: k for k, i in enumerate(env_idx)}
     found = []
     for (first, second), impulse in px.contacts.counted():
-        # Only bodies of this scene have names; ManiSkill's queries know no others.
+        # Only bodies of this scene have names.
         if first in plan.names and second in plan.names and plan.names[first][0] in position:
             index, name = plan.names[first]
             found.append(((position[index], name, plan.names[second][1]), impulse))
@@ -404,7 +403,7 @@ def _touching(
 
 
 def _hidden(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:
-    """Of each env with hidden actors: their offsets in its packed floats, and the poses [p, q] that are kept of them."""
+    """For each env with hidden actors: their offsets in its packed floats, and their true poses [p, q]."""
     found: dict[int, list[tuple[int, NDArray[np.float32]]]] = {}
     for slots, poses in hidden_poses(env):
         for slot, pose in zip(slots.tolist(), poses, strict=True):
@@ -445,13 +444,13 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
         would give the others new numbers, by which ManiSkill's segmentation pictures name them.
     """
     px: BatchedCpuSystem = scene.px
-    px.packs()  # substeps that are still owed are made by the old systems
+    px.packs()  # the old systems make pending substeps
     default = physx.get_scene_config()
     left = [i for i in env_idx if not _keeps_entity_ids(px.scenes[i])]
     try:
         for i in sorted(set(env_idx) - set(left)):
             old = px.systems[i]
-            # A system takes its gravity and solver from the process's default, which is another env's by now.
+            # A system takes gravity and solver from the process's default, which may be another env's.
             physx.set_scene_config(old.config)
             system = physx.PhysxCpuSystem()
             system.timestep = old.timestep

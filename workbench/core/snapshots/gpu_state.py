@@ -14,7 +14,7 @@ from workbench.core.scene.scene_index import in_every_env, present_states, scene
 from workbench.core.simulation.state_layout import BODY
 
 _JOINT_TENSORS = ("qf", "target_qpos", "target_qvel")
-"""Of an articulation, beside what its ``get_state()`` has: ``px.cuda_articulation_NAME``."""
+"""Of an articulation, in addition to ``get_state()``: ``px.cuda_articulation_NAME``."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,7 @@ def read_gpu_state(env: Any, env_idx: list[int]) -> GpuState:
 def write_gpu_state(
     env: Any, env_idx: list[int], state: GpuState, positions: list[int]
 ) -> tuple[dict[str, None], dict[str, str]]:
-    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``; as `cpu_state.write_cpu_state`, but applied and
-    fetched."""
+    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``, apply and fetch; returns as `write_cpu_state`."""
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
     position, structs = dict(zip(env_idx, positions, strict=True)), scene_index(env).states
@@ -56,7 +55,7 @@ def write_gpu_state(
     for name, struct in structs.items():
         width = maniskill_private.joints_of(struct)
         kept = state.states.get(name, np.zeros((0, 0), np.float32))
-        # Lowest env first, as ManiSkill's setters give the rows out.
+        # Lowest env first, the order of rows in ManiSkill's setters.
         targets = [i for i in maniskill_private.envs_of(struct).tolist() if i in position]
         fits = kept.shape[1] == BODY + (2 + len(_JOINT_TENSORS)) * width
         fitting = [i for i in targets if fits and not np.isnan(kept[position[i]]).any()]

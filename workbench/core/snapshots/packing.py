@@ -21,14 +21,14 @@ class PackedSnapshot:
 
     body: bytes
     keys: tuple[int, ...] | None
-    """The numbers of its parts; None where they are those of the snapshot before."""
+    """Numbers of its parts; None if they equal those of the previous snapshot."""
     new_parts: dict[int, bytes]
-    """Those that were not given out yet."""
+    """Parts that were not given out yet, by number."""
 
 
 @dataclass(frozen=True, slots=True)
 class WholeSnapshot:
-    """Unpickles as the `core.snapshots.snapshot.Snapshot` that it was packed from."""
+    """Unpickles as the `Snapshot` that was packed."""
 
     body: bytes
     parts: tuple[bytes, ...]
@@ -39,7 +39,7 @@ class WholeSnapshot:
 
 @dataclass
 class _SentPart:
-    """A part as it was last: the value for identity, its bytes for equality, its number."""
+    """A part of the last snapshot: value (for identity), bytes (for equality) and number."""
 
     value: Any
     pickled: bytes
@@ -65,7 +65,7 @@ class SnapshotPacker:
     _buffers: dict[str, Buffer] = field(default_factory=dict)
     """The buffers of the last snapshot, by path."""
     _next_key: int = field(default_factory=lambda: secrets.randbits(30) << 30)
-    """Not from 0: the server may still keep parts of a worker before this one."""
+    """Random: the server may still keep parts of an earlier worker."""
     _last_keys: tuple[int, ...] | None = None
 
     def pack(self, snapshot: Snapshot) -> PackedSnapshot:
@@ -86,7 +86,7 @@ class SnapshotPacker:
         return PackedSnapshot(body.getvalue(), None if same else keys, new)
 
     def _parts_of(self, snapshot: Snapshot) -> dict[Any, Any]:
-        """What mostly stays, by name."""
+        """The values that mostly stay, by name."""
         memory, task = snapshot.memory, snapshot.memory.task
         stays: dict[Any, Any] = {"contents": getattr(snapshot.simulation, "contents", ())}
         stays |= {"built": task.built, "omitted": task.omitted, **memory.shared_rng._asdict()}
@@ -99,9 +99,9 @@ class SnapshotPacker:
         return {name: value for name, value in stays.items() if value is not None}
 
     def _part(self, kept: _SentPart | None, value: Any, new: dict[int, bytes]) -> _SentPart:
-        """The part with this value: that of the snapshot before, or a new one.
+        """The part with this value: that of the previous snapshot, or a new one.
 
-        Never an older one: the server drops what no kept moment needs, and only the newest is sure to be kept.
+        Never an older one: the server drops parts that no kept moment needs.
         """
         if kept is not None and _is_the_same(kept.value, value):
             return kept
@@ -114,7 +114,7 @@ class SnapshotPacker:
 
 
 def unpack_snapshot(body: bytes, parts: Sequence[bytes]) -> Snapshot:
-    """The snapshot of which `SnapshotPacker.pack` made this body.
+    """The snapshot from which `SnapshotPacker.pack` made this body.
 
     Args:
         parts: the bytes of its parts, in the order of `PackedSnapshot.keys`.
@@ -126,6 +126,6 @@ def unpack_snapshot(body: bytes, parts: Sequence[bytes]) -> Snapshot:
 
 
 def _is_the_same(a: Any, b: Any) -> bool:
-    """Without looking inside: the same object, or a tuple of the same objects."""
+    """Whether both are one object, or tuples of the same objects."""
     both = type(a) is tuple and type(b) is tuple and len(a) == len(b)
     return a is b or (both and all(map(operator.is_, a, b)))

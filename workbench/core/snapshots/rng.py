@@ -13,10 +13,10 @@ import torch
 _MEMORY = ctypes.c_char * (624 * 4 + 4)
 """numpy's ``mt19937_state``: the key, then the position as an int."""
 _HAS_GAUSS = 3
-"""Where ``RandomState.get_state()`` tells whether a normal number is kept aside."""
+"""Index in ``RandomState.get_state()`` of the flag for a normal number kept aside."""
 
 RngState = tuple[Any, ...]
-"""What ``RandomState.get_state()`` gives."""
+"""As returned by ``RandomState.get_state()``."""
 
 
 class SharedRng(NamedTuple):
@@ -36,11 +36,11 @@ class SharedRng(NamedTuple):
 @dataclass
 class _ReadStates:
     generators: list[np.random.RandomState]
-    """Held: an address is somebody else's once its owner is gone."""
+    """Kept alive, since their memory is read by address."""
     memory: list[ctypes.Array[ctypes.c_char]]
-    """Where the state of each lies; not a copy."""
+    """Views of each state's memory."""
     copied: bytes
-    """What lay there."""
+    """Content of `memory` at the last read."""
     states: list[RngState]
     settled: bool
     """Whether none keeps a normal number aside."""
@@ -58,14 +58,14 @@ class RngReader:
         self._seen: dict[str, _ReadStates] = {}
 
     def read(self, purpose: str, generators: list[np.random.RandomState]) -> list[RngState]:
-        """What ``get_state()`` of each gives. `purpose` tells one list of generators from another."""
+        """``get_state()`` of each. `purpose` names the list of generators."""
         seen = self._seen.get(purpose)
         if seen is not None and seen.settled and seen.generators == generators:
             if b"".join(seen.memory) == seen.copied:
                 return seen.states
         states: list[RngState] = [generator.get_state() for generator in generators]  # type: ignore[misc]
         bit_generators = [generator._bit_generator for generator in generators]
-        # A RandomState may be made over another bit generator, whose memory is laid out in its own way.
+        # Other bit generators have another memory layout.
         if all(isinstance(b, np.random.MT19937) for b in bit_generators):
             memory = [_MEMORY.from_address(b.ctypes.state_address) for b in bit_generators]
             settled = not any(state[_HAS_GAUSS] for state in states)
@@ -79,7 +79,7 @@ class RngReader:
         env_idx: list[int],
         states: list[RngState],
     ) -> None:
-        """Put the generators of some envs back, in place: ManiSkill has more than one name for the first env's."""
+        """Restore the generators of some envs, in place: ManiSkill has several references to the first env's."""
         now = list(self.read(purpose, generators))
         for i, state in zip(env_idx, states, strict=True):
             if now[i] is not state:
@@ -87,13 +87,13 @@ class RngReader:
                 now[i] = state
         seen = self._seen.get(purpose)
         if seen is not None:
-            # So that putting back the same snapshot again finds the very states that it would write.
+            # So that restoring the same snapshot again finds the states that it would write.
             seen.states, seen.copied = now, b"".join(seen.memory)
             seen.settled = not any(state[_HAS_GAUSS] for state in now)
 
 
 def read_shared_rng(device: torch.device) -> SharedRng:
-    # The generator behind np.random's functions: the object that they are methods of.
+    # The generator whose methods np.random's functions are.
     (numpy_state,) = _shared_reader.read("numpy", [np.random.get_state.__self__])  # type: ignore[attr-defined]
     return SharedRng(
         torch.get_rng_state().numpy(),

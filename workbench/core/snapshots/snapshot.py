@@ -22,12 +22,12 @@ from workbench.core.snapshots.task_state import TaskState, read_task_state, writ
 
 
 class Memory(NamedTuple):
-    """What is not in the simulation: n envs of a batch of N."""
+    """State of n envs that is not in the simulation."""
 
     elapsed_steps: NDArray[np.int32]
     """(n,) control steps since each env's reset."""
     episode_seeds: NDArray[np.int64]
-    """(n,) as `seams.episode_seeds`."""
+    """(n,) as of `maniskill_private.episode_seeds`."""
     rng: dict[str, list[RngState]]
     """(n,) each: ManiSkill's generators of each env, by purpose."""
     task: TaskState
@@ -52,7 +52,7 @@ class Snapshot(NamedTuple):
     """
 
     num_envs: int
-    """N, of the env that it was taken of."""
+    """N, of the env from which it was taken."""
     env_idx: tuple[int, ...]
     """(n,) which of them."""
     simulation: CpuState | GpuState
@@ -60,27 +60,27 @@ class Snapshot(NamedTuple):
 
     @property
     def omitted(self) -> dict[str, str]:
-        """What the task remembers and could not be kept: path and reason."""
+        """State of the task that could not be kept: path and reason."""
         return self.memory.task.omitted
 
 
 @dataclass(frozen=True)
 class RestoreReport:
-    """What a restore carried: actors, articulations, and attributes of the task by path."""
+    """What a restore wrote: actors, articulations, and attributes of the task by path."""
 
     carried: tuple[str, ...]
     not_carried: dict[str, str]
-    """Name and reason; empty when a snapshot is put back where it was taken."""
+    """Name and reason; empty if a snapshot returns to where it was taken."""
 
 
 def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snapshot:
     """Copy the state of the envs in `env_idx`, or of all.
 
     Args:
-        env: a ManiSkill env, batched on the CPU or on the GPU, reset at least once; wrappers are looked through.
+        env: a ManiSkill env, batched on the CPU or on the GPU, reset at least once; wrappers are removed.
 
     Raises:
-        IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
+        IndexError, ValueError: `env_idx` names an env that does not exist, one twice, or none.
         NotImplementedError: a stock CPU env.
     """
     env = maniskill_private.open_env(env)
@@ -103,46 +103,44 @@ def restore_snapshot(
 ) -> RestoreReport:
     """Put the state of envs of a snapshot into envs of `env`; its other envs are not touched.
 
-    ``restore_snapshot(env, s)`` puts every env back where it was; ``restore_snapshot(env, s, [7], source=3)`` env
-    3's state into env 7; ``restore_snapshot(env, s, range(env.num_envs), source=3)`` into all.
+    ``restore_snapshot(env, s)`` restores every env; ``restore_snapshot(env, s, [7], source=3)`` puts env 3's state into
+    env 7; ``restore_snapshot(env, s, range(env.num_envs), source=3)`` into all.
 
-    The env may be another: made anew, or of an edited task. Then actors and articulations are matched by
-    name, articulations also by the names of their joints, and attributes of the task by name and shape.
-    What the task keeps for a whole batch (counters, a controller's step) belongs to the moment, and is put back
-    when all envs of the env are. The process's random generators are put back when all go back where they were,
-    in a snapshot of as many.
+    The env may be another, made again or of an edited task. Then actors and articulations are matched by name,
+    articulations also by the names of their joints, and attributes of the task by name and shape. What the task keeps for a
+    whole batch (counters, a controller's step) is restored if all envs are; the process's random generators, if all
+    return to where they were, in a snapshot of as many.
 
-    Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not:
-    ask ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
+    Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not: call
+    ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
 
     Args:
-        env_idx: the envs to be set; None for those that the snapshot was taken of.
-        source: whose state they get, as numbered in the env of the snapshot: one for all, or one each. None:
-            each its own; or if the snapshot has a single env, that one.
-        fresh_physics: whether the envs get a PhysX scene without a past, and so go on in the same way to the
-            last bit, whatever they did before. Without, a restore is several times as fast, and contacts that
-            an env has or gets later may be solved in another order (see `cpu_state`).
+        env_idx: the envs to restore; None for those of the snapshot.
+        source: the snapshot's envs whose state they get: one for all, or one each. None: each its own; or if the snapshot
+            has a single env, that one.
+        fresh_physics: whether the envs get a PhysX scene without a past, and so go on alike to the last bit. Without it, a
+            restore is several times as fast, and later contacts may be solved in another order (`renew_physics`).
 
     Raises:
-        IndexError, ValueError: `env_idx` or `source` names envs that are not there, or the numbers differ.
+        IndexError, ValueError: `env_idx` or `source` names an env that does not exist, or their lengths differ.
         TypeError: a GPU env's snapshot for a CPU env, or the other way round.
     """
     env = maniskill_private.open_env(env)
     if not isinstance(snapshot, Snapshot):
-        raise TypeError(f"a Snapshot is wanted, as take_snapshot gives it, not {type(snapshot).__name__}")
+        raise TypeError(f"expected a Snapshot from take_snapshot, not {type(snapshot).__name__}")
     targets, positions = _pairs(env, snapshot, env_idx, source)
     px = batched_system(env.scene)
     state: Any = snapshot.simulation
     if isinstance(state, CpuState) != (px is not None):
         raise TypeError(
-            "a snapshot of CPU simulation cannot be put into GPU simulation, nor the other way round"
+            "a snapshot of CPU simulation cannot be restored in GPU simulation, nor the other way round"
         )
     if px is not None:
         carried, missed = write_cpu_state(env, targets, state, positions, fresh_physics)
     else:
         _require_gpu(env)
         carried, missed = write_gpu_state(env, targets, state, positions)
-    # In whichever order they were taken and are named.
+    # In any order.
     whole = snapshot.num_envs == env.num_envs == len(targets) and all(
         snapshot.env_idx[k] == i for i, k in zip(targets, positions, strict=True)
     )
@@ -151,25 +149,25 @@ def restore_snapshot(
 
 
 def begin_anew(env: Any, env_idx: list[int]) -> None:
-    """Make now an exact point of these envs: PhysX forgets what was before, and their state is one that it gives back.
+    """Make the present an exact point of these envs: a PhysX scene without a past, in a state that it returns as written.
 
-    From an exact point a snapshot and the same actions give the same bits as the run that was not interrupted.
+    From an exact point, a snapshot and the same actions give the same bits as the uninterrupted run.
 
     Args:
-        env: batched on the CPU and reset at least once; wrappers are looked through.
+        env: batched on the CPU and reset at least once; wrappers are removed.
     """
     make_cpu_exact_point(maniskill_private.open_env(env), env_idx)
 
 
 def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
-    """Whether an env is where env `source` of the snapshot was, to the last byte of what PhysX gives out."""
+    """Whether an env's PhysX state equals that of env `source` of the snapshot, to the last byte."""
     wanted: Any = snapshot.simulation
     k = snapshot.env_idx.index(source)
     return read_cpu_state(env, [env_idx]).essence(0) == wanted.essence(k)
 
 
 def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
-    """Copy what is not in the simulation; see `Memory`."""
+    """Copy the state that is not in the simulation; see `Memory`."""
     seeds = maniskill_private.episode_seeds(env)
     reader = _rng_readers.setdefault(env, RngReader())
     generators = maniskill_private.episode_generators(env)
@@ -186,7 +184,7 @@ def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
 
 @contextmanager
 def remembering(env: BaseEnv) -> Iterator[None]:
-    """Afterwards the task remembers what it did: its hooks may count and draw, and must not do so twice in a step."""
+    """Restore the task's memory afterwards: its hooks may count and draw, and must not do so twice in a step."""
     every = list(range(env.num_envs))
     memory = take_memory(env, every)
     try:
@@ -198,10 +196,10 @@ def remembering(env: BaseEnv) -> Iterator[None]:
 def restore_memory(
     env: BaseEnv, memory: Memory, env_idx: list[int], positions: list[int], whole: bool
 ) -> tuple[dict[str, None], dict[str, str]]:
-    """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried, and not.
+    """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried and what was not.
 
     Args:
-        whole: all envs go back where they were, so the process's random generators do too.
+        whole: all envs return to where they were, so restore the process's random generators too.
     """
     steps = env.elapsed_steps
     steps[env_idx] = steps.new_tensor(memory.elapsed_steps[positions])
@@ -225,20 +223,20 @@ def _chosen(items: list[RngState], positions: list[int]) -> list[RngState]:
 def _require_gpu(env: BaseEnv) -> None:
     if not env.scene.gpu_sim_enabled:
         raise NotImplementedError(
-            "snapshots are of envs that are batched: make this one with workbench.make, with num_envs=1 if need be"
+            "snapshots need a batched env: make it with workbench.make (num_envs=1 is enough)"
         )
 
 
 def _pairs(
     env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | int | None, source: int | Sequence[int] | None
 ) -> tuple[list[int], list[int]]:
-    """The envs to be set, and for each the position of its source in the snapshot."""
+    """The envs to restore, and the position of each one's source in the snapshot."""
     if env_idx is None and source is not None:
-        raise ValueError("source says whose state to put; env_idx must say into which envs")
+        raise ValueError("source needs env_idx: the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
         raise IndexError(
-            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: say with env_idx which "
-            "are to be set, and with source whose state they get"
+            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name with env_idx the "
+            "envs to restore, and with source whose state they get"
         )
     targets = envs_of_batch(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
     if source is None:
@@ -270,8 +268,7 @@ def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iter
     to, since writing even the present state wakes what slept. In GPU simulation all envs step, and the others are restored.
 
     Args:
-        others: all other envs as they are now, which they are at the end again; None for a batch in which nobody
-            asks for what the others were.
+        others: a snapshot of all other envs, restored at the end; None if their state does not matter.
     """
     px = batched_system(env.scene)
     if px is None:

@@ -22,13 +22,13 @@ from workbench.core.maniskill_private import task_class
 from workbench.core.simulation.strict_system import TENSORS
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
-"""Values that cannot change, so that keeping them is a copy."""
+"""Immutable values, which need no copy."""
 _ENTERED = (
     *PLAIN,
     *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
     *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
 )
-"""What may hold state, whoever made it; those of the last row cannot be kept, and are named instead."""
+"""Types that may hold state; those of the last row cannot be kept, and are reported."""
 _NOT_ENTERED = (
     *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
     *("_thread", "weakref", "functools", "pathlib", "workbench"),
@@ -39,7 +39,7 @@ _DEEPEST = 8
 
 @dataclass
 class TaskValue:
-    """A value at the end of a path, and how to put another in its place."""
+    """A value with its path, and a function that replaces it."""
 
     path: str
     value: Any
@@ -48,19 +48,19 @@ class TaskValue:
 
 @dataclass
 class Walk:
-    """One look over everything that a task remembers."""
+    """One walk over everything that a task remembers."""
 
     env: BaseEnv
     author: str
-    """Module of the task's class: what is defined beside it is entered."""
+    """Module of the task's class: objects of classes from it are entered."""
     leaves: list[TaskValue] = field(default_factory=list)
     omitted: dict[str, str] = field(default_factory=dict)
     entered: dict[int, Any] = field(default_factory=dict)
-    """Objects that were met, by ``id``: held, and not entered a second time."""
+    """Objects entered, by ``id``, kept alive and not entered again."""
     owners: dict[str, Any] = field(default_factory=dict)
-    """Objects whose attributes were looked at, by path."""
+    """Objects whose attributes were read, by path."""
     simulation: frozenset[int] = frozenset()
-    """Where the simulation's own tensors lie: an attribute that is a view of one is no memory."""
+    """Addresses of the simulation's tensors: a view of one is no memory of the task."""
 
 
 def look_over(env: BaseEnv) -> Walk:
@@ -93,7 +93,7 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
             walk.leaves.append(TaskValue(path, value, put))
         return
     if isinstance(value, tuple) and all(isinstance(item, PLAIN) for item in value):
-        # As plain as its items. A list of them is one leaf too, but can be an env's each.
+        # As immutable as its items. A list of plain values is one leaf too, but may have a row for each env.
         walk.leaves.append(TaskValue(path, value, put))
         return
     if id(value) in walk.entered:
@@ -133,7 +133,7 @@ def _enter_members(walk: Walk, owner: Any, path: str, skipped: frozenset[str], d
 
 
 def _enter_tuple(walk: Walk, value: tuple, path: str, put: Callable[[Any], None], depth: int) -> None:
-    # A tuple cannot be written to: with every item that is put back, a new tuple takes the old one's place.
+    # A tuple is immutable: each restored item makes a new tuple.
     items = list(value)
 
     def put_item(new: Any, i: int) -> None:
@@ -151,7 +151,7 @@ def _putter(container: Any, key: Any) -> Callable[[Any], None]:
 
 @lru_cache(maxsize=4096)
 def _has_members(cls: type, author: str) -> bool:
-    """Whether an object's attributes are looked at: robots, controllers, what the author wrote, dataclasses."""
+    """Whether an object's attributes are entered: robots, controllers, the author's classes, dataclasses."""
     if issubclass(cls, (BaseAgent, BaseController)):
         return True
     if issubclass(cls, (type, torch.nn.Module)) or not cls.__dictoffset__:
@@ -163,7 +163,7 @@ def _has_members(cls: type, author: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def _is_ignored(cls: type, author: str) -> bool:
-    """Whether an object is neither entered nor worth a word: upstream's, or code."""
+    """Whether an object is skipped without a report: upstream's, or code."""
     if issubclass(cls, _ENTERED) or _has_members(cls, author):
         return False
     return cls.__module__.split(".")[0] in _NOT_ENTERED or any("__call__" in vars(c) for c in cls.__mro__)
@@ -173,8 +173,8 @@ def _is_ignored(cls: type, author: str) -> bool:
 def base_env_members() -> frozenset[str]:
     """The attributes that ManiSkill's BaseEnv sets on itself: read off its source, ``self.NAME = ...``.
 
-    They are the env's options, spaces, sensors, last observation and generators, which are either not
-    state or are put back by name (elapsed steps, generators). ``agent`` is entered.
+    Options, spaces, sensors, last observation and generators: no state, or restored by name (elapsed steps, generators).
+    ``agent`` is entered.
     """
     tree = ast.parse(textwrap.dedent(inspect.getsource(BaseEnv)))
     targets = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))

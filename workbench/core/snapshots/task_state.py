@@ -14,17 +14,17 @@ from workbench.core.scene.scene_index import once_a_scene
 from workbench.core.snapshots.task_attributes import PLAIN, TaskValue, look_over
 
 _LARGEST_OF_BATCH = 1 << 16
-"""Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
+"""Elements of a tensor that holds for the whole batch; a larger one is data, not state."""
 
 
 class Buffer(NamedTuple):
-    """One value that was found, as it was."""
+    """A copy of one value."""
 
     values: Any
-    """Rows of the chosen envs (numpy array, or list of plain values), or the value for the whole batch."""
+    """Rows of the chosen envs (numpy array or list of plain values), or the value for the whole batch."""
     per_env: bool
     dtype: torch.dtype | None
-    """Of a tensor; None for what is none."""
+    """Of a tensor, else None."""
 
     def is_as(self, other: Buffer) -> bool:
         """Whether both are equal to the last bit."""
@@ -47,11 +47,12 @@ class TaskState(NamedTuple):
     """
 
     buffers: dict[str, Buffer]
-    """What was written since the scene was built, by path: ``best_distance``, ``agent.controllers['pd_ee_delta_pos'].controllers['arm']._target_qpos``, ``stages['reach']``."""
+    """Values written since the scene was built, by path: ``best_distance``, ``stages['reach']``,
+    ``agent.controllers['pd_ee_delta_pos'].controllers['arm']._target_qpos``."""
     built: frozenset[str]
-    """Paths of what was there when the scene was built."""
+    """Paths that existed when the scene was built."""
     omitted: dict[str, str]
-    """Path and reason of what could not be kept."""
+    """What could not be kept: path and reason."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +62,14 @@ class _Mark:
     value: Any
     """Itself."""
     version: int
-    """How often a tensor had been written, as torch counts."""
+    """torch's count of writes to a tensor."""
     kept: Buffer
-    """What was in it."""
+    """Its content."""
 
 
 @dataclass
 class _Scene:
-    """What was there when a scene was built."""
+    """Values of the task when its scene was built."""
 
     marks: dict[str, _Mark] = field(default_factory=dict)
     paths: frozenset[str] = frozenset()
@@ -86,21 +87,21 @@ def _scene_of(env: BaseEnv) -> _Scene:
 
 
 def note_scene(env: BaseEnv) -> None:
-    """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
+    """Mark what the task holds now, right after its scene was built, as part of the scene."""
     _scene_of(env).add(env, look_over(env).leaves)
 
 
 def note_constructed(env: BaseEnv) -> None:
-    """Remember the plain values that the task's ``__init__`` set after BaseEnv's, as belonging to the scene.
+    """Mark the plain values that the task's ``__init__`` set after BaseEnv's as part of the scene.
 
-    An env made of the edited file would otherwise be given the old file's ``self.threshold = 0.02``.
+    Else a restore into an env of the edited file would write the old file's ``self.threshold = 0.02``.
     """
     plain = [leaf for leaf in look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))]
     _scene_of(env).add(env, plain)
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
-    """Copies of what the task remembers about the envs in `env_idx`, and of what holds for the batch."""
+    """Copies of the task's state of the envs in `env_idx`, and of the whole batch."""
     walk = look_over(env)
     scene = _scene_of(env)
     buffers: dict[str, Buffer] = {}
@@ -119,7 +120,7 @@ def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
 
 
 def _kept(value: Any, num_envs: int, env_idx: NDArray[np.int64] | None = None) -> Buffer:
-    """A copy of a value; of what has a row for each env, the rows of these, or of all."""
+    """A copy of a value; if it has a row for each env, of the rows of `env_idx`, or of all."""
     per_env, dtype = is_per_env(value, num_envs), None
     if per_env and env_idx is not None:
         value = [value[i] for i in env_idx] if isinstance(value, list) else value[env_idx]
@@ -134,8 +135,8 @@ def write_task_state(
 ) -> tuple[dict[str, None], dict[str, str]]:
     """Put row ``positions[k]`` of every buffer into env ``env_idx[k]``.
 
-    What holds for the whole batch is put back too if all envs are, each to its own or all to one of them: they
-    then stand at the one moment that it belongs to.
+    Values of the whole batch are restored too if all envs are, each to its own state or all to that of one: they are then
+    at one moment.
 
     Returns:
         Paths that were carried, and paths that were not with the reason.
@@ -155,7 +156,7 @@ def write_task_state(
             if not _changed(value, mark):
                 continue
             if mark is None or leaf.path not in state.built:
-                # A controller's start and step exist from its first action on, and mean nothing before it.
+                # A controller's start and step exist from its first action on, without meaning before it.
                 if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
                     missed[leaf.path] = "the snapshot has none of this name: left as it is"
                 continue
@@ -175,7 +176,7 @@ def write_task_state(
         if isinstance(new, str):
             missed[leaf.path] = new
             continue
-        # The old value is held, or its id could be the id of a new tensor.
+        # Keeps the old value alive, or a new tensor could get its id.
         replaced[id(value)] = value, new
         leaf.put(new)
         carried[leaf.path] = None
@@ -183,7 +184,7 @@ def write_task_state(
         if path in here:
             continue
         owner, _, name = path.rpartition(".")
-        # A class's default (controllers have None) shows that the attribute is only not set yet.
+        # A default on the class (controllers have None) means that the attribute is not set yet.
         if owner in walk.owners and hasattr(type(walk.owners[owner]), name) and all_envs:
             value = (
                 _with_rows(None, kept, env, env_idx, positions, True)
@@ -200,13 +201,13 @@ def write_task_state(
 def _with_rows(
     value: Any, kept: Buffer, env: BaseEnv, env_idx: list[int], positions: list[int], all_envs: bool
 ) -> Any:
-    """A copy of `value` with the rows put in, or a sentence that says why there is none."""
+    """A copy of `value` with the rows written, or the reason why there is none."""
     listed = isinstance(kept.values, list)
     rows: Any = [kept.values[k] for k in positions] if listed else kept.values[positions]
     kind: Any = list if listed else np.ndarray if kept.dtype is None else torch.Tensor
     shape = (env.num_envs, *np.shape(kept.values)[1:])
     fits = isinstance(value, kind) and is_per_env(value, env.num_envs) and (listed or value.shape == shape)
-    # Of all envs another thing may be put in its place, but for a tensor of another shape.
+    # If all envs are restored the value may be replaced, except a tensor of another shape.
     if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
         if listed:
             return "it is no list with an entry for each env now"
@@ -241,7 +242,7 @@ def is_per_env(value: Any, num_envs: int) -> bool:
 
 
 def _changed(value: Any, mark: _Mark | None) -> bool:
-    """Whether a value was written since its mark; what was not there then has been."""
+    """Whether a value was written since its mark; True without a mark."""
     if mark is None:
         return True
     if value is mark.value and isinstance(value, PLAIN):
@@ -252,7 +253,7 @@ def _changed(value: Any, mark: _Mark | None) -> bool:
 
 
 def version_of(tensor: torch.Tensor) -> int:
-    """How often it was written, as torch counts; below 0 where torch does not."""
+    """torch's count of writes; negative if torch does not count."""
     return -1 if tensor.is_inference() else tensor._version
 
 

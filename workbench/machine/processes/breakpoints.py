@@ -12,17 +12,17 @@ ONE_PROCESS = "remove this line, or use --workers 1 in a terminal, where Python'
 
 
 class NoDebugger(RuntimeError):
-    """The author's code stops for a debugger that cannot be there."""
+    """The author's code calls a debugger where there is no terminal."""
 
 
 def refuse_breakpoints(advice: str) -> None:
-    """From now on both raise `NoDebugger` at their own line, in this process.
+    """Make both raise `NoDebugger` at their own line, in this process.
 
-    Python's debugger would read the end of its input and raise ``BdbQuit`` at the line after, which says nothing. Where
-    ``PYTHONBREAKPOINT`` names something else, or 0, ``breakpoint()`` does that.
+    Python's debugger would read the end of its input and raise a bare ``BdbQuit`` at the next line. A ``PYTHONBREAKPOINT``
+    that names another function, or 0, stays in effect.
 
     Args:
-        advice: what to do instead, to go behind a colon.
+        advice: what to do instead, appended after a colon.
     """
 
     def refuse_breakpoint(*arguments: Any, **keywords: Any) -> NoReturn:
@@ -34,7 +34,7 @@ def refuse_breakpoints(advice: str) -> None:
 
 
 def pass_breakpoints() -> None:
-    """From now on both do nothing, in this process: nobody debugs what is done in the background."""
+    """Make both do nothing in this process, which runs in the background."""
 
     def pass_breakpoint(*arguments: Any, **keywords: Any) -> None:
         pass

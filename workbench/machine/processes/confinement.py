@@ -15,9 +15,9 @@ _ASK_VERSION = 1
 _PATH_BENEATH = 1
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
-"""What of files a version of Landlock knows besides those before it: all but reading is given up."""
+"""File rights that each version of Landlock adds; all but reading are given up."""
 _OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE
-"""Rights that make sense for what is no folder."""
+"""Rights that apply to what is no folder."""
 _TCP_RIGHTS = 0b11
 """Bind and connect, from version 4 on."""
 _SCOPES = 0b11
@@ -26,7 +26,7 @@ _PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MOST_WRITTEN = 1 << 20
-"""Bytes of a file that is written all the same, where there is no Landlock."""
+"""Bytes of a written file, a limit that also holds without Landlock."""
 MOST_OPEN_FILES = 512
 
 
@@ -39,10 +39,10 @@ def landlock_version() -> int:
 
 
 def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()) -> None:
-    """From now on this process and its children may read below `reads`, and what programs and libraries are made of.
+    """Restrict this process and its children: they read only below `reads`, and programs and libraries.
 
-    They write no file but below `writes`, open no TCP connection, signal nobody outside, and get no rights by what
-    they start.
+    They write only below `writes`, open no TCP connection, signal no outside process, and gain no rights by what they
+    start.
 
     Args:
         most_memory: bytes that may be allocated.
@@ -64,7 +64,7 @@ def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
     rights = sum(bits for since, bits in _FILE_RIGHTS.items() if since <= version)
     wanted = [rights, _TCP_RIGHTS if version >= 4 else 0, _SCOPES if version >= 6 else 0]
     asked = (ctypes.c_uint64 * 3)(*wanted)
-    # The kernel refuses a longer question than it knows.
+    # The kernel refuses a struct longer than it knows.
     size = 8 * (3 if version >= 6 else 2 if version >= 4 else 1)
     ruleset = _call(_CREATE_RULESET, ctypes.byref(asked), size, 0)
     if ruleset < 0:
@@ -85,7 +85,7 @@ def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
 
 
 def _python() -> set[str]:
-    """Where this interpreter and its packages are."""
+    """Folders of this interpreter and its packages."""
     user = [site.getusersitepackages()]
     return {os.path.realpath(path) for path in (sys.prefix, sys.base_prefix, *sys.path, *user) if path}
 

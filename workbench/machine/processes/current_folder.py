@@ -11,7 +11,7 @@ _AT_FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 
 
 class CurrentFolder:
-    """The folder that is current when this is made; by descriptor, so one that is renamed meanwhile is the same."""
+    """The current folder at construction, by descriptor, so that it may be renamed."""
 
     def __init__(self) -> None:
         self._fd = os.open(".", _AT_FOLDER)
@@ -19,10 +19,10 @@ class CurrentFolder:
 
     @contextmanager
     def again(self, *, stay: bool = False) -> Iterator[None]:
-        """Be there during the block, and afterwards in the folder before it.
+        """Within this it is the current folder; afterwards the previous one is.
 
         Args:
-            stay: a folder that the block itself changes to stays the current one, unless it raises.
+            stay: keep the folder in which the block ends, unless it raises.
         """
         before = os.open(".", _AT_FOLDER)
         leave = True

@@ -17,13 +17,13 @@ _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 def children(pid: int) -> list[int]:
-    """Process ids of its children, zombies too; empty when it is gone."""
+    """Process ids of its children, including zombies; empty if it is gone."""
     found: list[int] = []
     try:
         for thread in os.listdir(f"/proc/{pid}/task"):
             found += map(int, _read(f"/proc/{pid}/task/{thread}/children").split())
     except FileNotFoundError:
-        # A kernel without that file, or a thread or the process that has ended meanwhile.
+        # A kernel without that file, or a thread or the process has ended.
         return _children_by_parent(pid)
     except OSError:
         return found
@@ -31,7 +31,7 @@ def children(pid: int) -> list[int]:
 
 
 def family(pid: int) -> list[int]:
-    """A process and all that descend from it."""
+    """A process and all its descendants."""
     members = {pid: None}
     waiting = [pid]
     while waiting:
@@ -42,7 +42,7 @@ def family(pid: int) -> list[int]:
 
 
 def resident_memory(pid: int) -> int:
-    """Bytes of the process that are in memory, shared ones too; 0 when it is gone."""
+    """Resident bytes of the process, including shared ones; 0 if it is gone."""
     try:
         return int(_read(f"/proc/{pid}/statm").split()[1]) * _PAGE
     except (OSError, IndexError):
@@ -50,8 +50,8 @@ def resident_memory(pid: int) -> int:
 
 
 def allocated_memory(pid: int) -> int:
-    """Bytes in memory that the process itself has filled; 0 when it is gone. Of `resident_memory` what is no file: of
-    mapped libraries the kernel may drop hundreds of megabytes while something else is allocated."""
+    """Resident bytes without mapped files; 0 if it is gone. Of mapped libraries the kernel may drop hundreds of megabytes
+    while something else is allocated."""
     try:
         _, resident, shared, *_ = _read(f"/proc/{pid}/statm").split()
         return (int(resident) - int(shared)) * _PAGE
@@ -60,15 +60,15 @@ def allocated_memory(pid: int) -> int:
 
 
 def proportional_memory(pids: Iterable[int]) -> int:
-    """Bytes that processes have in memory together, a page that several of them share counted once.
+    """Bytes that these processes have in memory together, by PSS: a page that they share counts once.
 
-    Of what is shared with others a part is counted (PSS). Takes milliseconds for each process that has a gigabyte.
+    Takes milliseconds for each process of a gigabyte.
     """
     return sum(map(_proportional, pids))
 
 
 def main_thread_ended(pid: int) -> bool:
-    """Whether its main thread has ended and others have not, as also for a moment in the midst of any end."""
+    """Whether its main thread has ended and others have not; also true for a moment of any exit."""
     try:
         return _state_and_parent(pid)[0] == "Z" and len(os.listdir(f"/proc/{pid}/task")) > 1
     except OSError:
@@ -81,7 +81,7 @@ def _proportional(pid: int) -> int:
             if line.startswith(b"Pss:"):
                 return int(line.split()[1]) * 1024
     except (OSError, ValueError):
-        # Of another user, or on its way out.
+        # Of another user, or ending.
         return resident_memory(pid)
     return 0
 
@@ -94,7 +94,7 @@ def _children_by_parent(pid: int) -> list[int]:
 
 def _state_and_parent(pid: int | str) -> tuple[str, int]:
     try:
-        # The name, in brackets, may hold anything.
+        # The name in brackets may contain anything.
         state, parent = _read(f"/proc/{pid}/stat").rpartition(b")")[2].split()[:2]
     except (OSError, ValueError):
         return "", 0
@@ -106,17 +106,17 @@ def _read(path: str) -> bytes:
         return file.read()
 
 
-# --- Whatever a worker starts ends with it: a process above it adopts what detaches itself, and ends it all ---
+# --- a keeper above the worker adopts what detaches itself, and ends it all ---------------------------
 
 
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36
 _LONGEST_END = 5.0
-"""Seconds in which what was killed must be gone; a process that waits for a disk may not be."""
+"""Seconds for killed processes to end; one that waits for a disk may take longer."""
 _SIGNALS = {signal.SIGCHLD, signal.SIGTERM}
 
 
 def main() -> None:
-    """``python -m workbench.machine.processes.family SERVER MODULE ARGUMENT...``: the family of a process that is ``MODULE.main()``."""
+    """``python -m workbench.machine.processes.family SERVER MODULE ARGUMENT...``: run ``MODULE.main()`` under a keeper."""
     begin_family(int(sys.argv.pop(1)))
     importlib.import_module(sys.argv[1]).main(*sys.argv[2:])
 
@@ -133,14 +133,14 @@ def begin_family(server: int) -> None:
     Call it before any import (the keeper then has 6 MB of its own) and before any thread is started.
 
     Args:
-        server: process id of the parent. The keeper ends its family when that is gone, however it went.
+        server: process id of the parent. The keeper ends its family when the parent is gone.
     """
     libc = ctypes.CDLL(None)
-    # Until we wait for them they would be lost, and SIGTERM would end us before there is anything to end.
+    # Blocked until `_keep` waits for them: else SIGCHLD is lost, and SIGTERM ends us before the worker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     signal.signal(
         signal.SIGCHLD, signal.SIG_DFL
-    )  # whoever started us may have it ignored: then nobody is reaped
+    )  # the parent may have set it to be ignored: then no child can be waited for
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != server:
         sys.exit("the server is gone")
@@ -149,49 +149,49 @@ def begin_family(server: int) -> None:
     worker = os.fork()
     if worker != 0:
         _keep(worker)
-    # A group of its own: what the author's code sends to its group is not for the keeper.
+    # A group of its own: signals of the author's code to its group must not reach the keeper.
     os.setsid()
     end_with_parent(keeper)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def end_with_parent(parent: int) -> None:
-    """Ask the kernel to end this process with `parent`, which must be the process that made it and have one thread."""
+    """Ask the kernel to end this process with `parent`, its parent process, which must have one thread."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
 
 def end_family(keeper: subprocess.Popen[bytes]) -> None:
-    """End a process that called `begin_family`, with all that it started; returns when all is gone."""
+    """End a process that called `begin_family` and all that it started; returns when all have ended."""
     keeper.terminate()
     try:
         keeper.wait(timeout=2 * _LONGEST_END)
     except subprocess.TimeoutExpired:
-        # Somebody stopped it. The worker ends with it; what was detached does not.
+        # The keeper is stopped. The worker ends with it; what was detached does not.
         keeper.kill()
         keeper.wait()
 
 
 def describe_exit(code: int | None) -> str:
-    """In words: ``was killed by SIGSEGV``, ``ended with exit code 3``."""
+    """As text: ``was killed by SIGSEGV``, ``ended with exit code 3``."""
     if code is None:
         return "stopped answering"
     if code < 0:
-        # Not every signal has a name: of the real-time ones only the first and the last.
+        # Of the real-time signals only the first and the last have names.
         named = -code in set(signal.Signals)
         return f"was killed by {signal.Signals(-code).name if named else f'signal {-code}'}"
     return f"ended with exit code {code}"
 
 
 def _keep(worker: int) -> NoReturn:
-    # The server sees the worker's end by the end of what they share.
+    # The server sees the worker's end when shared descriptors close: the keeper must hold none.
     for fd in sorted(map(int, os.listdir("/proc/self/fd"))):
         if fd > 2:
             try:
                 os.close(fd)
             except OSError:
-                pass  # the one that the folder was read with
+                pass  # the descriptor of listdir
     os.dup2(0, 1)
     os.dup2(0, 2)
     status = None
@@ -204,12 +204,12 @@ def _keep(worker: int) -> NoReturn:
 
 
 def _end_all() -> dict[int, int]:
-    """Kill all children, and those that become ours by that; their exit statuses."""
+    """Kill all children, and those that become ours by that; returns exit statuses."""
     ended: dict[int, int] = {}
     deadline = time.monotonic() + _LONGEST_END
     while (ours := children(os.getpid())) and time.monotonic() < deadline:
         for pid in ours:
-            os.kill(pid, signal.SIGKILL)  # a zombie at least: only we reap it
+            os.kill(pid, signal.SIGKILL)  # its number is not reused before we reap it
         ended |= _reap()
         signal.sigtimedwait(_SIGNALS, 0.005)
     return ended | _reap()
@@ -233,7 +233,7 @@ def _leave_with(status: int | None) -> NoReturn:
     number = signal.SIGKILL if status is None else os.WTERMSIG(status)
     if number != signal.SIGKILL:
         signal.signal(number, signal.SIG_DFL)
-        ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0)  # the worker has left its core
+        ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0)  # the worker has dumped its core
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [number])
     os.kill(os.getpid(), number)
     time.sleep(1.0)

@@ -13,11 +13,11 @@ def without_current_folder(path: Sequence[str], python_path: str) -> list[str]:
     ``python -m`` and an empty entry of ``PYTHONPATH`` add that folder: a ``numpy.py`` in a downloaded folder would run.
 
     Args:
-        python_path: the variable ``PYTHONPATH``: what is named there, ``.`` too, is meant.
+        python_path: the variable ``PYTHONPATH``; folders named there stay, even ``.``.
     """
     try:
         here = os.getcwd()
-    except FileNotFoundError:  # it was removed: nothing can be imported from it
+    except FileNotFoundError:  # it was removed
         return list(path)
     named = {os.path.realpath(entry) for entry in python_path.split(os.pathsep) if entry}
     package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.realpath(__file__)))))

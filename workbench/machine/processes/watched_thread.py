@@ -10,16 +10,16 @@ from collections.abc import Callable
 logger = logging.getLogger(__name__)
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.05, 5.0
-"""Seconds before a thread begins again; twice as long each time that it fails."""
+"""Seconds before a thread starts again; doubled at each failure."""
 
 _listeners: list[Callable[[str], None]] = []
 _lock = threading.Lock()
 
 
 def watched_thread(name: str, work: Callable[[], None]) -> threading.Thread:
-    """A thread, not started, that does `work` until that returns.
+    """A thread, not started, that runs `work` until it returns, again after each exception.
 
-    `work` must be such that it can be begun again where it raised: a loop that takes what is to be done from a queue.
+    `work` must be restartable, such as a loop over a queue.
     """
 
     def keep_at_it() -> None:
@@ -36,7 +36,7 @@ def watched_thread(name: str, work: Callable[[], None]) -> threading.Thread:
 
 
 def report_failure(what: str, error: BaseException) -> None:
-    """Tell whoever listens, or else the log, that part of the workbench itself failed.
+    """Report a failure of the workbench itself to the listeners, or to the log if there are none.
 
     Args:
         what: a sentence without its full stop.
@@ -51,12 +51,12 @@ def report_failure(what: str, error: BaseException) -> None:
         try:
             listener(text)
         except Exception:
-            # Its terminal may be what failed.
+            # The listener's terminal may be the cause.
             logger.exception("%s", text)
 
 
 def listen(listener: Callable[[str], None]) -> None:
-    """Have `listener` called, on any thread, with the text of each failure, until `stop_listening`."""
+    """Call `listener`, on any thread, with the text of each failure, until `stop_listening`."""
     with _lock:
         _listeners.append(listener)
 

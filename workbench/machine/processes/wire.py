@@ -19,44 +19,44 @@ import msgspec
 import numpy as np
 
 MOST_BYTES = 1 << 30
-"""Of one message. The largest of a healthy task are its meshes and the pictures of all envs: some 100 MB."""
+"""Of one message. The largest of a working task, its meshes and the pictures of all envs, are some 100 MB."""
 _PIECE, _SMALL = 1 << 18, 1 << 14
-"""Bytes; the first is more than a socket holds."""
+"""Bytes; the first is more than a socket's buffer."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
-"""Kinds of msgpack's extensions: the next array, or one that came before."""
+"""msgpack extensions: the next array, or a repeated one."""
 _NUMBERS = "biufcSU"
-"""Kinds of arrays: what holds objects is no data."""
+"""Kinds of arrays that may be sent; arrays of objects may not."""
 _LONGEST = 500
-"""Bytes of what is said of one array."""
+"""Bytes of the description of one array."""
 _Head = tuple[str, int | None, msgspec.Raw]
 Value = TypeVar("Value", covariant=True)
 
 
 class Unreadable(EOFError):
-    """What came is no message. Nothing that follows can be read, so the line is at its end; the text says why."""
+    """The received bytes are no message, and nothing after them can be read; the text says why."""
 
 
 # --- calls -----------------------------------------------------------------------------------------
 
 
 class Question(Generic[Value]):
-    """What a worker can be asked in a `Call`; its answer is a `Value`."""
+    """Base of what a `Call` can ask; its answer is a `Value`."""
 
     part: ClassVar[Any] = None
-    """The type of what is told before the answer."""
+    """Type of progress messages before the answer."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """Request to a worker: an answer with this number comes back, after any count of messages on how far it is."""
+    """A request to a worker; its answer, and progress messages before it, carry the same number."""
 
     number: int
     request: Question[Any]
 
 
 def value_type(question: type[Question[Any]]) -> Any:
-    """What its answer is to be."""
+    """The type of a question's answer."""
     (base,) = question.__orig_bases__  # type: ignore[attr-defined]
     (kind,) = get_args(base)
     if isinstance(kind, ForwardRef):
@@ -84,7 +84,7 @@ class MessageSocket:
     ) -> None:
         """
         Args:
-            kinds, questions: that may come, as of `Unpacker`.
+            kinds, questions: accepted messages, as in `Unpacker`.
         """
         self.end = end
         self._unpacker = Unpacker(kinds, questions)
@@ -92,28 +92,28 @@ class MessageSocket:
         self._poll.register(end, select.POLLIN)
         self._came, self._piece = bytearray(), memoryview(bytearray(_PIECE))
         self._at = 0
-        """Where in that the next message begins."""
+        """Offset of the next message in `_came`."""
 
     def send(self, message: object) -> None:
-        """Waits until all of it is on its way. Raises OSError: the other end is closed."""
+        """Send a message; blocks until all of it is written. Raises OSError if the other end is closed."""
         self.send_bytes(pack_message(message))
 
     def send_bytes(self, raw: bytes) -> None:
-        """What is packed already. Raises as `send`."""
+        """Send a packed message. Raises as `send`."""
         head = _LENGTH.pack(len(raw))
         for piece in (head + raw,) if len(raw) < _SMALL else (head, raw):  # no copy of what is large
             self.end.sendall(piece)
 
     def waits(self) -> bool:
-        """Whether anything came since the last `receive` that gave None."""
+        """Whether bytes are waiting to be read."""
         return bool(self._poll.poll(0))
 
     def receive(self, timeout: float | None) -> Any:
-        """The next message; None where none is complete within `timeout` seconds, of which None is any number.
+        """The next message; None if none is complete within `timeout` seconds (None waits for ever).
 
         Raises:
-            Unreadable: no message begins here.
-            EOFError: the other end is closed, and all that was sent whole was received.
+            Unreadable: the bytes are no message.
+            EOFError: the other end is closed, and all complete messages were received.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while (message := self._whole()) is None:
@@ -133,7 +133,7 @@ class MessageSocket:
         return message
 
     def _whole(self) -> Any | None:
-        """The message that is complete, if one is."""
+        """The next message if it is complete."""
         begin = self._at + _LENGTH.size
         if len(self._came) < begin:
             return None
@@ -144,7 +144,7 @@ class MessageSocket:
         if len(came) < end:
             return None
         self._at = end
-        if end == len(came):  # what was large is not to be kept until more comes
+        if end == len(came):  # do not keep a large buffer until more comes
             self._came, self._at = bytearray(), 0
         return self._unpacker.message(memoryview(came)[begin:end])
 
@@ -153,15 +153,15 @@ class MessageSocket:
 
 
 def pack(value: object) -> bytes:
-    """Of dataclasses, arrays and plain data.
+    """Bytes of dataclasses, arrays and plain data.
 
     Raises:
-        TypeError: something of it is neither.
+        TypeError: it contains something else.
     """
     arrays = _Written()
     try:
         message = msgspec.msgpack.Encoder(enc_hook=arrays.hook).encode(value)
-    except UnicodeEncodeError:  # half a character in the author's text, or in what it raised
+    except UnicodeEncodeError:  # a lone surrogate in the author's text
         arrays = _Written()
         plain = msgspec.to_builtins(value, builtin_types=(bytes, np.ndarray, np.generic, Path))
         message = msgspec.msgpack.Encoder(enc_hook=arrays.hook).encode(_can_be_written(plain))
@@ -169,7 +169,7 @@ def pack(value: object) -> bytes:
 
 
 def pack_message(message: object) -> bytes:
-    """Of a request or an event; a `Call` goes by the name of its question."""
+    """Bytes of a request or an event; a `Call` is sent under the name of its question."""
     if isinstance(message, Call):
         return pack((type(message.request).__name__, message.number, message.request))
     return pack((type(message).__name__, None, message))
@@ -181,8 +181,8 @@ class Unpacker:
     def __init__(self, kinds: Sequence[type] = (), questions: Sequence[type] = ()) -> None:
         """
         Args:
-            kinds: of messages that may come.
-            questions: that may come in a `Call`.
+            kinds: accepted messages.
+            questions: accepted in a `Call`.
         """
         self._kinds = {(kind.__name__, False): kind for kind in kinds}
         self._kinds |= {(kind.__name__, True): kind for kind in questions}
@@ -190,20 +190,21 @@ class Unpacker:
         self._arrays = _Read(memoryview(b""))
 
     def unpack(self, raw: bytes | bytearray | memoryview, kind: Any) -> Any:
-        """
+        """The value that `pack` was given.
+
         Args:
-            kind: its type, as an annotation says it.
+            kind: its type, as an annotation.
 
         Raises:
-            Unreadable: it is not of this kind.
+            Unreadable: it is not of this type.
         """
         return self._guarded(lambda: self._decoder(kind).decode(self._begin(raw)))
 
     def message(self, raw: bytes | bytearray | memoryview) -> Any:
-        """What `pack_message` was given.
+        """The message that `pack_message` was given.
 
         Raises:
-            Unreadable: it is none of the kinds.
+            Unreadable: it is none of the accepted ones.
         """
         return self._guarded(lambda: self._message(raw))
 
@@ -219,7 +220,7 @@ class Unpacker:
         whole = memoryview(raw)
         end = _LENGTH.size + _LENGTH.unpack_from(whole)[0]
         if end > len(whole):
-            raise ValueError("it says that it is longer than it is")
+            raise ValueError("its stated length exceeds the data")
         self._arrays = _Read(whole[end:])
         return whole[_LENGTH.size : end]
 
@@ -236,20 +237,20 @@ class Unpacker:
         except Unreadable:
             raise
         except Exception as error:
-            # Any of them: what comes may be made so that it breaks what reads it.
+            # Any exception: the bytes may be made to break their reader.
             raise Unreadable(f"{type(error).__name__}: {_line(error)}") from error
         finally:
             self._arrays = _Read(memoryview(b""))
 
 
 class _Written:
-    """The arrays of a message that is written."""
+    """Arrays of a message that is packed."""
 
     def __init__(self) -> None:
         self.parts: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._alive: list[np.ndarray] = []
-        """Else another may get the number of one that is gone."""
+        """Kept alive, since `_numbers` goes by id."""
 
     def hook(self, value: object) -> object:
         if isinstance(value, np.ndarray):
@@ -271,7 +272,7 @@ class _Written:
 
 
 class _Read:
-    """The arrays of a message that is read."""
+    """Arrays of a message that is unpacked."""
 
     def __init__(self, rest: memoryview) -> None:
         self._rest = rest
@@ -285,9 +286,9 @@ class _Read:
         dtype, shape, size = _described(bytes(data))
         if size > len(self._rest):
             raise ValueError("an array is longer than what came")
-        # A copy: who keeps one array must not keep the whole message.
+        # A copy, so that one array does not keep the whole message alive.
         array = np.zeros(0, dtype) if size == 0 else np.frombuffer(self._rest[:size], dtype).copy()
-        if dtype.kind == "b":  # any byte may stand there, and numpy takes one but 0 and 1 for what it likes
+        if dtype.kind == "b":  # other bytes than 0 and 1 are undefined in numpy
             array = array.view(np.uint8) != 0
         array = array.reshape(shape)
         self._rest = self._rest[size:]
@@ -296,7 +297,7 @@ class _Read:
 
 
 def _refuse() -> Any:
-    raise ValueError("something that is no array")
+    raise ValueError("invalid description of an array")
 
 
 @functools.lru_cache(1000)
@@ -316,7 +317,7 @@ def _described(data: bytes) -> tuple[np.dtype, tuple[int, ...], int]:
 
 
 def _checked(kind: Any, value: Any) -> Any:
-    """A value of a type that is not msgpack's own."""
+    """Check a value of a type that msgpack does not have."""
     if (get_origin(kind) or kind) is np.ndarray and isinstance(value, np.ndarray):
         return value
     if kind is Path and isinstance(value, bytes):
