@@ -92,7 +92,7 @@ def test_end_effector_control_solves_by_device_and_aims_by_the_scene() -> None:
     assert 'self.device.type == "cuda"' in inspect.getsource(Kinematics.__init__)
     solve = inspect.getsource(Kinematics.compute_ik)
     assert "return None" in solve and "pose.sp" in solve  # what is done where no answer is found; one env
-    # What seams._set_ee_action_of_each_env says anew, for all envs: word for word as it was read.
+    # `maniskill_private._set_ee_action_of_each_env` repeats this for all envs: word for word as it was read.
     action = inspect.getsource(pd_ee_pose)
     for line in (
         "ik_via_target_pose = self.config.use_target or not self.scene.gpu_sim_enabled",

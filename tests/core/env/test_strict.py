@@ -415,7 +415,7 @@ def test_a_batch_of_another_size_than_is_reset_is_told_with_both(rules: Any, wri
         ValueError, match=f"{words}.*batch of 3 .* 2 rows are wanted: .*len.env_idx"
     ) as caught:
         env.reset(options={"env_idx": torch.tensor([0, 2])})
-    assert traceback.extract_tb(caught.value.__traceback__)[-1].filename.endswith("struct_access.py")
+    assert traceback.extract_tb(caught.value.__traceback__)[-1].filename.endswith("accessors.py")
     env.close()
     env = build(mended, rules)
     env.reset(options={"env_idx": torch.tensor([0, 2])})

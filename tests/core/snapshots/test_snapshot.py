@@ -617,7 +617,7 @@ def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv
     assert not restore_snapshot(vector, take_snapshot(wrapped)).not_carried
     for taken in (None, [0, 2]):
         with pytest.raises(
-            IndexError, match="the snapshot is of envs .* and this env has 2: say with env_idx"
+            IndexError, match="the snapshot is of envs .* and this env has 2: name with env_idx"
         ):
             restore_snapshot(wrapped, take_snapshot(pick, taken))
     vector.close()
