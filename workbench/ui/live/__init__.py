@@ -1,1 +1,1 @@
-"""The panels of the live page."""
+"""Panels of the live page."""

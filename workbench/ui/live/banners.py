@@ -1,14 +1,4 @@
-"""The banners over the top of the view: what is wrong in the author's file, or what its code has been at for long.
-
-They float over the view and never over the controls, because the last good version keeps running behind and stays
-usable. Of a problem the sentence that is needed comes first (what failed, where), then the line of code and the message;
-the whole traceback only on demand.
-
-Code that is at one thing for long may only be slow, so nothing is done unasked, and the page says what is known instead:
-the hook, the author's line, the seconds. *Interrupt* leaves the code there, with its traceback, and keeps the process and
-the envs. Where that does not help (native code, a loop that catches everything), *Restart* ends the process, and the last
-good version comes back in another, where it was.
-"""
+"""Banners over the 3-D view: a problem in the author's file, or code that runs for long."""
 
 from __future__ import annotations
 
@@ -22,11 +12,11 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
 WIDEST, BUSY_WIDEST = 520, 460
-"""Pixels. The style sheet makes them as narrow as the view: over the controls they would hide the very buttons that the
-last good version is still used with."""
+"""Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
+version is still used."""
 
 SHOWN_AFTER = 4.0
-"""Seconds. The status line says it earlier; a banner is for what one may want to end."""
+"""Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
 DOING = {
     "syntax": "cannot be read",
@@ -49,17 +39,18 @@ INTERRUPTED = {
 
 
 def is_busy_for_long(view: SessionView) -> bool:
-    """Whether the banner stands over the view; it goes before that of a problem.
+    """Whether to show the busy banner; it hides that of a problem.
 
-    Not for a worker that gets ready: nothing of the author's is at work then, and why the one before is gone
-    must stay in sight. Nor for one that a debugger holds, which the status line says.
+    Not while a worker gets ready: none of the author's code runs then, and the reason why the last worker ended must
+    stay visible. Nor while a debugger holds the worker, which the status line shows.
     """
     busy = view.busy
     return busy is not None and busy.seconds >= SHOWN_AFTER and not (busy.getting_ready or busy.held)
 
 
 class Banner(PagePart[SessionView]):
-    """A floating panel that is there only while a problem stands.
+    """A floating panel that is shown while there is a problem: what failed and where, then the line of code and the
+    message; the traceback on demand.
 
     Args:
         server: The page.
@@ -75,7 +66,7 @@ class Banner(PagePart[SessionView]):
             self._restart = server.gui.add_button(
                 "Start a new worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
-        # From the right edge of the view: on the left are viser's own notices.
+        # At the right edge of the view: on the left are viser's own notifications.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
@@ -90,7 +81,7 @@ class Banner(PagePart[SessionView]):
             return
         stopped = view.state == "stopped"
         self._restart.visible = stopped
-        # Written once a problem: a new text would close the traceback that someone has open.
+        # Written once for each problem: a new text would close an open traceback.
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:
             self._drawn = drawn
@@ -100,7 +91,7 @@ class Banner(PagePart[SessionView]):
 
 
 def banner_html(problem: Problem, view: SessionView) -> str:
-    """The banner's content; every value escaped."""
+    """The banner's content."""
     if problem.stage == "syntax" or (view.task is None and problem.file is not None):
         subject = "The file"
     else:
@@ -112,7 +103,7 @@ def banner_html(problem: Problem, view: SessionView) -> str:
 
 
 def _kept(view: SessionView) -> str:
-    """What there still is."""
+    """Which version still runs, in a sentence."""
     if view.state == "stopped":
         return "The worker process is gone, so nothing moves until there is a new one."
     if view.task is None:
@@ -127,11 +118,15 @@ def _kept(view: SessionView) -> str:
 
 
 class BusyBanner(PagePart[SessionView]):
-    """A floating panel that is there only while the worker is busy for long.
+    """A floating panel that is shown while the worker is busy for long: hook, line and seconds.
+
+    The code may only be slow, so nothing is done unasked. *Interrupt* raises in the author's code and keeps process and
+    envs. Where that does not help (native code, a loop that catches everything), *Restart* ends the process, and the
+    last good version comes back where it was in another.
 
     Args:
         server: The page.
-        interrupt: Asks the session to have the author's code left where it is.
+        interrupt: Asks the session to interrupt the author's code.
         restart: Asks the session for another worker process.
     """
 
@@ -152,7 +147,7 @@ class BusyBanner(PagePart[SessionView]):
             self._panel.visible = False
             return
         self._html.content = busy_html(busy, view)
-        # Apart from the seconds, which would close it each time that they change.
+        # An element of its own: the changing seconds would close an open traceback.
         trace = render("traceback", traceback=busy.traceback) if busy.deaf and busy.traceback else ""
         self._traceback.content = trace
         self._traceback.visible = bool(trace)
@@ -164,7 +159,7 @@ class BusyBanner(PagePart[SessionView]):
 
 
 def busy_html(busy: Busy, view: SessionView) -> str:
-    """The banner's content; every value escaped."""
+    """The banner's content."""
     if busy.deaf:
         advice = (
             "It was interrupted and goes on: it is in native code, or it catches every exception. Restart ends the "

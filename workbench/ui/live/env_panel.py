@@ -1,9 +1,4 @@
-"""The batch, one row an env: sort it, filter it, press a row to select that env and go to its moment.
-
-At most `MOST_ROWS` rows are drawn. Sorting and filter belong to the page's server, like the selected env, so two open
-pages show the same. Ties keep the order of the envs, or rows would jump about while nothing changes; an env without a
-value in a column comes last whichever way it is sorted.
-"""
+"""The table of envs: one row an env, sorted and filtered; a press selects the env and goes to its moment."""
 
 from __future__ import annotations
 
@@ -43,25 +38,25 @@ FILTERS: dict[Filter, tuple[str, str, str]] = {
         "No env is flagged.",
     ),
 }
-"""What a pill says (an env that runs may have failed before, so "failed 16" beside "running 16" puzzles), what it means,
-and what is said where there is none."""
+"""Label of the button, hint, and text of an empty table. "last failed", not "failed": a running env may have failed
+before, and "failed 16" next to "running 16" confuses."""
 MOST_ENTRIES = 6
-"""Columns of bool entries; a row of more is wider than the view."""
+"""Columns of bool entries; with more a row is wider than the view."""
 POINTS = 40
-"""Of a row's small curve: it is 60 pixels wide."""
+"""Points of a row's small curve."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
 _GRAVITY = np.array([2, 3, 0, 1])
-"""Of an `Outcome` when sorted by: failed first, then cut off, then running, then solved."""
+"""Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
 
 
 def entry_names(rows: EnvRows) -> tuple[str, ...]:
-    """The bool entries that get a column: ``success`` and ``fail`` first."""
+    """The bool entries that get a column, ``success`` and ``fail`` first."""
     names = sorted(rows.first_true, key=lambda name: (name != "success", name != "fail", name))
     return tuple(names[:MOST_ENTRIES])
 
 
 def columns(rows: EnvRows) -> tuple[str, ...]:
-    """Names by which rows can be sorted, as they stand in the table."""
+    """Names of the sortable columns, in the order of the table."""
     return (
         "env",
         "state",
@@ -74,10 +69,10 @@ def columns(rows: EnvRows) -> tuple[str, ...]:
 
 
 def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
-    """(N,) the envs that a filter lets through.
+    """(N,) whether each env passes a filter.
 
-    ``failed``: the present episode ended without success or, while it runs, the one before did.
-    ``flagged``: outliers in the present episode or the one before.
+    ``failed``: the present episode ended without success or, while it runs, the previous one did.
+    ``flagged``: outliers in the present or the previous episode.
     """
     everyone = np.ones(rows.num_envs, bool)
     if wanted == "failed":
@@ -92,12 +87,16 @@ def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
 
 
 def first_flagged(rows: EnvRows) -> int | None:
-    """The first env with something odd: in the episode under way, or else in the one before; None for none."""
+    """The first env with an outlier in the present episode, or else in the previous one; None for none."""
     return min(rows.outliers, default=None) if rows.outliers else min(rows.last.outliers, default=None)
 
 
 def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
-    """The envs that a filter lets through, sorted by a column; envs without a value last."""
+    """The envs that pass a filter, sorted by a column.
+
+    Envs without a value come last in both directions. Ties keep the order of the envs, or rows would jump while nothing
+    changes.
+    """
     envs = np.flatnonzero(mask(rows, wanted))
     keys = _keys(rows, column)[envs]
     keys = np.where(np.isnan(keys), np.inf, -keys if descending else keys)
@@ -105,14 +104,14 @@ def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") 
 
 
 def moment_of(rows: EnvRows, env: int) -> int | None:
-    """The step of its present episode that an env's row is about: its first outlier, else its end, else none."""
+    """The step of the present episode that a press on an env's row shows: its first outlier, else its end, else None."""
     if env in rows.outliers:
         return rows.outliers[env][0].step
     return int(rows.end[env]) if rows.end[env] >= 0 else None
 
 
 def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
-    """The cells of these envs. A curve is ``points`` of SVG polylines; reasons of flags are the oldest first."""
+    """The cells of these envs. A curve is ``points`` of SVG polylines; flags are oldest first."""
     names = entry_names(rows)
     curves = _curves(rows.rewards, envs)
     made = []
@@ -166,15 +165,15 @@ def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
 
 
 def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[str]]:
-    """SVG points of each env's rewards, all on one scale: rows are there to be compared."""
+    """SVG points of each env's rewards, all on one scale."""
     chosen = rewards[envs].astype(np.float64)
     finite = np.isfinite(chosen)
     if not finite.any():
         return [[] for _ in envs]
-    # As wide as the longest episode shown.
+    # As wide as the longest shown episode.
     chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
     every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
-    # A single step without a number is seen too.
+    # A single step without a number makes a gap, too.
     finite = np.logical_and.reduceat(np.isfinite(chosen), every, axis=1)
     chosen = chosen[:, every]
     if not finite.any():
@@ -194,7 +193,7 @@ def _step(step: int) -> str:
 
 
 MOST_ROWS = 64
-"""On one page of the table."""
+"""Rows of one page of the table."""
 HINTS = {
     "env": "Press a column to sort by it, again to turn it round",
     "state": "Of the episode under way: running until its first end",
@@ -206,7 +205,7 @@ HINTS = {
 
 
 class EnvPanel(PagePart[SessionView]):
-    """The table of envs in the present container."""
+    """The table of envs in the present container. Sorting and filter are the same for all open pages."""
 
     every = 0.3
     """Faster, numbers of many rows cannot be read."""
@@ -219,7 +218,7 @@ class EnvPanel(PagePart[SessionView]):
         self._filter: Filter = "all"
         self._pages = Paged(MOST_ROWS)
         self._pressed = 0
-        """How often something was that changes the table."""
+        """Number of presses that change the table."""
 
     def key(self, view: SessionView) -> object:
         return view.task_serial, view.step_serial
@@ -282,7 +281,7 @@ class EnvPanel(PagePart[SessionView]):
         start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
         return [*start, plain, *entries, *(sortable(name, name, HINTS[name]) for name in ("last", "flags"))]
 
-    # --- what is pressed ---------------------------------------------------------------------------
+    # --- presses -----------------------------------------------------------------------------------
 
     def _press(self, key: Hashable, do: Callable[[], None]) -> str:
         def pressed(client: viser.ClientHandle | None) -> None:
@@ -311,14 +310,14 @@ class EnvPanel(PagePart[SessionView]):
         self._pages.go_to(0)
 
     def select_first_flagged(self) -> None:
-        """The first env with something odd, at the step at which that began."""
+        """Select the first flagged env, at its first outlier."""
         rows = self._session.env_rows()
         env = None if rows is None else first_flagged(rows)
         if env is not None:
             self._choose_env(env)
 
     def select_next(self, wanted: Filter) -> None:
-        """The next env, by number and round the end, that a filter lets through; none if there is none."""
+        """Select the next env, by number and wrapping around, that passes a filter, if any does."""
         rows = self._session.env_rows()
         if rows is None:
             return

@@ -1,9 +1,4 @@
-"""The Episodes tab: record, keep what was just seen, and how both stand.
-
-Three wishes, three buttons: *record from now on* (a fresh episode is begun, since one without its reset could not be
-made again), *record the next episode* and disturb nothing, and *keep what I just saw*, which makes a recording of the
-past. Each can be stopped where it was begun, and what each is doing stands under them in words.
-"""
+"""The Episodes tab: record from now on, record the next episode, or keep the past one."""
 
 from __future__ import annotations
 
@@ -25,6 +20,12 @@ STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keepi
 
 
 class RecordPanel(PagePart[SessionView]):
+    """Three buttons, each of which also stops what it began, and their state in words.
+
+    *Record* begins a fresh episode, since one without its reset cannot be replayed; *Record the next episode* waits for a
+    reset; *Keep what I just saw* makes a recording of the past.
+    """
+
     every = 0.2
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
@@ -65,14 +66,14 @@ class RecordPanel(PagePart[SessionView]):
         return None if self._which.value == ALL_ENVS else (self._session.view().selected_env,)
 
     def toggle(self) -> None:
-        """Start if nothing is recorded, stop if something is."""
+        """Start or stop recording."""
         if self._session.view().recording.active:
             self._session.stop_recording()
         else:
             self._session.start_recording(self._envs)
 
     def keep(self) -> None:
-        """Keep what was just seen, or give that up."""
+        """Start or stop keeping the past episode."""
         if self._session.view().recording.keeping.progress is not None:
             self._session.keeper.stop()
         else:
@@ -96,7 +97,7 @@ class RecordPanel(PagePart[SessionView]):
         self._keep.icon = viser.Icon.PLAYER_STOP if keeping else viser.Icon.HISTORY
         can_record = view.task is not None and view.state != "stopped"
         self._button.disabled = not can_record and not recording.active
-        # Hidden, the next button would move under the pointer.
+        # Disabled, not hidden: the next button would move under the pointer.
         self._next.disabled = not can_record or recording.active
         self._keep.disabled = view.timeline.moments == 0 and not keeping
         self._which.disabled = not can_record
@@ -108,7 +109,7 @@ class RecordPanel(PagePart[SessionView]):
 
 
 def runs_since(view: SessionView) -> int | None:
-    """Steps of the selected env's episode up to what is shown, if that has not ended there; else None."""
+    """Steps of the selected env's episode up to the shown moment, if it still runs there; else None."""
     step, env = view.step, view.selected_env
     if step is None or view.timeline.moments == 0 or env >= len(step.elapsed_steps):
         return None
@@ -118,14 +119,14 @@ def runs_since(view: SessionView) -> int | None:
 
 
 def has_one_before(view: SessionView) -> bool:
-    """Whether there are moments before an episode that has not ended."""
+    """Whether the history has moments before a running episode."""
     steps, past = runs_since(view), view.timeline
     at = past.last if past.shown is None else past.shown
     return steps is not None and at - past.first > steps
 
 
 def what_keeping_means(view: SessionView, all_envs: bool) -> str:
-    """Which episode *Keep what I just saw* takes, where that is one that has not ended."""
+    """Which episode *Keep what I just saw* takes, if it is a running one; else empty."""
     steps = runs_since(view)
     if steps is None or view.task is None:
         return ""

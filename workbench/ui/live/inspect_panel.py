@@ -1,9 +1,4 @@
-"""The Inspect tab: one env from inside, read from the worker only while somebody wants it.
-
-viser does not say which tab is looked at, so what is read is what is chosen here. The next reading is asked for when
-the last has come, five times a second at most: a worker that is busy is not sent a queue. A number counts as changed
-when it differs from the reading before of the same env, however little.
-"""
+"""The Inspect tab: joints, contacts, poses, observation or state of one env, and contact forces in the 3-D view."""
 
 from __future__ import annotations
 
@@ -29,14 +24,14 @@ NEAR_A_LIMIT = 0.02
 """Part of a joint's range."""
 
 Row = dict[str, Any]
-"""As the template ``inspect`` reads it."""
+"""A row of the template ``inspect``."""
 
 
 def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Row]:
-    """One row an array.
+    """One row for each array; numbers that differ at all from the previous reading are marked.
 
     Args:
-        before: the reading before, of the same env; None marks nothing.
+        before: the previous reading of the same env; None marks nothing.
     """
     known = {leaf.name: leaf.values for leaf in before or ()}
     rows = []
@@ -89,7 +84,7 @@ def joint_rows(joints: JointReadings) -> list[Row]:
 
 
 def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
-    """Of the bodies that an env has; `poses` is (B, 7), p and q (wxyz), NaN where it has none."""
+    """One row for each body of an env; `poses` is (B, 7), p and q (wxyz), NaN for bodies that it lacks."""
     rows = []
     for name, pose in zip(names, poses, strict=True):
         if np.isfinite(pose).all():
@@ -100,7 +95,7 @@ def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
 
 
 def number(value: object) -> str:
-    """Short, with a width that does not jump about while it changes."""
+    """Short text of a value, of a stable width while it changes."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -123,19 +118,19 @@ def _place(value: float, low: float, high: float) -> float:
 
 
 def strength(values: NDArray) -> str:
-    """Of a force or an impulse (3,)."""
+    """Text of the norm of a force or an impulse (3,)."""
     return number_text(float(np.linalg.norm(values)), ".3g")
 
 
 def _code(values: NDArray[np.float32]) -> str:
-    # Six decimals: a micrometre, and what float32 has.
+    # Six decimals: a micrometre, and the precision of float32.
     return "[" + ", ".join(f"{float(value):.6f}".rstrip("0").rstrip(".") or "0" for value in values) + "]"
 
 
 READ_EVERY = 0.2
 """Seconds."""
 PATIENCE = 2.0
-"""Seconds after which an answer that has not come is asked for again: the worker may be another by then."""
+"""Seconds without an answer after which the question is sent again: the worker may be another by then."""
 NOTHING, POSES = "nothing", "poses"
 CHOICES: dict[str, Section | None] = {
     NOTHING: None,
@@ -148,6 +143,12 @@ CHOICES: dict[str, Section | None] = {
 
 
 class InspectPanel(PagePart[SessionView]):
+    """Reads what is chosen, of the selected env, from the worker.
+
+    viser does not tell which tab is open, so nothing is read until a person chooses. The next reading is asked for when
+    the last has come, at most five times a second: a busy worker gets no queue of questions.
+    """
+
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session, self._clock = session, clock
         self._show = server.gui.add_dropdown(
@@ -182,15 +183,15 @@ class InspectPanel(PagePart[SessionView]):
         self._handle.content = inspect_html(choice, view, self._now, self._before, no_step)
 
     def forces(self, view: SessionView) -> Inspection | None:
-        """The reading whose contacts are to be drawn in the view; None draws none: they are of what is live."""
+        """The reading whose contacts the 3-D view shows; None while the past is shown: contacts are read live only."""
         here = self._now is not None and self._now.env == view.selected_env
         known = view.timeline.shown is None and not self._no_step_yet(view)
         shown = self._forces.value and here and known
         return self._now if shown else None
 
     def _no_step_yet(self, view: SessionView) -> bool:
-        """Whether the selected env was built, reset or put back and has made no step since. PhysX finds contacts
-        while it steps: until then its list is empty, or that of the state before."""
+        """Whether the selected env has made no step since it was built, reset or put back. PhysX finds contacts while
+        it steps: until then its list is empty or outdated."""
         if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
             return True
         lived = self._session.past.stretch() if view.timeline.shown is None else None
@@ -230,7 +231,7 @@ def inspect_html(
     before: Inspection | None,
     no_step_yet: bool = False,
 ) -> str:
-    """What the tab shows under its controls; no contacts of an env that made no step since it was set."""
+    """The tab's content; without contacts if the env made no step since it was set."""
     leaves, articulations, contacts, poses = [], [], (), []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
@@ -285,21 +286,21 @@ def _reading(now: Inspection, section: Section | None) -> object:
 
 
 FORCE_COLOUR = (255, 0, 200)
-"""Magenta: wood, steel, goals and cubes are not."""
+"""Magenta, unlike wood, steel, goals and cubes."""
 METRES_AT_ONE_NEWTON = 0.07
 LONGEST = 0.3
 SHAFT, HEAD, HEAD_LENGTH = 0.005, 0.012, 0.028
-"""Metres; an arrow shorter than its head would be drawn as something else."""
+"""Metres; viser does not draw an arrow shorter than its head as an arrow."""
 WEAKEST = 1e-3
-"""Newtons; weaker is drawn by nobody's wish."""
+"""Newtons; weaker forces are not drawn."""
 
 
 class ForceArrows:
     """Contact forces of one env as arrows in the 3-D view.
 
-    One arrow a contact point, from the point in the direction of the force on the first body of the pair. Forces span
-    five decades (a cube's weight on four corners, a hand that is pressed into a table), so the length grows with the
-    cube root of the force and is bounded: it says "much" or "little", the numbers are in the Inspect tab.
+    One arrow for each contact point, along the force on the first body of the pair. Forces span five decades (a cube's
+    weight on four corners, a hand pressed into a table), so the length grows with the cube root of the force and is
+    bounded; the numbers are in the Inspect tab.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -311,7 +312,7 @@ class ForceArrows:
         """Show the contacts of this reading, or nothing.
 
         Args:
-            offset: (3,) where the env stands in the view.
+            offset: (3,) of the env in the view.
         """
         arrows = () if inspection is None else arrows_of(inspection)
         if len(arrows):

@@ -1,9 +1,4 @@
-"""The Log tab: what the author's code printed, in its colours, with a filter, and what the worker's processes hold.
-
-Only the last lines of what fits the filter are drawn, so that a task that prints in every hook costs no more than one
-that prints once. Colours beyond the page's sixteen are made lighter on the dark page and darker on the light one until
-they can be read; with a background they are the author's on both.
-"""
+"""The Log tab: captured output of the author's code in its colours, a filter, and memory of the processes."""
 
 from __future__ import annotations
 
@@ -28,22 +23,22 @@ from workbench.ui.widgets.templates import render
 Rgb = tuple[int, int, int]
 LIGHT_PAGE: Rgb = (241, 243, 245)
 DARK_PAGE: Rgb = (66, 66, 66)
-"""The Log's background, or a little nearer to the text than that."""
+"""Backgrounds of the Log, a little nearer to the text than the real ones."""
 READABLE = 4.5
-"""Contrast between text and background that WCAG 2.1 asks for."""
+"""Least contrast of text in WCAG 2.1."""
 MOST_SPANS = 1500
-"""Over all lines; older ones are shown plain. A line may change its colour with each character."""
+"""In all lines; older lines are shown plain. A line may change its colour with each character."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),
     [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
     [(102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255)],
 )  # fmt: skip
-"""Where one of them is a background, or stands on one."""
+"""Used where one of the sixteen is a background, or stands on one."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Text for the template; `look` and `css` hold nothing that the author wrote but numbers."""
+    """Text for the template; `look` and `css` take only numbers from the author's output."""
 
     text: str
     look: str = ""
@@ -51,7 +46,7 @@ class Span:
 
 
 def spans_of_lines(lines: Sequence[tuple[str, tuple[Run, ...]]]) -> list[list[Span]]:
-    """The spans of each line, given as its text and its runs; no more than `MOST_SPANS` in all."""
+    """The spans of each line (its text and its runs), at most `MOST_SPANS` in all."""
     left = MOST_SPANS
     found: list[list[Span]] = []
     for text, runs in reversed(lines):
@@ -90,7 +85,7 @@ def _look(style: Style) -> tuple[str, str]:
 
 
 def readable_on(colour: Rgb, page: Rgb) -> Rgb:
-    """`colour`, or the nearest to it towards black or white that can be read on `page`."""
+    """`colour`, moved towards black or white until it can be read on `page`."""
     end = 255 if _luminance(page) < 0.2 else 0
     found = colour
     for share in range(1, 21):
@@ -102,7 +97,7 @@ def readable_on(colour: Rgb, page: Rgb) -> Rgb:
 
 
 def contrast(one: Rgb, other: Rgb) -> float:
-    """1 for the same, 21 for black on white, as WCAG 2.1 defines it."""
+    """Contrast of WCAG 2.1: 1 for equal colours, 21 for black on white."""
     dark, light = sorted((_luminance(one), _luminance(other)))
     return (light + 0.05) / (dark + 0.05)
 
@@ -122,10 +117,11 @@ LONGEST_FILTER = 200
 
 
 class LogPanel(PagePart[SessionView]):
-    """
+    """The last lines that pass the filter; only those are drawn, so that a task that prints in every hook stays cheap.
+
     Args:
         server: The page.
-        clear: Asks the session to forget what was printed.
+        clear: Asks the session to forget the output.
     """
 
     every = 0.3
@@ -142,7 +138,7 @@ class LogPanel(PagePart[SessionView]):
         self._clear.on_click(lambda _: self._on_clear(clear))
         self._cleared = 0
         self._drawn: object = None
-        """What somebody asked for when it was drawn; for another thing also while it is held."""
+        """Filter and number of clears when it was drawn; a change is drawn even while it is held."""
 
     def key(self, view: SessionView) -> object:
         return view.printed.serial, self._hold.value, self._filter.value, self._cleared, view.vitals
@@ -154,7 +150,7 @@ class LogPanel(PagePart[SessionView]):
             return
         self._drawn = wanted, self._cleared
         self._html.content = log_html(view.printed, wanted)
-        # With nothing there, there is nothing to filter, to hold or to clear.
+        # An empty log needs no controls.
         for control in (self._filter, self._hold, self._clear):
             control.visible = bool(view.printed.lines or view.printed.dropped)
 
@@ -164,11 +160,10 @@ class LogPanel(PagePart[SessionView]):
 
 
 def log_html(printed: Printed, wanted: str) -> str:
-    """The last lines that fit; every value escaped.
+    """The last lines that pass the filter.
 
     Args:
-        wanted: text that a line must have in it, in any case of letters; ``stderr:`` or ``stdout:`` before it
-            takes the lines of one stream only.
+        wanted: text that a line must contain, case-insensitive; a prefix ``stderr:`` or ``stdout:`` takes one stream.
     """
     stream, colon, rest = wanted.partition(":")
     if not (colon and stream in ("stdout", "stderr")):
@@ -192,7 +187,7 @@ def log_html(printed: Printed, wanted: str) -> str:
 
 
 def vitals_html(vitals: Vitals) -> str:
-    """What the processes hold, in words that change only when it matters."""
+    """Memory of the processes, in words that change only when it matters."""
     if not vitals.memory:
         return ""
     return render("vitals", vitals=vitals, in_words=in_words)

@@ -1,8 +1,4 @@
-"""The past judged again: a line above the curves, and under them the new curve over the old and what differs.
-
-Nothing is here before there is something to say. A row of the list selects its env and goes to the moment where it
-differs. On a small screen all that lies below the edge, so the line above says what came of it and scrolls there.
-"""
+"""Rescoring of the past in the Reward tab: a summary above the curves, and below them the new curve and what differs."""
 
 from __future__ import annotations
 
@@ -43,7 +39,7 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
         self._add_list()
         self._verdicts: Sequence[Verdict[PastRun]] = ()
         self._shown: tuple[int, int | None] = 0, None
-        """Env and moment on the page."""
+        """Env and moment that the page shows."""
         self._first = 0
 
     def key(self, view: SessionView) -> object:
@@ -95,7 +91,7 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
             self._session.change(selected_env=env)
 
     def go_to_difference(self, by: int) -> None:
-        """Show the next (1) or last (-1) moment of the list, from the one that is shown; round the end."""
+        """Show the next (1) or previous (-1) moment of the list, wrapping around."""
         listed = self._listed
         if not listed:
             return
@@ -108,15 +104,15 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
 
 
 def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
-    """Env, and serial of the moment to look at."""
+    """Env and serial of the moment to look at."""
     assert verdict.look_at is not None
     return verdict.of.env, verdict.of.at(verdict.look_at)
 
 
 def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
-    """As uPlot wants it: x, the record, what is said now, and a point at the moment that is shown, if one is.
+    """Data for uPlot: x, the recorded curve, the new curve, and a dot at the shown moment, if any.
 
-    Of a long record the newest part, or the part round the moment that is shown.
+    Of a long curve the newest part, or the part around the shown moment.
     """
     place = None if shown is None else int(np.searchsorted(curve.serial, shown))
     part = part_round(len(curve.tick), place)
@@ -127,11 +123,11 @@ def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
 
 
 def in_a_line(judged: JudgedView) -> str:
-    """For who does not see the rest; empty while there is nothing to say."""
+    """Summary in one line; empty while there is nothing to report."""
     if judged.state == "loading":
         return "The past is judged again: loading the new code"
     if judged.state == "judging":
-        # In tenths, or a page that is played on would be written to at every look.
+        # In tenths: each change is sent to the page.
         return f"The past is judged again: {10 * int(10 * judged.done / max(1, judged.total))} %"
     if judged.state == "done":
         return f"{TITLE}: {words.headline(judged.verdicts, others=judged.differing_names)}"

@@ -1,12 +1,4 @@
-"""Reward, success and the reward's terms over time: the selected env, against the mean of the batch.
-
-The session keeps the past of every env, so selecting another env takes another column of it and wipes nothing. What is
-sent is bounded, and no more often than the eye follows.
-
-What ``evaluate`` returns decides the rows: a bool is counted over the batch, a number averaged, a vector shortened. A
-surprise (NaN, a string, None, an entry without a row for each env) is shown as it is and not left out, since it is what
-an author looks for.
-"""
+"""The Reward tab: a table of the task's numbers, and curves of reward, success and reward terms."""
 
 from __future__ import annotations
 
@@ -39,6 +31,8 @@ HOW_TO = (
 
 
 class CurvesPanel(PagePart[SessionView]):
+    """Curves of the selected env and of the mean over the batch, from the history: selecting an env keeps its past."""
+
     every = 0.2
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -79,7 +73,7 @@ class CurvesPanel(PagePart[SessionView]):
 
 
 def said_of(reward: NDArray[np.float32]) -> str:
-    """What the curve does not show of a step: in how many envs its reward is no finite number. Empty for none."""
+    """A warning with the number of envs whose reward is NaN or infinite; empty for none."""
     lost = nonfinite_text(reward)
     if not lost:
         return ""
@@ -92,7 +86,7 @@ def said_of(reward: NDArray[np.float32]) -> str:
 
 
 def env_lines(values: NDArray[np.float32], env: int) -> list[ChartLine]:
-    """The mean of the batch, where there is one, and an env's own column of `values` (T, N)."""
+    """The mean of the batch, if N > 1, and one env's column of `values` (T, N)."""
     env = min(env, values.shape[1] - 1)
     one = ChartLine(f"env {env}", values[:, env])
     if values.shape[1] == 1:
@@ -101,7 +95,7 @@ def env_lines(values: NDArray[np.float32], env: int) -> list[ChartLine]:
 
 
 def mean_of_numbers(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(T,) over the envs whose value is a number; NaN where none is. One env's NaN is not to take the mean away."""
+    """(T,) mean over the envs with a finite value; NaN where there is none."""
     there = np.isfinite(values)
     total = np.where(there, values, 0.0).sum(axis=1, dtype=np.float64)
     count = there.sum(axis=1)
@@ -113,7 +107,7 @@ def no_curve_text(names: tuple[str, ...]) -> str:
     return f'No curve of {listed} in info["reward_terms"]: a curve needs one number for each env, of shape (num_envs,).'
 
 
-# --- The numbers of the task in the Reward tab: one row an entry, the selected env beside the whole batch ---
+# --- The table of numbers: one row for each entry, the selected env next to the whole batch ----
 
 
 LONGEST_VECTOR = 4
@@ -123,15 +117,21 @@ MOST_ROWS = 200
 
 @dataclass(frozen=True)
 class NumberRow:
+    """A row of the table.
+
+    A bool is counted over the batch, a number averaged, a vector shortened. Surprises (NaN, a string, None, an entry that
+    is not per env) are shown as they are: they are what an author looks for.
+    """
+
     name: str
     selected: str
     batch: str
     mood: str = ""
     """``good`` or ``bad`` for success and failure of the selected env, else empty."""
     whole: str = ""
-    """What is shown in place of both where the entry is not per env."""
+    """The value of an entry that is not per env, instead of `selected` and `batch`."""
     hint: str = ""
-    """What else there is to know of the value."""
+    """Further information about the value."""
 
 
 def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | None) -> list[NumberRow]:
@@ -170,7 +170,7 @@ def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
 
 
 def _reward_row(step: StepResult, env: int) -> NumberRow:
-    """A reward is for an action: right after a reset there is none, which is not zero and not a NaN of the task's."""
+    """The reward's row: a dash right after a reset, when there is none (neither zero nor a NaN of the task)."""
     there = np.isfinite(step.reward) | ((step.elapsed_steps > 0) & (step.action is not None))
     there &= step.elapsed_steps > 0
     return NumberRow(
@@ -215,7 +215,7 @@ def _batch(values: NDArray) -> str:
     if values.ndim == 1 and values.dtype.kind == "b":
         return f"{int(values.sum())} of {len(values)}"
     if values.ndim > 1 and values.dtype.kind == "f":
-        # Of a vector the envs are counted that have one anywhere in it.
+        # For vectors, count the envs with NaN or an infinite value in any component.
         rows = values.reshape(len(values), -1)
         infinite = np.where(np.isinf(rows).any(axis=1), np.inf, 0.0)
         return nonfinite_text(np.where(np.isnan(rows).any(axis=1), np.nan, infinite))
@@ -227,6 +227,8 @@ def _batch(values: NDArray) -> str:
 
 
 class NumbersPanel(PagePart[SessionView]):
+    """The table of the task's numbers."""
+
     every = 0.12
 
     def __init__(self, server: viser.ViserServer) -> None:

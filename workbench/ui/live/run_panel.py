@@ -1,8 +1,4 @@
-"""The Run tab: play, step, reset, speed, seed, env, what happens at an episode's end, and actions with their sliders.
-
-Nothing here touches an env. Every input asks the session and shows what the session says (see `controls`), so a key, a
-second page and this panel cannot disagree.
-"""
+"""The Run tab: play, step, reset, speed, seed, env, episode end and the source of actions."""
 
 from __future__ import annotations
 
@@ -24,7 +20,7 @@ UNBOUNDED = 1.0
 
 
 class ActionSliders:
-    """A folder with one slider a dimension; there only while the source is ``sliders``."""
+    """A folder with one slider for each dimension; shown while the source is ``sliders``."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server = server
@@ -37,7 +33,7 @@ class ActionSliders:
         self._centre.on_click(lambda _: self._send_centre())
 
     def build(self, dimensions: tuple[ActionDimension, ...], values: tuple[float, ...]) -> None:
-        """Sliders of this action space, unless they are there already (a reload keeps them)."""
+        """Make the sliders of this action space, unless they exist (a reload keeps them)."""
         if dimensions == self._dimensions:
             return
         for control in self._controls:
@@ -67,11 +63,11 @@ class ActionSliders:
                 control.show(value)
 
     def _send(self) -> None:
-        # All of them at their newest: two sliders moved at once arrive in any order.
+        # The newest value of each: two sliders moved at once arrive in any order.
         self._session.change(sliders=tuple(self._in_bounds(c.handle.value for c in self._controls)))
 
     def _in_bounds(self, values: Iterable[float]) -> Iterator[float]:
-        """A browser adds steps up to a little more than the end; a policy may give more than a slider has."""
+        """Clamp to the sliders: a browser's sum of steps may pass the end, and a policy's action may lie outside."""
         for dimension, value in zip(self._dimensions, values, strict=True):
             low, high = slider_bounds(dimension)
             yield min(max(value, low), high)
@@ -114,6 +110,8 @@ LARGEST_SEED = 2**31 - 1
 
 
 class RunPanel(PagePart[SessionView]):
+    """The tab's controls. Each asks the session and shows the session's value (`Control`); none touches an env."""
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         gui = server.gui
@@ -179,7 +177,7 @@ class RunPanel(PagePart[SessionView]):
             )
             self._sliders = ActionSliders(server, session)
 
-    # --- what keys and buttons do ----------------------------------------------------------------
+    # --- keys and buttons ------------------------------------------------------------------------
 
     def toggle_play(self) -> None:
         if self._session.view().playing:
@@ -191,7 +189,7 @@ class RunPanel(PagePart[SessionView]):
         self._session.reset((self._session.view().selected_env,))
 
     def select_neighbour(self, step: int) -> None:
-        """The next (1) or previous (-1) env, round the end."""
+        """Select the next (1) or previous (-1) env, wrapping around."""
         count = self._num_envs()
         self._session.change(selected_env=(self._session.view().selected_env + step) % count)
 
@@ -215,7 +213,7 @@ class RunPanel(PagePart[SessionView]):
             self._env.handle.max = max(1, view.task.num_envs - 1)
             self._sliders.build(view.task.actions, view.settings.sliders)
         self._draw_play(view.playing, can_act)
-        # viser cannot grey out a group of buttons; one that does nothing must not be there.
+        # viser cannot disable a group of buttons, so it is hidden.
         self._transport.visible = can_act
         for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
             control.enable(can_act)
@@ -244,7 +242,7 @@ class RunPanel(PagePart[SessionView]):
     def _speed_shown(self, speed: float) -> str:
         name = _name_of(SPEEDS, speed)
         if name is None:
-            # A speed that came from the command line and is none of ours.
+            # A speed from the command line that is not in the list.
             name = f"{speed:g} ×"
             SPEEDS[name] = speed
         if name not in self._speed.handle.options:
@@ -252,7 +250,7 @@ class RunPanel(PagePart[SessionView]):
         return name
 
     def _choose_source(self, source: ActionSource) -> None:
-        # A policy that is not named yet is a source all the same: a step says what is missing.
+        # Without a name it is a source too: the next step reports what is missing.
         policy = self._policy.handle.value.strip() if source == "policy" else ""
         self._session.change(action_source=source, policy=policy or None)
 

@@ -1,4 +1,4 @@
-"""The line above the tabs: what runs, on what, how fast, and whether all is well; and the mark of broken rules."""
+"""The status line above the tabs, the mark of flagged envs, and the mark of broken rules."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ WORDS = {
 
 
 class StatusLine(PagePart[SessionView]):
-    """
+    """State, task, activity and speed of the session, and the mark of flagged envs.
+
     Args:
-        env_rows: The envs as they stand; None before there is a task.
+        env_rows: The table of envs; None before there is a task.
         on_flagged: Called when the mark of flagged envs is pressed.
     """
 
@@ -56,9 +57,9 @@ class StatusLine(PagePart[SessionView]):
     ) -> None:
         self._env_rows, self._on_flagged = env_rows, on_flagged
         self._handle = server.gui.add_html("")
-        # On its own: the line above is made anew four times a second, under the finger that presses.
+        # An element of its own: the line above is replaced four times a second, and a press on it would be lost.
         self._standing = server.gui.add_html("", visible=False)
-        # At the end of the panel, behind the tabs: all that comes after it is hidden.
+        # At the end of the panel, after the tabs: everything after it is hidden.
         self._presses = Presses(server)
         self._clock = clock
         self._task_serial = 0
@@ -70,9 +71,9 @@ class StatusLine(PagePart[SessionView]):
         return busy, view.state, view.stale, view.activity, self._is_fresh(view), *at
 
     def _is_fresh(self, view: SessionView) -> bool:
-        """Whether a new version came in a moment ago."""
+        """Whether a new version came less than `NEWS` seconds ago."""
         if view.task_serial != self._task_serial:
-            # The first version is no news.
+            # The first version is not announced.
             self._loaded_at = self._clock() if self._task_serial else -math.inf
             self._task_serial = view.task_serial
         return self._clock() - self._loaded_at < NEWS
@@ -91,7 +92,7 @@ class StatusLine(PagePart[SessionView]):
 
 
 def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
-    """How many envs are flagged and what is odd in the first of them, in short and in full; None where none is."""
+    """Number of flagged envs and the reason of the first, as label and hint; None without flagged envs."""
     count = int(np.count_nonzero(mask(rows, "flagged")))
     env = first_flagged(rows)
     if env is None:
@@ -105,14 +106,14 @@ def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
 
 
 def status_values(view: SessionView, fresh: bool = False, marked: bool = False) -> dict[str, object]:
-    """What the template is given.
+    """The values of the template.
 
     Args:
-        fresh: a new version of the file has just come in.
-        marked: something stands below the line that is not as it should be.
+        fresh: a new version has just come.
+        marked: there is a mark below the line.
     """
     task = view.task
-    # While the renderer is at work, what the session says of it is more than that it is busy.
+    # While the renderer works, the session's activity says more than "busy".
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
     moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
     slow = view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
@@ -157,15 +158,15 @@ def _news(view: SessionView) -> str:
 
 
 class RulesMark(PagePart[SessionView]):
-    """The standing mark below the status line: what the task breaks of the rules of GPU simulation, a press from the list.
+    """The mark of broken rules below the status line; a press opens the list.
 
-    A rule that only warns stops nothing, so whatever tells of it must not pass: the mark stays until the file is mended.
+    A broken rule that only warns stops nothing, so the mark stays until the file is mended.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._html = server.gui.add_html("", visible=False)
-        # Not in a folder with it: viser draws one without a label as if its parts stood in the container itself, and
-        # all that comes after the mark of the hidden buttons, the tabs too, would be hidden.
+        # Not in a folder: viser draws a folder without a label as if its parts stood in the container, and all that
+        # follows the hidden buttons, the tabs too, would be hidden.
         self._press = Presses(server).id_of("open", lambda _: self.toggle())
         self._open = False
 
@@ -174,7 +175,7 @@ class RulesMark(PagePart[SessionView]):
             self._open = False
             self._html.visible = False
             return
-        # What is the same is not sent: a list that somebody reads keeps its place.
+        # Equal content is not sent: an open list keeps its scroll position.
         self._html.content = rules_html(view.rules, self._open, self._press)
         self._html.visible = True
 
@@ -184,7 +185,7 @@ class RulesMark(PagePart[SessionView]):
 
 
 def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:
-    """The mark, and the list where it is open; every value escaped."""
+    """The mark, and the list if it is open."""
     newest = next((place(row) for row in rules.rows if row.file), "")
     if newest and len(rules.rows) > 1:
         newest += f" and {len(rules.rows) - 1} more"
@@ -193,7 +194,8 @@ def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:
 
 
 def times(count: int) -> str:
-    """``once``, ``7 times``, ``300 times and more``: of large numbers the first digit, or the list would change at each step."""
+    """``once``, ``7 times``, ``300 times and more``: only the first digit of large counts, or the list would change at
+    each step."""
     if count < 10:
         return "once" if count == 1 else f"{count} times"
     scale = 10 ** (len(str(count)) - 1)

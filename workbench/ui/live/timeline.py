@@ -1,13 +1,4 @@
-"""The timeline: one slider over the past, under the view, with what happened to the selected env on it.
-
-It counts backwards from now: 0 is live and -37 is 37 steps ago. So the slider rests at its right end while the
-simulation runs, and nothing has to be sent to keep it there. The strip under it is drawn by the server as one
-small SVG, a few times a second at most: the reward of the selected env, its episodes as bands, its events as
-marks, and an arc where it went back.
-
-Dragging asks the session for another moment, which it has in memory; only when somebody has stood still at a
-moment for a while are its pictures asked of the worker, where there are none.
-"""
+"""The timeline under the view: a slider over the past, a strip with reward and events, and buttons."""
 
 from __future__ import annotations
 
@@ -33,27 +24,27 @@ from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
 from workbench.ui.widgets.templates import render
 
 GAP = 12
-"""Pixels between what lies over the view and its edges; as ``view_width.js`` has it."""
+"""Pixels between floating panels and the view's edges; the same in ``view_width.js``."""
 WIDEST = 760
 HEIGHT = 205
-"""Pixels of the view that it lies over, for whoever frames a scene."""
+"""Pixels of the view that it covers; framing a scene leaves them out."""
 REDRAW_EVERY = 0.2
 RANGE_EVERY = 0.5
 """Seconds. A slider whose ends move at every step cannot be held."""
 STANDS_STILL = 0.35
-"""Seconds at one moment after which its pictures are drawn: less, and every drag would draw some."""
+"""Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "step ›", "event ›", "now"
 EPISODE, EVERYTHING = "zoom to episode", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Go on from here"
 UNDO = "undo"
-"""How the button begins that takes back a jump; what and of how many envs follows."""
+"""Start of the undo button's label; what is undone follows."""
 WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
 View = TypeVar("View", contravariant=True)
 
 
 class Seeks(Protocol):
-    """What is moved through time; its own module says what a place in time is."""
+    """What the slider and the buttons move through time; it defines what a place is."""
 
     def seek(self, place: Any, /) -> None: ...
     def seek_by(self, steps: int, /) -> None: ...
@@ -66,7 +57,7 @@ class TimeBar(PagePart[View]):
     Args:
         seeks: What slider, buttons and arrow keys move.
         name: Of the slider.
-        does: What further buttons do, by how they begin.
+        does: Actions of further buttons, by the start of their label.
     """
 
     def __init__(
@@ -101,13 +92,13 @@ class TimeBar(PagePart[View]):
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
         self._shown: int | None = None
         self._before_slider: int | None = None
-        """What was shown before the slider was last moved."""
+        """The place that was shown before the slider was last moved."""
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
-        """Between the strip and the buttons."""
+        """Add rows between the strip and the buttons."""
 
     def commands(self) -> list[Command]:
-        """Of the arrow keys."""
+        """Commands of the arrow keys."""
         return [
             Command("A step back in time", lambda: self._step_by(-1), "arrowleft"),
             Command("A step on in time", lambda: self._step_by(1), "arrowright"),
@@ -121,7 +112,7 @@ class TimeBar(PagePart[View]):
             self._seeks.seek_by(steps)
 
     def _to_event(self, direction: int) -> None:
-        """An arrow key with shift; what a slider that has the focus made of it is taken back."""
+        """An arrow key with shift; undoes the move of a slider that has the focus."""
         if Control.took_the_key():
             self._seeks.seek(self._before_slider)
         self._seeks.seek_event(direction)
@@ -143,11 +134,16 @@ class TimeBar(PagePart[View]):
 
     def _set_ends(self, low: int, high: int) -> None:
         handle = self._slider.handle
-        # Never an empty range, which the browser divides by.
+        # Never an empty range: the browser divides by it.
         handle.min, handle.max, handle.visible = min(low, high - 1), high, low < high
 
 
 class TimelinePanel(TimeBar[SessionView]):
+    """The live page's timeline. It counts backwards: 0 is live and -37 is 37 steps ago, so that the slider rests at its
+    right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in memory; the
+    worker draws pictures only after a while at one moment.
+    """
+
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         zooms = {EPISODE: partial(self._zoom, True), EVERYTHING: partial(self._zoom, False)}
         does = {NOW: self.go_live, **zooms, UNDO: session.past.undo}
@@ -158,25 +154,25 @@ class TimelinePanel(TimeBar[SessionView]):
         self._range = (0, 0)
         """Serials of the slider's ends."""
         self._newest = 0
-        """The serial that the page last took for 0."""
+        """The serial that the slider shows as 0."""
         self._range_at = -math.inf
         self._strip_due = DrawDue(REDRAW_EVERY, clock)
         self._stood: tuple[object, float] = (None, 0.0)
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
-        # One of these two is there, and they are equally high: a panel that grows is moved up only a moment later, its
-        # last row is cut off until then, and a second press on "step" would meet another button.
+        # One of these two is shown, and they have the same height: a panel that grows is moved up a moment later, its
+        # last row is cut off until then, and a second press on "step" would hit another button.
         self._hint = gui.add_html("")
         self._travel = gui.add_button_group("", (GO_ON,), visible=False)
         name_control(self._travel, "way to go on")
 
-    # --- what buttons and keys do ------------------------------------------------------------------
+    # --- buttons and keys --------------------------------------------------------------------------
 
     def go_live(self) -> None:
         self._session.past.seek(None)
 
     def go_to_the_first(self) -> None:
-        """To the left end of the slider, which may have the focus and go there as well."""
+        """Go to the left end of the slider, where a slider with the focus goes too."""
         self._session.past.seek(self._range[0] if self._episode_only else 0)
 
     def go_on(self) -> None:
@@ -216,7 +212,7 @@ class TimelinePanel(TimeBar[SessionView]):
 
     def _draw_buttons(self, view: SessionView) -> None:
         past = view.timeline
-        # A group of buttons cannot be greyed, so what would do nothing is left out.
+        # Buttons of a group cannot be disabled, so those that would do nothing are left out.
         undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
         self._walk.options = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
         travel = go_on_labels(view) if past.can_go_on else ()
@@ -246,7 +242,7 @@ class TimelinePanel(TimeBar[SessionView]):
 
 
 def go_on_labels(view: SessionView) -> tuple[str, ...]:
-    """Of the buttons that go back, in the order of `SCOPES`."""
+    """Labels of the go-on buttons, in the order of `SCOPES`."""
     if view.task is None or view.task.num_envs == 1:
         return (GO_ON,)
     env = f"env {view.selected_env}"
@@ -254,9 +250,9 @@ def go_on_labels(view: SessionView) -> tuple[str, ...]:
 
 
 POINTS = 240
-"""Of the reward's line, each the least and the greatest of its steps: a spike of one step stays visible."""
+"""Points of the reward's line, minimum and maximum of each interval in turn: a spike of one step stays visible."""
 LINE_HEIGHT = 30.0
-"""Units of the picture's height that the line has; the marks are above."""
+"""Height of the line in the picture's units; the marks are above."""
 FLAGS = {
     NOT_A_NUMBER: "odd",
     FAIL: "fail",
@@ -265,7 +261,7 @@ FLAGS = {
     WENT_BACK: "back",
     RESET: "reset",
 }
-"""The style of a mark; of several that happened at once the first is drawn."""
+"""Style of each event's mark; of several events at once the first of these is drawn."""
 NAMES = {
     "odd": "reward is NaN or infinite",
     "fail": "fail",
@@ -275,24 +271,24 @@ NAMES = {
     "reset": "reset",
     "other": "other event",
 }
-"""Of the styles, as the legend says them."""
+"""Legend of the styles."""
 MOST_MARKS = 150
 
 
 def strip_values(
     low: int, high: int, reward: NDArray[np.float32], styles: Collection[str]
 ) -> dict[str, object]:
-    """What the templates of both timelines are given.
+    """The values that the templates of both timelines share.
 
     Args:
-        low: Where the strip begins.
-        high: Where it ends.
-        reward: (high - low + 1,) NaN where there is none.
-        styles: Of the marks that are on it.
+        low: First place of the strip.
+        high: Last place.
+        reward: (high - low + 1,), NaN where there is none.
+        styles: Of the marks on it.
     """
 
     def place(at: float) -> float:
-        """Per cent of the strip's width; at its ends for what is beyond them."""
+        """Per cent of the strip's width, clamped."""
         return round(100 * (min(max(at, low), high) - low) / max(high - low, 1), 3)
 
     kinds = [(style, name) for style, name in NAMES.items() if style in styles]
@@ -300,7 +296,7 @@ def strip_values(
 
 
 def strip_html(strip: Strip, view: SessionView) -> str:
-    """The past of one env, and which moment of it is shown."""
+    """The strip of one env with its shown moment."""
     marks = [
         (serial, next(style for flag, style in FLAGS.items() if flags & flag))
         for serial, flags in strip.events[-MOST_MARKS:]
@@ -319,7 +315,7 @@ def strip_html(strip: Strip, view: SessionView) -> str:
 
 
 def step_in_words(view: SessionView) -> str:
-    """How far the selected env is into its episode: a single step is too small to be seen in the view."""
+    """The selected env's step of its episode, as text."""
     task, step = view.task, view.step
     if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
         return ""
@@ -329,7 +325,7 @@ def step_in_words(view: SessionView) -> str:
 
 
 def where(view: SessionView) -> str:
-    """Env, step of its episode and simulated time of what is shown."""
+    """Env, step of its episode and simulated time of the shown moment."""
     words = step_in_words(view)
     if not words or view.task is None or view.step is None:
         return words
@@ -337,8 +333,8 @@ def where(view: SessionView) -> str:
 
 
 def reward_lines(reward: NDArray[np.float32]) -> list[str]:
-    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT`, greatest on top, with a gap where there
-    is none; no line without two different ones."""
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT` (greatest on top), with gaps; empty
+    without two different values."""
     finite = reward[np.isfinite(reward)]
     if not len(finite) or finite.min() == finite.max():
         return []
@@ -356,9 +352,9 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
 
 
 def polylines(points: Sequence[str | None]) -> list[str]:
-    """What SVG's polylines are given for these points, with a gap at each None."""
+    """``points`` of SVG polylines through these points, with a gap at each None."""
     runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
-    # A line of one point is not drawn; one of length zero with round ends is a dot.
+    # A polyline of one point is not drawn; one of length zero with round ends is a dot.
     return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
 
 

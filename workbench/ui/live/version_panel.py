@@ -1,10 +1,4 @@
-"""How the version that is shown came in, and the ways to bring it in again.
-
-A saved file comes in by the least that is safe, and a person must be able to see what that was: an author who
-thinks that the scene was built anew, when only the reward was exchanged, looks for a bug that is not there. So
-level, reason and time stand here, with what a build could not carry over; and beside them the buttons that choose
-otherwise. Where a file has several tasks, this is where one of them is chosen.
-"""
+"""How the running version was loaded, and buttons to load it again or choose the file's task."""
 
 from __future__ import annotations
 
@@ -28,14 +22,20 @@ LEVELS: dict[str, LoadLevel] = {
     REBUILT: "rebuilt",
 }
 MOST_SHOWN = 8
-"""Things not carried that are named; the rest is counted."""
+"""Items not carried over that are named; the rest is counted."""
 
 
 class VersionPanel(PagePart[SessionView]):
+    """Level, reason and time of the last load, and what a rebuild could not carry over.
+
+    A save loads by the smallest level that is safe, and the author must see which: one who thinks that the scene was rebuilt, when
+    only the reward was patched, looks for a bug that is not there.
+    """
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._names: tuple[str, ...] = ("",)
-        # viser's annotations take the first options for all that there will ever be.
+        # viser's annotations infer the option type from the first options.
         add_dropdown: Any = server.gui.add_dropdown
         with server.gui.add_folder("Version of the file"):
             self._task = Control(
@@ -57,7 +57,7 @@ class VersionPanel(PagePart[SessionView]):
         can_load = view.state != "stopped"
         self._again.visible = can_load
         if len(view.choices) > 1:
-            # In one order, whichever of them is shown.
+            # Sorted, so that the order does not depend on the shown one.
             if tuple(sorted(view.choices)) != self._names:
                 self._names = tuple(sorted(view.choices))
                 self._task.handle.options = self._names
@@ -80,14 +80,14 @@ def version_html(
     refused: Problem | None = None,
     notices: tuple[str, ...] = (),
 ) -> str:
-    """What the page says of the version that runs, and of the file where it holds another; every value escaped.
+    """The panel's text about the running version, and about the file where that was refused.
 
     Args:
-        report: how the version that runs came in; None for the first.
-        milliseconds: that it took.
-        loaded: whether one runs.
-        refused: why what is in the file does not.
-        notices: what the author should know of it besides.
+        report: how the running version was loaded; None for the first.
+        milliseconds: duration of the load.
+        loaded: whether a version runs.
+        refused: why the file's present text does not run.
+        notices: further notes for the author.
     """
     return render(
         "version",

@@ -1,1 +1,1 @@
-"""The panels of the review."""
+"""Panels and 3-D view of the review page."""

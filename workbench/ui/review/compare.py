@@ -1,7 +1,4 @@
-"""The Compare tab: where the first recording and another one part, entry by entry, and the lines that changed.
-
-A row is pressed to go there: both recordings then show the first state at which that entry differs.
-"""
+"""The Compare tab: where two recordings differ first, entry by entry."""
 
 from __future__ import annotations
 
@@ -21,6 +18,8 @@ MOST_ROWS = 30
 
 
 class ReviewComparePanel(PagePart[ReviewView]):
+    """Compares the first recording with another; a row goes to the first state at which its entry differs."""
+
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         gui = server.gui
@@ -45,7 +44,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
         self._html = gui.add_html("")
         self._presses = Presses(server)
         self._differing: list[Parting] = []
-        """By the rows of the table, of which each goes to its position."""
+        """By row of the table."""
 
     def key(self, view: ReviewView) -> object:
         return view.opened_serial, len(view.opened), view.anchors, self._other.value, self._tolerance.value

@@ -1,9 +1,4 @@
-"""The Curves tab of a review: the selected recording's numbers, and curves of all that are compared.
-
-One chart holds one entry with a line for each recording, over each other as they are aligned; the reward always, and
-one that is chosen. An action or the terms of a reward have many lines of their own, so those are drawn of the
-selected recording alone. A line at the position would have to be sent with every frame; a dot on the first line is.
-"""
+"""The Curves tab of a review: numbers of the recordings at the position, and curves over their steps."""
 
 from __future__ import annotations
 
@@ -27,11 +22,13 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import colour, letter, render
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
-"""Their heights, from the top."""
+"""Heights in pixels, from the top."""
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
 class ReviewNumbers(PagePart[ReviewView]):
+    """The table of numbers at the position."""
+
     every = 0.09
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -55,6 +52,12 @@ class ReviewNumbers(PagePart[ReviewView]):
 
 
 class ReviewCurves(PagePart[ReviewView]):
+    """Charts of one entry each, with a line for each recording, aligned: the reward, and one that is chosen.
+
+    An action and the reward terms have many lines, so they are drawn for the selected recording only. The position is a
+    dot on one line: a line at the position would have to be sent with every frame.
+    """
+
     every = 0.15
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -70,16 +73,16 @@ class ReviewCurves(PagePart[ReviewView]):
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
-        """What is in the list, to the entry and which of its lines; empty where it has one."""
+        """Option of the dropdown to entry and line; the line is empty where the entry has one."""
         self._wish = ""
-        """The entry that was last chosen, kept while recordings without it are open."""
+        """The entry that was chosen last, kept while recordings without it are open."""
 
     def key(self, view: ReviewView) -> object:
         which = view.opened_serial, len(view.opened), view.selected
         return *which, view.position, view.anchors, self._wish
 
     def draw(self, view: ReviewView) -> None:
-        # By the recording's id: what gets its scene later is the same recording.
+        # By id: a recording that gets its scene later stays the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
         self._offer(view, shown)
@@ -87,7 +90,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._draw_entry("also", self._entry.value if self._entry.visible else "", view, shown)
         lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
         if lines != self._lines_drawn:
-            # They do not follow the position, and a chart that is sent anew is drawn anew.
+            # They do not follow the position, and a chart that is sent again is drawn again.
             self._lines_drawn = lines
             self._draw_lines("terms", TERMS, view)
             self._draw_lines("action", ACTION, view)
@@ -117,7 +120,7 @@ class ReviewCurves(PagePart[ReviewView]):
             self._entry.value = wish
 
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
-        """One entry of all that are compared."""
+        """One entry of all compared recordings."""
         group, line = self._offered.get(entry, (entry, ""))
         drawn: list[ChartLine] = []
         cursor = 0
@@ -153,7 +156,7 @@ class ReviewCurves(PagePart[ReviewView]):
         drawn: list[ChartLine],
         dotted: ChartLine | None = None,
     ) -> None:
-        """Every so-many-th position, and the dot of one line at the position that is shown."""
+        """Draw at most `LONGEST` positions, and the dot of one line at the present position."""
         axis = axis_of(view)
         every = slice(None, None, max(1, -(-len(axis) // LONGEST)))
         x, lines = axis[every], [replace(line, values=line.values[every]) for line in drawn]
@@ -181,10 +184,7 @@ def step_of(episode: Episode, state: int) -> StepResult:
 
 
 def known(number: str, state: int) -> str:
-    """A number as it is said in the table: what the first state lacks, of which no step came before, is kept as NaN.
-
-    Later a NaN is what the task returned, and what somebody looks for.
-    """
+    """The text of a number: NaN at state 0 is a dash, since no step came before it; later the task returned it."""
     return "—" if number == "NaN" and state == 0 else number
 
 
@@ -194,7 +194,7 @@ def compared(
     """Rows of the table: those of the selected recording, then what only others have.
 
     Args:
-        beside: of each recording that has a column, its rows and which state they are of.
+        beside: of each recording with a column, its rows and their state.
     """
     moods = {row.name: row.mood for row in rows}
     for others, _ in beside:

@@ -1,8 +1,4 @@
-"""The Review tab: play, which recordings are open, how they lie to each other, and what is known of the selected one.
-
-Play, speed and loop are at the top as on the live page. With one recording there is nothing to compare, and the
-controls for that are not there.
-"""
+"""The Review tab: playback, the open recordings, their alignment, and facts about the selected one."""
 
 from __future__ import annotations
 
@@ -28,10 +24,11 @@ GO_LIVE, STAY = "Go on live from here", "Stay here"
 
 
 class ReviewPanel(PagePart[ReviewView]):
-    """
+    """The controls in the present container; those for comparing only while several recordings are open.
+
     Args:
         server: The page.
-        review: What is shown and asked.
+        review: Of the page.
         on_step_back: Called with the id of the selected recording and the state that is shown, when a person wants to
             go on from there live, and again when they would rather stay.
         going: What is waited for on the way to the live env.
@@ -80,13 +77,13 @@ class ReviewPanel(PagePart[ReviewView]):
         self._changes = ChangesOnDisk()
         self._presses = Presses(server)
         self._listed: object = None
-        """What the list was made of."""
+        """What the list was drawn for."""
         self._told: tuple[Opened, str] | None = None
-        """What the facts are of."""
+        """What the facts were drawn for."""
 
     @property
     def ghosts(self) -> bool:
-        """Whether the recordings are drawn over each other, as far as there are few enough of them."""
+        """Whether the recordings are drawn over each other: chosen, and few enough."""
         return self._arrange.value == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
 
     def toggle_arrangement(self) -> None:
@@ -101,7 +98,7 @@ class ReviewPanel(PagePart[ReviewView]):
             self._on_step_back(view.chosen.id, view.states[view.selected])
 
     def select_neighbour(self, step: int) -> None:
-        """The next (1) or previous (-1) opened recording, round the end."""
+        """Select the next (1) or previous (-1) open recording, wrapping around."""
         view = self._review.view()
         if view.opened:
             self._review.select((view.selected + step) % len(view.opened))
@@ -121,7 +118,7 @@ class ReviewPanel(PagePart[ReviewView]):
         self._problems.content = render("review_problems", problems=view.problems, loading=view.loading)
         listed = (view.opened, view.selected, bool(view.loading))
         if self._listed != listed:
-            # Not at every position: with many recordings it would be most of what a frame costs.
+            # Not at every position: with many recordings it would be most of a frame's cost.
             self._listed = listed
             self._list.content = self._list_html(view)
         self._arrange.visible = 1 < len(view.opened) <= MOST_COMPARED
@@ -149,7 +146,7 @@ class ReviewPanel(PagePart[ReviewView]):
 
 
 def never_words(view: ReviewView) -> str:
-    """Which recordings have no moment to be aligned at."""
+    """The note on recordings without the event that they are aligned at."""
     name = view.align.removeprefix("first ")
     without = [letter(i) for i, one in enumerate(view.opened) if one.first(name) is None]
     if view.align == "start" or not without:
@@ -159,10 +156,10 @@ def never_words(view: ReviewView) -> str:
 
 
 def facts_html(chosen: Opened, changed: str) -> str:
-    """What is known of a recording.
+    """Facts about a recording, as HTML.
 
     Args:
-        changed: what of its task is another now.
+        changed: which symbols of its task changed since the recording.
     """
     info = chosen.episode.info
     return render(

@@ -1,8 +1,4 @@
-"""The Judge tab of the review: recorded episodes run again, with today's code or another, and what is judged otherwise.
-
-A row of the list opens its episode at the first state that differs, with its reward as recorded and as it is now. Which
-code judges is chosen among what the server knows of, by name, and never by a path from a page.
-"""
+"""The Judge tab of the review: runs recorded episodes again with today's or other code, and lists what differs."""
 
 from __future__ import annotations
 
@@ -36,13 +32,13 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Code:
-    """One choice; what it is called does not make it another."""
+    """Code to run recordings with. A choice among files that the server knows; a page never sends a path."""
 
     label: str = field(compare=False)
     told: str = field(compare=False)
-    """What is opened, in words."""
+    """Which files it runs, for the page."""
     file: Path | None = None
-    """Asked before the files that the recordings name."""
+    """Used before the files named by the recordings."""
     recorded: bool = False
 
 
@@ -51,13 +47,13 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
 
     Args:
         infos: Of the recordings that are open; of others nothing is known before they are judged.
-        known: Task files besides those that the recordings name.
+        known: Further task files, not named by the recordings.
     """
     named = list({str(reference): reference for reference in map(reference_of, infos)}.values())
     own = {file for file in map(named_file, named) if file is not None}
     codes = [Code(TODAYS, _todays(infos, named)), Code(RECORDED, _recorded(infos), recorded=True)]
     for file in dict.fromkeys(known):
-        # Of recordings that are not open it is not known whether it has their task; those of another are left alone.
+        # Without open recordings their tasks are not known; recordings of other tasks are skipped later.
         if file not in own and (not infos or any(class_in(file, info.task) for info in infos)):
             taken = {code.label for code in codes}
             label = file.name if file.name not in taken else str(Path(file.parent.name, file.name))
@@ -100,7 +96,7 @@ class RescoreChoices:
 
 
 def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
-    """Where these recordings are; those that are gone, or cannot be read, are left out."""
+    """The sources of these recordings, without those that are gone or cannot be read."""
     rows = {row.id: row for row in library.rows()}
     return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
 
@@ -114,7 +110,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         review: Shows the episode of a row, and says what is open.
         library: Of the recordings that may be judged.
         choices: What was chosen before.
-        known: Task files that the server knows of besides those that recordings name.
+        known: Further task files that the server knows.
     """
 
     advice = words.PUT_IN
@@ -188,7 +184,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         return *at, self._pages.first, self._selected, self._codes_are_of(view)
 
     def _codes_are_of(self, view: ReviewView) -> object:
-        """What decides which code there is to choose from."""
+        """What the choices of code depend on."""
         return tuple(one.id for one in view.opened), tuple(self._known()), self._choices.code
 
     def draw(self, view: ReviewView) -> None:
@@ -217,7 +213,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         at = verdict.first_difference
         opened = [one.id for one in self._review.view().opened]
         return {
-            # As it is drawn with, if it is one of several that are open.
+            # Its colour, if it is one of several open recordings.
             "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
             "name": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.of.name[-24:],
             "hint": f"{verdict.of.name}. Press to open it"

@@ -1,9 +1,4 @@
-"""Opened recordings as one scene in the 3-D view, over each other or side by side, with their marks and names.
-
-Each recording is an env of one scene, and what looks the same in several is one shape with several wearers. Over each
-other, later ones are the same shapes, tinted and half see-through, for as long as they are elsewhere than the first
-one's; what stands at the same place in both for the whole time is drawn once.
-"""
+"""Open recordings as one scene in the 3-D view, over each other or side by side."""
 
 from __future__ import annotations
 
@@ -34,39 +29,44 @@ from workbench.ui.scene.viewpoint import Stage, Viewpoint, frame_all, frame_one
 from workbench.ui.widgets.templates import colour, letter
 
 SEE_THROUGH = 0.45
-"""Alpha of a ghost. Less vanishes over a white table, more hides what is behind."""
+"""Alpha of a ghost. Less vanishes over a white table, more hides the bodies behind."""
 MOST_NAMED = 16
-"""Recordings side by side that are all named. A browser lays a label out anew at every frame: of sixty it draws half as
-many (measured)."""
+"""Most recordings side by side with a label each. A browser lays out labels at every frame: with sixty its frame rate
+halves (measured)."""
 APART = 5e-4
-"""Metres from which on a ghost is drawn beside the body that it is a ghost of."""
+"""Least metres between a ghost and its body for the ghost to be drawn."""
 _SAME_PLACE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class ReviewScene:
-    """What the view draws of some opened recordings."""
+    """The scene of some open recordings.
+
+    Each recording is an env of one scene, and equal shapes are shared. Over each other, later recordings are ghosts:
+    tinted and half transparent, drawn only where they are apart from the first. Bodies that rest at the same place in
+    both for the whole time are drawn once.
+    """
 
     geometry: SceneGeometry
     layout: EnvLayout
     ghosts: bool
     _poses: tuple[NDArray[np.float32], ...]
-    """Of each recording (T + 1, its bodies, 7)."""
+    """(T + 1, its bodies, 7) of each recording."""
     _bodies: tuple[NDArray[np.int64], ...]
-    """Of each recording: where its bodies are among all."""
+    """Rows of each recording's bodies among all bodies."""
 
     def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
-        """(N, B, 7) at that state of each recording; NaN for what a recording lacks."""
+        """(N, B, 7) at this state of each recording; NaN for bodies that a recording lacks."""
         found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
         if self.ghosts:
             for ghost in found[1:]:
-                # Two skins at one place make a pattern of patches; one sees better where they part.
+                # Two surfaces at one place flicker.
                 ghost[distances(found[0], ghost) < APART] = np.nan
         return found
 
 
 def shown_together(view: ReviewView) -> tuple[int, ...]:
-    """Which recordings have lines over each other: all, or the selected one where they are too many."""
+    """Indices of the recordings drawn together: all, or only the selected one where they are too many."""
     return tuple(range(len(view.opened))) if len(view.opened) <= MOST_COMPARED else (view.selected,)
 
 
@@ -104,13 +104,13 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
                 if name in left_out:
                     continue
                 worn = replace(visual, material=tinted(visual.material, colour(index))) if ghost else visual
-                # Recordings share their shapes (`SharedShapes`), and each is looked at once.
+                # Recordings share their shapes (`SharedShapes`): one fingerprint for each.
                 object_ = (id(visual.mesh), id(visual.material), index if ghost else -1)
                 if object_ not in known:
                     known[object_] = fingerprint((worn,))
                 looks = known[object_]
                 number = 0
-                # The same shape twice on one body, at the same place: two visuals, as in the recording.
+                # The same shape twice on one body stays two visuals, as in the recording.
                 while (looks, rows[name], number) in shapes and index in shapes[looks, rows[name], number][1]:
                     number += 1
                 shapes.setdefault((looks, rows[name], number), (worn, []))[1].append(index)
@@ -134,7 +134,7 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
 
 
 def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
-    """Bodies that stand at one and the same place in both for the whole time."""
+    """Bodies that rest at the same place in both for the whole time."""
     found = []
     a, b = first.episode, other.episode
     if a.geometry is None or b.geometry is None or a.poses is None or b.poses is None:
@@ -149,7 +149,7 @@ def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
 
 
 def tinted(material: Material, tone: str) -> Material:
-    """Mostly that colour, half see-through, and without texture: the shape is what is compared."""
+    """The material mostly in that colour, half transparent, without texture."""
     tint = np.array([int(tone[i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** 2.2
     own = np.array(material.base_color[:3])
     red, green, blue = (float(c) for c in 0.75 * tint + 0.25 * own)
@@ -170,11 +170,12 @@ def _side_by_side(
 
 
 class ReviewIn3D:
-    """
+    """Draws the open recordings with marks, names and frustums.
+
     Args:
         server: The page.
-        review: What is shown, and told which recording is clicked at.
-        stage: The view that is drawn into.
+        review: Of the page; a click in the view selects a recording of it.
+        stage: The 3-D view.
     """
 
     def __init__(self, server: viser.ViserServer, review: Review, stage: Stage) -> None:
@@ -185,10 +186,10 @@ class ReviewIn3D:
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
-        """That the scene is of: another recording may be open since."""
+        """The one that the scene was drawn for: another recording may be open since."""
         self._scene_of: object = None
         self._triangles = 0
-        """How many the bodies were built for."""
+        """The limit that the bodies were built with."""
         server.scene.on_click()(self._on_click)
 
     def draw(
@@ -199,12 +200,13 @@ class ReviewIn3D:
         cameras: tuple[CameraInfo, ...],
         pictures: dict[CameraKey, Picture],
     ) -> None:
-        """
+        """Draw the present states.
+
         Args:
-            ghosts: Over each other, where there are several.
-            triangles: About how many may be drawn.
+            ghosts: Over each other, if there are several.
+            triangles: Approximate limit.
             cameras: Of the selected recording.
-            pictures: What is shown in their frustums.
+            pictures: Shown in their frustums.
         """
         wanted = (view.opened_serial, ghosts, len(view.opened))
         if wanted != self._scene_of:
@@ -240,7 +242,7 @@ class ReviewIn3D:
 
     def _frame_what_is_new(self, view: ReviewView, scene: ReviewScene, in_grid: bool) -> None:
         size = np.round(np.concatenate([scene.layout.low, scene.layout.high]), 0).tobytes()
-        # As the live page has it: where the same is to be seen there, the view stays.
+        # The live page uses the same key: switching between the two for one task keeps the view.
         task = view.opened[0].episode.info.task
         if self._framing.is_new((task, len(view.opened) if in_grid else 1, size)):
             self.frame()
@@ -261,7 +263,7 @@ class ReviewIn3D:
         self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL)
 
     def _draw_names(self, view: ReviewView, scene: ReviewScene | None) -> None:
-        """The names of those that are not selected, where they are few; the selected one's is on its frame."""
+        """Label the recordings that are not selected, if few; the selected one's label is on its frame."""
         few = scene is not None and len(view.opened) <= MOST_NAMED
         for index, label in enumerate(self._names):
             if scene is None or not few or index >= len(view.opened) or index == view.selected:
@@ -295,7 +297,7 @@ class ReviewIn3D:
 
 
 def human_camera(view: ReviewView) -> CameraTrack | None:
-    """The recordings' own camera for people: the selected one's, or of another where that has none."""
+    """The human camera of the selected recording, or else of another."""
     chosen = view.chosen
     several = () if chosen is None else (chosen, *view.opened)
     tracks = (track for one in several for track in one.episode.cameras)
@@ -303,12 +305,12 @@ def human_camera(view: ReviewView) -> CameraTrack | None:
 
 
 def as_picture(track: CameraTrack) -> Picture:
-    """Where it stood at the start; the picture itself is not looked at."""
+    """A picture without pixels that has the camera's pose at the start."""
     return Picture(track.info.name, "human", 0, track.pose[0])
 
 
 def caption(view: ReviewView, index: int) -> str:
-    """The name of a recording in the view."""
+    """Label of a recording in the view."""
     one = view.opened[index]
     seed = f", seed {one.episode.info.seed}" if one.episode.info.seed >= 0 else ""
     return f"{letter(index)}{seed}"
