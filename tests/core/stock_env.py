@@ -1,4 +1,4 @@
-"""Tasks without a robot, and ManiSkill's own single CPU env as the judge of one env of a batch."""
+"""Tasks without a robot, and ManiSkill's own single CPU env as the reference for one env of a batch."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false

@@ -66,8 +66,8 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
     except (OSError, subprocess.TimeoutExpired) as problem:
         raise AptFailed(f"{' '.join(command)}: {problem}") from problem
     if done.returncode != 0:
-        said = "\n".join((done.stdout + done.stderr).strip().splitlines()[-12:])
-        raise AptFailed(f"{' '.join(command)} ended with {done.returncode}:\n{said}")
+        output = "\n".join((done.stdout + done.stderr).strip().splitlines()[-12:])
+        raise AptFailed(f"{' '.join(command)} ended with {done.returncode}:\n{output}")
 
 
 def apt_install(*packages: str) -> None:

@@ -73,7 +73,7 @@ def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float =
             return replace(msgspec.json.decode(line[len(ANSWER) :], type=RenderProbe), env=added)
     how, last = (
         describe_exit(child.returncode),
-        (child.stderr.strip().splitlines() or ["it said nothing"])[-1],
+        (child.stderr.strip().splitlines() or ["no output"])[-1],
     )
     return RenderProbe(
         ok=False, error=f"SAPIEN {how}" + (f": {last}" if child.returncode > 0 else ""), env=added

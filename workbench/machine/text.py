@@ -33,12 +33,14 @@ def nonfinite_text(values: ArrayLike) -> str:
     return f"{told} of {len(flat)}" if told else ""
 
 
-def mean_text(values: ArrayLike, say: Callable[[float], str] = number_text) -> str:
+def mean_text(values: ArrayLike, form_text: Callable[[float], str] = number_text) -> str:
     """Mean of the finite values, and counts of the others: ``0.25, NaN in 3 of 16``."""
     flat = np.asarray(values, np.float64).reshape(-1)
     finite = flat[np.isfinite(flat)]
     return ", ".join(
-        part for part in (say(float(finite.mean())) if len(finite) else "", nonfinite_text(flat)) if part
+        part
+        for part in (form_text(float(finite.mean())) if len(finite) else "", nonfinite_text(flat))
+        if part
     )
 
 

@@ -31,7 +31,7 @@ def env(renderer: None) -> Iterator[Any]:
     made.close()
 
 
-def judged(env: Any, placement: Placement, size: tuple[int, int]) -> CameraReport:
+def measured(env: Any, placement: Placement, size: tuple[int, int]) -> CameraReport:
     return join_reports([measure_placement(env, e, placement, size=size) for e in range(N)])
 
 
@@ -50,7 +50,7 @@ def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
             axes_of(suggestion.settings.quaternion)[0], away / np.linalg.norm(away), atol=1e-9
         )
         # Judged again from nothing but its settings, it is as good as was said.
-        again = judged(env, Placement(suggestion.settings), suggestion.report.measured_size)
+        again = measured(env, Placement(suggestion.settings), suggestion.report.measured_size)
         assert score_of(again, space.objects) == pytest.approx(suggestion.score, abs=1e-6)
         assert all(thing.summary().seen == 1 for thing in again.wanted_objects(space.objects))
         assert suggestion.picture.rgb is not None and suggestion.picture.rgb.shape == (64, 96, 3)
@@ -121,7 +121,7 @@ def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_it
     assert abs(left @ axes_of(lens.quaternion)[2]) < 1e-6 and up @ axes_of(lens.quaternion)[2] > 0
     assert np.allclose(np.cross(np.subtract(found.target, eye), forward), 0, atol=1e-6)
     placement = Placement(found.settings, mount=mount)
-    again = judged(env, placement, found.report.measured_size)
+    again = measured(env, placement, found.report.measured_size)
     assert score_of(again, ("cube",)) == pytest.approx(found.score, abs=1e-6) and found.score > 0.1
     with pytest.raises(ValueError, match="no body 'panda/tail'"):
         suggest_cameras(env, replace(space, mount="panda/tail"), [0])

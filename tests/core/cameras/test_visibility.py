@@ -23,7 +23,7 @@ from workbench.core.cameras.visibility import (
     measure_placement,
     objects_to_see,
     placement_of,
-    settings_of,
+    present_settings,
     small_size,
 )
 from workbench.core.scene.scene_index import read_poses, scene_index
@@ -52,7 +52,7 @@ def built(task: str, **kwargs: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
-    """The cube to push; sensors with a shader that is not the one that is used to judge."""
+    """The cube to push; sensors with a shader other than the one of reports."""
     made = built("PushCube-v1", sensor_configs={"shader_pack": "default"})
     yield made
     made.close()
@@ -114,7 +114,7 @@ def test_judging_leaves_no_trace(env: Any) -> None:
         return [
             [(s.physx_system.pack(), s.pack_poses(), [e.per_scene_id for e in s.entities]) for s in scenes],
             [(b.visibility, len(s.render_system.cameras)) for s in scenes for b in bodies],
-            [settings_of(camera, e) for camera in cameras_of(env).values() for e in range(N)],
+            [present_settings(camera, e) for camera in cameras_of(env).values() for e in range(N)],
             sapien.render.get_camera_shader_dir(),
             [
                 (p.rgb.tobytes(), p.depth.tobytes(), p.segmentation.tobytes())  # type: ignore[union-attr]
@@ -237,7 +237,7 @@ def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
         assert_array_equal(seen(ridden, "cube").pixels, seen(still, "cube").pixels)
 
 
-def test_a_moment_of_the_past_is_judged_where_its_bodies_were(env: Any) -> None:
+def test_a_past_moment_is_measured_where_its_bodies_were(env: Any) -> None:
     cube = scene_index(env).names.index("cube")
     past = read_poses(env)
     past[:, cube, :3] += [0.0, 5.0, 0.0]
@@ -270,7 +270,7 @@ def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> N
     env.close()
 
 
-def test_what_cannot_be_judged_is_refused_by_name(env: Any) -> None:
+def test_what_cannot_be_measured_is_refused_by_name(env: Any) -> None:
     with pytest.raises(ValueError, match=r"base_camera \(sensor\)"):
         measure_camera(env, ("sensor", "nothing"), 0)
     with pytest.raises(IndexError, match="out of range for 3"):

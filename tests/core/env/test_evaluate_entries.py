@@ -237,7 +237,7 @@ def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
     env.close()
 
 
-def test_steps_and_judgements_tell_both_halves(odd_task: Path) -> None:
+def test_steps_and_rescoring_give_both_halves(odd_task: Path) -> None:
     env = workbench.make(odd_task, 3, **CPU, reward_mode="dense")
     task = TaskEnv(open_env(env))
     task.reset(seed=0)

@@ -1,4 +1,4 @@
-"""The batched CPU core against ManiSkill's own single CPU env, which is the judge."""
+"""The batched CPU core against ManiSkill's own single CPU env, as the reference."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false

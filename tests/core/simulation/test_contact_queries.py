@@ -1,4 +1,4 @@
-"""What queries of contact impulses answer, over bare systems of boxes; `test_contacts` has stock ManiSkill as the judge."""
+"""What queries of contact impulses answer, over bare systems of boxes; `test_contacts` compares with stock ManiSkill."""
 
 # SAPIEN annotates vectors as arrays, and its objects by what they are in C++.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false

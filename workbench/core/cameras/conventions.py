@@ -65,7 +65,7 @@ def normalised(quaternion: ArrayLike) -> Floats:
     # Divided by the largest first: the squares of tiny numbers are zero.
     largest = np.abs(q).max()
     if largest == 0:
-        raise ValueError("a quaternion of zeros says no rotation; 1, 0, 0, 0 (w first) turns nothing")
+        raise ValueError("a quaternion of zeros is no rotation; 1, 0, 0, 0 (w first) is the identity")
     q = q / largest
     q = q / np.linalg.norm(q)
     first = q[np.abs(q) > 1e-12][0]

@@ -170,7 +170,7 @@ def _of_env(value: Any, env_index: int) -> float:
     return float(value if isinstance(value, (int, float)) else value[env_index])
 
 
-# --- what a config says ---------------------------------------------------------------------------
+# --- settings of a config ---------------------------------------------------------------------------
 
 
 def settings_of(config: Any) -> CameraSettings | None:

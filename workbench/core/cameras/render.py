@@ -151,7 +151,7 @@ def begin_pictures(
     ]
     places = places_to_draw(env, env_index, poses)
     with (
-        hidden_objects(env, env_index, shown=kinds == {"human"}),
+        show_hidden_objects(env, env_index, shown=kinds == {"human"}),
         drawn_at(places, components) as move_bodies,
     ):
         sub_scene.update_render()
@@ -188,9 +188,9 @@ def cameras_of(env: Any) -> dict[CameraKey, Any]:
 
 def _varies(config: Any, components: Sequence[Any]) -> bool:
     """Whether the poses differ between envs, or are not those of the config."""
-    said = rows_of_pose(config)
+    configured = rows_of_pose(config)
     real = np.array([[*c.local_pose.p, *c.local_pose.q] for c in components])
-    return bool((said != said[:1]).any() or np.abs(real - said[:1]).max() > 1e-5)
+    return bool((configured != configured[:1]).any() or np.abs(real - configured[:1]).max() > 1e-5)
 
 
 def mount_of(env: Any, camera: Any) -> str | None:
@@ -214,7 +214,7 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 
 
 @contextmanager
-def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
+def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Within this, draw the task's hidden objects in this env, or do not.
 
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on a stock CPU env by visibility,

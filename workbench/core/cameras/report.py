@@ -284,7 +284,7 @@ def _end_to_end(parts: Sequence[_Part]) -> _Part:
 
 def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
     """Text about these objects: ``cube: in 8 of 8 envs, about 210 pixels``."""
-    told = []
+    texts = []
     for thing in report.wanted_objects(objects):
         all_envs = thing.summary()
         if not all_envs.present:
@@ -297,8 +297,8 @@ def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
             words += f", cut by the border in {all_envs.cut:.0%}"
         if all_envs.hidden > 0.005:
             words += f", {all_envs.hidden:.0%} behind the robot"
-        told.append(words)
-    return "; ".join(told)
+        texts.append(words)
+    return "; ".join(texts)
 
 
 def _share_lost(left: NDArray[np.float32], whole: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from workbench.core.camera_data import CameraKind, CameraSettings
 from workbench.core.cameras.conventions import intrinsic_of, scaled_intrinsic
-from workbench.core.cameras.render import cameras_of, depth_in_metres, hidden_objects, places_to_draw
+from workbench.core.cameras.render import cameras_of, depth_in_metres, places_to_draw, show_hidden_objects
 from workbench.core.env_numbers import require_env
 from workbench.core.simulation.drawn_poses import drawn_at, temporarily
 
@@ -89,7 +89,7 @@ def temporary_camera(
         scene.px.sync_poses_gpu_to_cpu()
     places = places_to_draw(env, env_index, poses)
     with ExitStack() as after:
-        after.enter_context(hidden_objects(env, env_index, shown=kind == "human"))
+        after.enter_context(show_hidden_objects(env, env_index, shown=kind == "human"))
         move_bodies = after.enter_context(drawn_at(places))
         second_scene = sapien.Scene([render_system])
         entity = sapien.Entity()

@@ -145,7 +145,7 @@ def placement_of(env: Any, camera: CameraKey, e: int, settings: CameraSettings |
         raise ValueError(f"there is no {camera[0]} camera {camera[1]!r} to report on; there are: {there}")
     require_env(e, env.num_envs)
     found, (kind, name) = cameras[camera], camera
-    return Placement(settings or settings_of(found, e), kind, mount_of(env, found), name)
+    return Placement(settings or present_settings(found, e), kind, mount_of(env, found), name)
 
 
 def measure_placement(
@@ -167,7 +167,7 @@ def measure_placement(
         RuntimeError: the renderer failed.
     """
     index = scene_index(env)
-    pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, index)
+    pose = placement_pose(placement, read_poses(env)[e] if poses is None else poses, index)
     with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         camera = placement.kind, placement.name
         return measure(view, pose, e, list_objects(env), index, camera, placement.settings)
@@ -181,14 +181,14 @@ def picture_of(
     size: tuple[int, int] | None = None,
 ) -> Picture:
     """A picture from a camera that need not exist; arguments and errors as `measure_placement`."""
-    pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
+    pose = placement_pose(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
     with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         segmentation, depth = view.look(pose)
         rgb = view.colours()
     return Picture("suggested", placement.kind, e, pose.astype(np.float32), rgb, depth, segmentation)
 
 
-def settings_of(camera: Any, env_index: int) -> CameraSettings:
+def present_settings(camera: Any, env_index: int) -> CameraSettings:
     """Present settings of one env's camera, the lens as an intrinsic matrix; `camera` as in `cameras_of`."""
     component = maniskill_private.camera_components(camera)[env_index]
     local = component.local_pose
@@ -215,7 +215,9 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 # --- measuring ---------------------------------------------------------------------------------------------------
 
 
-def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneIndex) -> NDArray[np.float64]:
+def placement_pose(
+    placement: Placement, bodies: NDArray[np.float32], index: SceneIndex
+) -> NDArray[np.float64]:
     """(7,) of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
     if placement.mount is None:
         return pose_of(placement.settings)

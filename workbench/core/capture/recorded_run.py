@@ -90,7 +90,7 @@ def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
     return {name: row for name, row in rows.items() if not np.isnan(row).all()}
 
 
-# --- The keywords of ``gym.make`` that make an env again, as far as a text file can say them ---
+# --- keywords of ``gym.make`` that make an env again ------------------------------------------------
 
 
 HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
@@ -105,8 +105,8 @@ def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if env.agent is not None and isinstance(env.control_mode, str):
         modes["control_mode"] = env.control_mode
-    said = {**given, **modes}
-    return {name: said[name] for name in said if name not in HOW_IT_IS_RUN and _is_json(said[name])}
+    every = {**given, **modes}
+    return {name: every[name] for name in every if name not in HOW_IT_IS_RUN and _is_json(every[name])}
 
 
 def _is_json(value: Any) -> bool:

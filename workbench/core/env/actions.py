@@ -135,13 +135,13 @@ def to_flat_action(
 
 
 def _wrong_shape(whose: str, shape: tuple[int, ...], expected: tuple[int, int], mode: Any) -> str:
-    said = f"{whose} has shape {shape}, expected {expected} (envs, dimensions)"
+    problem = f"{whose} has shape {shape}, expected {expected} (envs, dimensions)"
     if not shape or shape[-1] == expected[1]:
-        return said
+        return problem
     # Several robots have one mode each.
     modes = ", ".join(f"{one}" for one in mode.values()) if isinstance(mode, dict) else str(mode)
     return (
-        f"{said}: it is {shape[-1]} wide, and the control mode {modes} takes {expected[1]}. Name the one that it is written "
+        f"{problem}: it is {shape[-1]} wide, and the control mode {modes} takes {expected[1]}. Name the one that it is written "
         "for with --env control_mode=..., or return as many"
     )
 

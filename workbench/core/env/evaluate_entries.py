@@ -203,24 +203,24 @@ def _text(value: Any) -> tuple[str, bool]:
     if isinstance(value, np.generic):
         value = str(value)  # its repr names numpy, and Python's number has digits that it has not
     if isinstance(value, str):
-        said = str.__str__(value)
+        text = str.__str__(value)
     else:
-        said = safe_repr(value)
-    if len(said) > MOST_LETTERS:
-        return clean_text(said[: MOST_LETTERS - 1]) + "…", False
-    return clean_text(said), isinstance(value, str) or "..." not in said
+        text = safe_repr(value)
+    if len(text) > MOST_LETTERS:
+        return clean_text(text[: MOST_LETTERS - 1]) + "…", False
+    return clean_text(text), isinstance(value, str) or "..." not in text
 
 
 def safe_repr(value: object) -> str:
     """A repr of bounded length, also if the object's own raises."""
     try:
         if isinstance(value, (list, tuple, dict, set, frozenset)):
-            said = _short.repr(value)
+            text = _short.repr(value)
         else:
-            said = repr(value)
+            text = repr(value)
     except Exception as error:  # an author's __repr__
         return f"<{type(value).__qualname__}, whose repr raises {type(error).__name__}>"
-    return _ADDRESS.sub("", said)
+    return _ADDRESS.sub("", text)
 
 
 def clean_text(text: str) -> str:
@@ -249,9 +249,9 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> str | None:
     """What is wrong with a reward, or None: a floating tensor (N,). A NaN is a value, shown in that env's row."""
-    said = no_reward(reward, num_envs)
-    if said is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
-        return said
+    problem = no_reward(reward, num_envs)
+    if problem is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
+        return problem
     # ManiSkill's own sparse reward is `success` itself where a task has no `fail`.
     success = evaluate.get("success")
     if isinstance(success, torch.Tensor) and reward.dtype == torch.bool and torch.equal(reward, success):

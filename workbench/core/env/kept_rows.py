@@ -225,7 +225,7 @@ class _Lines:
             del self.found[path]
 
 
-# --- told of -----------------------------------------------------------------------------------------
+# --- reports -----------------------------------------------------------------------------------------
 
 
 _TRIES = 3
@@ -233,7 +233,7 @@ _TRIES = 3
 
 
 class ResetWatch:
-    """Watches the partial resets of one env, from `start` to `tell` or `stop`.
+    """Watches the partial resets of one env, from `start` to `report` or `stop`.
 
     Args:
         rules: Receives what is found.
@@ -275,7 +275,7 @@ class ResetWatch:
             self._lines.stop()
             self._lines = None
 
-    def tell(self, over: bool = True) -> None:
+    def report(self, over: bool = True) -> None:
         """Report what the reset changed, or has changed so far if it is not `over`.
 
         Raises:
@@ -291,9 +291,9 @@ class ResetWatch:
             self._tries -= self._seeks
             self._seeks = self._tries > 0 and not found.keys() <= lines.found.keys()
         for path, envs in found.items():
-            self._tell(path, envs, lines.found.get(path, ()), lines.rows.env.num_envs)
+            self._report(path, envs, lines.found.get(path, ()), lines.rows.env.num_envs)
 
-    def _tell(self, path: str, envs: tuple[int, ...], frames: tuple[Frame, ...], total: int) -> None:
+    def _report(self, path: str, envs: tuple[int, ...], frames: tuple[Frame, ...], total: int) -> None:
         assert self._task is not None
         shown = path.removesuffix(".raw_pose")
         if not envs:

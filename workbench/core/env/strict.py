@@ -90,7 +90,7 @@ class StrictMixin:
                     chosen = sorted(set(range(self.num_envs)).difference(untouched))
                     watch.start(self, self._workbench_task, chosen)  # type: ignore[arg-type]
                 made = super().reset(seed=seed, options=options)  # type: ignore[misc]
-                watch.tell()
+                watch.report()
                 return made
             finally:
                 watch.stop()
@@ -121,7 +121,7 @@ class StrictMixin:
             super()._initialize_episode(env_idx, options)  # type: ignore[misc]
             system.being_reset = None
             system.refuse_changes_elsewhere(state, reset)
-            watch.tell(over=not watch.whole)
+            watch.report(over=not watch.whole)
         finally:
             system.being_reset = None
             watch.stop()

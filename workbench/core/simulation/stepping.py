@@ -222,7 +222,7 @@ _CAPSULE_NAME = ctypes.c_char_p(b"St9type_info")
 """``typeid(std::type_info).name()``; a capsule keeps a pointer to its name, so this must not be collected."""
 
 
-# --- A few threads that take envs off one list, kept for the life of the process --------------
+# --- threads that take envs off one list, kept for the life of the process --------------------
 
 
 def usable_cores() -> int:

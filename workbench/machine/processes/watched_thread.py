@@ -44,10 +44,10 @@ def report_failure(what: str, error: BaseException) -> None:
     text = f"{what}: {type(error).__name__}: {error}. This is a fault of the workbench.\n"
     text += "".join(traceback.format_exception(error))
     with _lock:
-        told = list(_listeners)
-    if not told:
+        listeners = list(_listeners)
+    if not listeners:
         logger.error("%s", text)
-    for listener in told:
+    for listener in listeners:
         try:
             listener(text)
         except Exception:

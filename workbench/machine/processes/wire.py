@@ -257,11 +257,11 @@ class _Written:
             known = self._numbers.setdefault(id(value), len(self._numbers))
             if known < len(self._alive):
                 return msgspec.msgpack.Ext(_AGAIN, str(known).encode())
-            said = _what_it_is(value.dtype, value.shape)
+            description = _array_description(value.dtype, value.shape)
             self._alive.append(value)
             if value.size:
                 self.parts.append(np.ascontiguousarray(value).reshape(-1).view(np.uint8))
-            return said
+            return description
         if isinstance(value, np.generic):
             return value.item()
         if isinstance(value, Path):
@@ -280,9 +280,9 @@ class _Read:
 
     def take(self, code: int, data: memoryview) -> np.ndarray:
         if code == _AGAIN:
-            return self._taken[int(bytes(data))] if bytes(data).isdigit() else _refuse()
+            return self._taken[int(bytes(data))] if bytes(data).isdigit() else _refuse_array()
         if code != _ARRAY or len(data) > _LONGEST:
-            _refuse()
+            _refuse_array()
         dtype, shape, size = _described(bytes(data))
         if size > len(self._rest):
             raise ValueError("an array is longer than what came")
@@ -296,12 +296,12 @@ class _Read:
         return array
 
 
-def _refuse() -> Any:
+def _refuse_array() -> Any:
     raise ValueError("invalid description of an array")
 
 
 @functools.lru_cache(1000)
-def _what_it_is(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpack.Ext:
+def _array_description(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpack.Ext:
     if dtype.kind not in _NUMBERS:
         raise TypeError(f"an array of {dtype} cannot be sent")
     return msgspec.msgpack.Ext(_ARRAY, msgspec.msgpack.encode((dtype.str, shape)))
@@ -312,7 +312,7 @@ def _described(data: bytes) -> tuple[np.dtype, tuple[int, ...], int]:
     name, shape = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...]])
     dtype = np.dtype(name)
     if dtype.kind not in _NUMBERS or dtype.itemsize == 0 or min(shape, default=0) < 0:
-        _refuse()
+        _refuse_array()
     return dtype, shape, dtype.itemsize * math.prod(shape)
 
 
