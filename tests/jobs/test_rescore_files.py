@@ -97,7 +97,7 @@ def test_no_recording_is_opened_in_this_process(
     def refuse(path: Path) -> None:
         raise AssertionError(f"{path} was opened here")
 
-    for module in ("read_maniskill", "read_episode"):
+    for module in ("maniskill.read", "reader.read_episode"):
         monkeypatch.setattr(f"workbench.recording.{module}.open_h5", refuse)
     assert len(rescore_all(RescoreOptions((foreign, author / "recordings")))[0]) == 5
     assert [run.length for run in read_given(foreign)[0]] == [STEPS, STEPS]

@@ -1,4 +1,4 @@
-"""Random numbers of an episode, and scenes that are built anew at a reset."""
+"""Random numbers of an episode, and scenes that a reset rebuilds."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false

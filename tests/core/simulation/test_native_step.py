@@ -1,4 +1,4 @@
-"""The exported names of SAPIEN that stepping beside the interpreter lock relies on."""
+"""Exported names of SAPIEN that stepping without the interpreter lock needs."""
 
 from __future__ import annotations
 

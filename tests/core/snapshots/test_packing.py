@@ -1,4 +1,4 @@
-"""A snapshot cut in parts is the snapshot, and what did not change is said once."""
+"""A packed snapshot unpacks as the snapshot, and unchanged parts are sent once."""
 
 # A task's own attributes are not known to the checker.
 # pyright: reportAttributeAccessIssue=false

@@ -1,4 +1,4 @@
-"""Snapshots: an episode goes on as it would have, in its own env, in others, and in an env made anew."""
+"""Snapshots: an episode goes on as it would have, in its own env, in others, and in an env made again."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 # pyright: reportCallIssue=false

@@ -1,4 +1,4 @@
-"""What is sent comes back as it was, and whatever else comes is data of the kinds that are awaited or unreadable."""
+"""Messages arrive as they were sent; other bytes are data of the expected types, or unreadable."""
 
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ class ImpulseQuery:
 class ContactReader:
     """Answers queries about the last substep of the systems; `invalidate` after each substep.
 
-    Reading the points of a PhysX contact takes microseconds in Python. The lists are walked at most once a step, whatever
-    the number of queries, and points are read only of contacts that a query counts. (PickCube, 64 envs: ``is_grasping`` took
+    Reading the points of a PhysX contact takes microseconds in Python. The lists are walked at most once a step, for any
+    number of queries, and points are read only of contacts that a query counts. (PickCube, 64 envs: ``is_grasping`` took
     1,900 us of a control step while every contact of the cube was read, 1,200 us since; 850 are ManiSkill's own.) Sums have
     the order and precision of ``mani_skill.utils.sapien_utils.compute_total_impulse``, so that numbers equal stock ManiSkill's.
     """
