@@ -1,8 +1,4 @@
-"""Two placements of one camera side by side: the one now, and the file's or one that was kept as A.
-
-Two pictures one after the other cannot be compared from memory. Both are of the same moment of the selected env, and
-what differs between the placements is said under them in numbers.
-"""
+"""Compares two placements of a camera: two pictures of the same moment, and the differences in numbers."""
 
 from __future__ import annotations
 
@@ -27,7 +23,7 @@ LARGEST = 256
 
 
 class CameraCompare:
-    """The folder in the present container."""
+    """The folder in the present container: the placement now, next to the file's or one that was kept as A."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
@@ -113,7 +109,7 @@ class CameraCompare:
 
 
 def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
-    """What `new` has otherwise than `old`, each in a few words; empty if nothing is."""
+    """The differences of `new` from `old`, each in a few words."""
     said = []
     moved = float(np.linalg.norm(np.subtract(new.position, old.position)))
     if moved > 1e-6:
@@ -127,9 +123,9 @@ def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
         said.append("another lens")
     if (old.width, old.height) != (new.width, new.height):
         said.append(f"{old.width} × {old.height} → {new.width} × {new.height}")
-    for name in ("near", "far"):
-        if getattr(old, name) != getattr(new, name):
-            said.append(f"{name} {getattr(old, name):g} → {getattr(new, name):g} m")
+    for name, was, now in (("near", old.near, new.near), ("far", old.far, new.far)):
+        if was != now:
+            said.append(f"{name} {was:g} → {now:g} m")
     if old.shader_pack != new.shader_pack:
         said.append(f"shader {old.shader_pack} → {new.shader_pack}")
     return said

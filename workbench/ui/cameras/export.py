@@ -1,8 +1,4 @@
-"""A camera in other programs' words: its matrices in a convention of one's choice, files of it, and a calibration read in.
-
-A matrix of sixteen numbers does not say what it is. Which way it goes and what the camera's axes are called is
-therefore chosen here, stands beside the numbers that are shown, and holds for what is pasted too.
-"""
+"""Matrices of a camera in a chosen convention, files of cameras, and import of a calibration."""
 
 from __future__ import annotations
 
@@ -28,7 +24,7 @@ CONVENTIONS: dict[str, Convention] = {
     "OpenGL, Blender": "opengl",
     "ManiSkill, ROS body": "maniskill",
 }
-"""ROS calls by x forward the frame of a camera's body, and by z forward its optical frame (REP 103)."""
+"""In ROS x is forward in the frame of a camera's body, and z is forward in its optical frame (REP 103)."""
 AXES = {
     "opencv": "x right, y down, z forward",
     "opengl": "x right, y up, z backward",
@@ -44,14 +40,18 @@ FORMS: dict[str, tuple[Form, str]] = {
     "ROS CameraInfo": ("ros", "yaml"),
 }
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
-"""Metres in one of them: calibrations are often in those of the board that was looked at."""
+"""Metres in one of each: calibrations are often in the unit of the calibration board."""
 THIS, ALL = "this camera", "all cameras"
 LONGEST = 20_000
-"""Characters of a calibration that is pasted."""
+"""Characters of a pasted calibration."""
 
 
 class CameraExport:
-    """The folder in the present container."""
+    """The folder in the present container.
+
+    A matrix of sixteen numbers does not tell its direction and the names of the camera's axes: both are chosen here, and
+    hold for what is shown and for what is pasted.
+    """
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
@@ -140,13 +140,13 @@ class CameraExport:
 
 
 def file_name(name: str, form: Form, suffix: str) -> str:
-    """A name for the download: what a camera may be called is no matter for a file system."""
+    """A name for the download, with only letters, digits, - and _ of the camera's name."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "camera"
     return f"{plain[:60]}{'' if form == 'json' else f'_{form}'}.{suffix}"
 
 
 def matrices_html(camera: StudioCamera | None, convention: Convention, direction: Direction) -> str:
-    """Intrinsic and extrinsic of the camera as it is placed, in the env's frame."""
+    """Intrinsic and extrinsic of the camera at its present place, in the env's frame."""
     if camera is None or camera.now is None:
         return render("note", text="Choose a camera first.")
     pose = frames.pose_in_env(camera.now, camera.mount_pose)
@@ -163,13 +163,13 @@ def matrices_html(camera: StudioCamera | None, convention: Convention, direction
 
 
 def aligned(matrix: NDArray[np.float64]) -> str:
-    """Rows of a matrix with their points under each other, to be read."""
+    """Rows of a matrix with aligned decimal points, for reading."""
     cells = [[f"{number + 0.0:.4f}".replace("-0.0000", "0.0000") for number in row] for row in matrix]
     width = max(len(cell) for row in cells for cell in row)
     return "\n".join("  ".join(cell.rjust(width) for cell in row) for row in cells)
 
 
 def as_lists(matrix: NDArray[np.float64]) -> str:
-    """The matrix as Python and JSON write it, to be copied: nine digits, more than a calibration has."""
+    """The matrix as Python and JSON lists, for copying, with nine digits."""
     rows = (", ".join(f"{number + 0.0:.9g}" for number in row) for row in matrix)
     return "[" + ", ".join(f"[{row}]" for row in rows) + "]"

@@ -1,14 +1,4 @@
-"""Where the chosen camera stands and looks, and its lens and picture, in numbers that can be typed.
-
-All ways to say a pose are shown of the same camera and each writes it; of the three for the orientation one at a time,
-since nobody reads eleven fields. What a typed eye means follows the handles in the view: with one handle on the camera
-the target goes with it, with an eye and a target each is typed alone. Of a mounted camera all is in the frame of its
-link. The lens is set once and then left, so its folder is closed. It can be said in two ways that exclude each other in
-ManiSkill's config; the choice between them is a change of the config, after which the camera sees the same.
-
-A field says once which numbers of a camera it has, and how they are put into it: what is shown, what is taken as typed
-and what stays as exact as it is are told by the same numbers.
-"""
+"""Number fields for the chosen camera's pose, lens and picture."""
 
 from __future__ import annotations
 
@@ -44,15 +34,15 @@ from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.templates import render
 
 TYPED = 0.3
-"""Seconds without another number after which the last is taken: the arrows beside a field are held down."""
+"""Seconds without another number until the last is taken: a person may hold down the arrows next to a field."""
 RPY, WXYZ, AXES = "roll, pitch, yaw", "quaternion wxyz", "forward and up"
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
-"""Digits that are shown."""
+"""Digits of the shown numbers."""
 FOV, INTRINSIC = "field of view", "intrinsic matrix"
 GOES_ALONG = "What it looks at goes along with the position. To keep it: Place, eye and target."
 STAYS = "Each moves alone: the camera goes on looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
-"""Those that ManiSkill 3 brings."""
+"""The shader packs of ManiSkill 3."""
 SMALLEST, LARGEST = 8, 4096
 """Pixels of a picture's side."""
 
@@ -60,16 +50,21 @@ Numbers = tuple[float, ...]
 
 
 class CameraNumbers:
-    """Two folders in the present container.
+    """Two folders in the present container: pose, and lens and picture.
+
+    All forms of the pose show the same camera and each writes it; of the three forms of the orientation one is shown at
+    a time. With one gizmo on the camera a typed eye takes the target along; with an eye and a target each is typed
+    alone. A mounted camera's numbers are in the frame of its link. The lens is a field of view or an intrinsic matrix,
+    which exclude each other in ManiSkill's config; the picture stays the same when the form is changed.
 
     Args:
-        look_at: whether eye and target are placed, each alone, and not a pose.
+        look_at: whether eye and target are placed separately, instead of a pose.
     """
 
     def __init__(self, server: viser.ViserServer, placing: Placing, look_at: Callable[[], bool]) -> None:
         self._placing, self._look_at, self._gui = placing, look_at, server.gui
         with self._gui.add_folder("Where it is") as where:
-            # Hides the little arrows in what follows: three numbers with four digits do not fit beside them.
+            # Hides the arrows of the fields below: three numbers with four digits do not fit next to them.
             self._gui.add_html(render("tight"))
             self._build_points()
             self._build_orientation()
@@ -95,8 +90,8 @@ class CameraNumbers:
         """A field of one to three numbers.
 
         Args:
-            read: those of a camera.
-            write: the same camera with others; raises ValueError with a sentence.
+            read: the numbers of a camera.
+            write: the camera with other numbers; raises ValueError with a sentence.
         """
 
         def each(number: float) -> Any:
@@ -106,7 +101,7 @@ class CameraNumbers:
             numbers = (typed,) if count == 1 else typed
 
             def change(now: CameraSettings, frame: Frame) -> CameraSettings:
-                # Of whole numbers the field cuts none.
+                # A field of whole numbers rounds nothing.
                 return write(now, kept_where_equal(read(now), numbers, digits or 9), frame)
 
             self._placing.change(label, change)
@@ -117,7 +112,7 @@ class CameraNumbers:
 
         add: Any = (self._gui.add_number, self._gui.add_vector2, self._gui.add_vector3)[count - 1]
         handle = add(label, each(max(low, 0.0)), min=each(low), max=each(high), step=step, hint=hint)
-        # Digits that are shown and can be typed; viser takes them from the step.
+        # Digits that are shown and can be typed; viser would take them from the step.
         handle.precision = digits
         return Control(handle, send, shown=shown, settle=TYPED)
 
@@ -253,7 +248,7 @@ class CameraNumbers:
         )
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Show this camera's; None hides all."""
+        """Show this camera's numbers; None hides the fields."""
         for folder in self._folders:
             folder.visible = camera is not None
         if camera is None or camera.now is None:
@@ -268,7 +263,7 @@ class CameraNumbers:
             left = ", ".join(f"{n:.{UNIT}f}" for n in rounded(axes_of(now.quaternion)[1], UNIT))
             self._left.content = render("note", text=f"Left: {left}")
         if now.shader_pack not in self._shader.handle.options:
-            # A task may bring a shader pack of its own.
+            # A task may have a shader pack of its own.
             self._shader.handle.options = (*SHADERS, now.shader_pack)
         for control, shown in (
             *((each, True) for each in (self._position, self._target)),
@@ -290,7 +285,7 @@ class CameraNumbers:
         return moved
 
 
-# --- what is typed, put into a camera ----------------------------------------------------------------
+# --- typed numbers to settings of a camera -----------------------------------------------------------
 
 
 def _fov(settings: CameraSettings) -> float:
@@ -322,7 +317,7 @@ def _with_size(settings: CameraSettings, typed: Numbers, frame: Frame) -> Camera
     sized = replace(settings, width=width, height=height)
     if settings.intrinsic is None:
         return sized
-    # In pixels of the other size, so that it shows the same.
+    # In pixels of the new size, so that the picture stays the same.
     k = scaled_intrinsic(settings.intrinsic, (settings.width, settings.height), (width, height))
     return replace(sized, intrinsic=matrix3(k))
 
@@ -334,7 +329,7 @@ def _with_range(settings: CameraSettings, typed: Numbers, frame: Frame) -> Camer
 
 
 def _angles(settings: CameraSettings) -> list[float]:
-    # Half a turn is the same both ways round; it would flicker between the two.
+    # 180 and -180 degrees are the same; the field would flicker between the two.
     return [180.0 if round(a, DEGREES) == -180 else a for a in rpy_of(settings.quaternion)]
 
 

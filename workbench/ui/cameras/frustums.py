@@ -1,8 +1,4 @@
-"""The selected env's cameras in the 3-D view, each a frustum with its live picture on it.
-
-Which one is pressed is told from the ray of the press, not by viser's own clicks on a node: a node that can be clicked
-takes every press at its place for itself, also those on the handles of the chosen camera that are drawn over it.
-"""
+"""The selected env's cameras in the 3-D view, each a frustum with its live picture."""
 
 from __future__ import annotations
 
@@ -26,25 +22,25 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
 LARGEST_IMAGE = 128
 """Pixels along the longer side of the picture on a frustum."""
 SMALL, LARGE = 0.07, 0.14
-"""Depth of a frustum, metres: small beside one env, larger where the whole grid is looked at."""
+"""Depth of a frustum, metres: small for one env, larger for a view of the whole grid."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
 THIN, THICK = 2.0, 4.0
 """Pixels of a frustum's lines; the chosen one's are thick."""
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A camera that is being placed: it is drawn where it was put, which its newest picture may not know yet."""
+class PlacedFrustum:
+    """A camera that is being placed: drawn at its present place, which its newest picture may not have yet."""
 
     pose: NDArray[np.float64]
     """(7,) in the view."""
     settings: CameraSettings
     hidden: bool = False
-    """Somebody looks through it, and would see nothing but its picture."""
+    """A page looks through it, and would see nothing but its picture."""
 
 
 class CameraFrustums:
-    """One frustum for each camera whose picture is at hand; a camera's pose travels with its picture."""
+    """One frustum for each camera with a picture, at the pose that comes with the picture."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -57,16 +53,16 @@ class CameraFrustums:
         pictures: dict[CameraKey, Picture],
         offset: NDArray[np.float32],
         size: float = LARGE,
-        placed: Mapping[CameraKey, Placed] | None = None,
+        placed: Mapping[CameraKey, PlacedFrustum] | None = None,
     ) -> None:
-        """Draw these pictures' cameras and those that are being placed, and take away all others.
+        """Draw the cameras of these pictures and those that are being placed, and remove all others.
 
         Args:
             cameras: The task's cameras.
-            pictures: Those to show; empty shows none.
-            offset: (3,) where the selected env stands in the view.
+            pictures: By camera; empty shows none.
+            offset: (3,) of the selected env in the view.
             size: Depth of a frustum in metres.
-            placed: Those that are being placed; with or without a picture.
+            placed: Cameras that are being placed, with or without a picture.
         """
         placed = placed or {}
         known = {camera.key: camera for camera in cameras}
@@ -85,7 +81,11 @@ class CameraFrustums:
         self.draw((), {}, np.zeros(3, np.float32))
 
     def under_ray(self, origin: NDArray, direction: NDArray) -> CameraKey | None:
-        """The camera whose frustum a ray (3,) in the view meets first; None if it meets none."""
+        """The camera whose frustum a ray (3,) in the view hits first, or None.
+
+        By a ray, not by viser's clicks on nodes: a clickable node takes every press at its place, also those on the
+        gizmo that is drawn over it.
+        """
         met = [
             (distance, key)
             for key, frustum in list(self._drawn.items())
@@ -98,7 +98,7 @@ class CameraFrustums:
         self,
         camera: CameraInfo,
         picture: Picture | None,
-        placed: Placed | None,
+        placed: PlacedFrustum | None,
         offset: NDArray[np.float32],
         size: float,
     ) -> None:
@@ -132,21 +132,21 @@ class CameraFrustums:
             )
         frustum.draw(wxyz, position, size, fov, aspect, thickness)
         if picture is not None and picture is not self._worn.get(camera.key) and picture.rgb is not None:
-            # Assigning encodes and sends it, also when it is the picture that is there already.
+            # Assigning encodes and sends it, even the same picture.
             self._worn[camera.key] = picture
             frustum.handle.image = small_image(picture)
 
 
 def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: NDArray) -> float | None:
-    """How far along a ray (3,) its frustum begins, in lengths of `direction`; None where the ray passes it by."""
+    """Where a ray (3,) enters a frustum, in lengths of `direction`; None where it misses."""
     turn = viser.transforms.SO3(handle.wxyz).inverse()
     start, along = turn @ (np.asarray(origin, float) - handle.position), turn @ np.asarray(direction, float)
-    # viser keeps the volume of what it draws (CameraFrustumVariants.tsx): a pyramid with its tip in the origin.
+    # viser keeps the volume of the pyramid (CameraFrustumVariants.tsx), whose tip is at the origin.
     y = np.tan(handle.fov / 2)
     x = y * handle.aspect
     depth = np.mean(handle.scale) / np.cbrt(x * y / 3)
     sides = np.array([[0, 0, 1], [1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y]])
-    # The inside of each side: `sides @ point <= room`.
+    # A point is inside where `sides @ point <= room`.
     room = np.array([depth, 0, 0, 0, 0]) - sides @ start
     speed = sides @ along
     if (room[speed == 0] < 0).any():
@@ -157,10 +157,9 @@ def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: 
 
 
 def small_image(picture: Picture) -> NDArray[np.uint8] | None:
-    """What a frustum wears: every n-th pixel, since it is drawn some hundred pixels wide at most.
+    """Every n-th pixel of a picture: a frustum is at most some hundred pixels wide.
 
-    A texture of 512 x 512 that changes fifteen times a second is what a browser without a graphics card
-    spends its time on.
+    A texture of 512 x 512 that changes fifteen times a second keeps a browser without a graphics card busy.
     """
     if picture.rgb is None:
         return None
@@ -169,7 +168,7 @@ def small_image(picture: Picture) -> NDArray[np.uint8] | None:
 
 
 def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
-    """wxyz and position of a camera (7,) in the view, in OpenCV's frame (z forward, y down)."""
+    """wxyz and position in the view of a camera's pose (7,), in OpenCV's frame (z forward, y down)."""
     turned = viser.transforms.SO3(pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
     return turned.wxyz, (pose[:3] + offset).astype(np.float64)
 
@@ -179,8 +178,8 @@ def without_the_viewpoint(
 ) -> dict[CameraKey, Picture]:
     """The pictures to draw while one env is alone in the view.
 
-    The view then starts at the task's human camera (see `viewpoint`); its own picture, or that of a
-    sensor at the same place, would fill it.
+    The view then starts at the task's human camera (`viewpoint`); that camera's picture, or that of a sensor at the same
+    place, would fill it.
     """
     eyes = [picture.pose[:3] for (kind, _), picture in seen.items() if kind == "human"]
     return {

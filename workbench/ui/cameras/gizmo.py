@@ -1,17 +1,4 @@
-"""The handles on the chosen camera in the 3-D view: one to move and turn it, or an eye and a target; and the view from
-where it stands.
-
-viser has one gizmo, which always lies along its own axes, and knows no steps. So turning about the world's axes is
-done here: that gizmo lies along the world's axes when it is taken, and what it was turned by since is put on the
-camera. Steps are made here too: the camera jumps in steps while the gizmo follows the hand, and is put where the
-camera is when it is let go.
-
-While somebody holds it, it belongs to them: a pose that the server writes then would pull it out of their hand.
-
-To judge a placement one wants to stand where the camera stands. "Look through it" takes the page that asked there, with
-that field of view; while it looks through, it follows the camera (a number that is typed, an undo), and going back leaves
-it where it was. Each page has its own view, so this is kept by page.
-"""
+"""The gizmos of the chosen camera in the 3-D view, and the page's view through that camera."""
 
 from __future__ import annotations
 
@@ -45,17 +32,17 @@ from workbench.ui.scene.viewpoint import USUAL_ASPECT
 from workbench.ui.widgets.inputs import refusals_told
 
 LEFT_ALONE = 60.0
-"""Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
+"""Seconds without a movement until a gizmo that was never released (its page was closed) is free again."""
 PIXELS = 76.0
 TARGET_PIXELS = 44.0
-"""Of the handles on the screen."""
+"""Sizes of the gizmos on the screen."""
 SIGHT_COLOUR = (34, 139, 230)
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """A camera as it was when a handle was taken: until that is let go, all is one step of undo."""
+    """A camera as it was when a gizmo was taken: until it is released, all is one step of undo."""
 
     key: CameraKey
     settings: CameraSettings
@@ -67,12 +54,17 @@ class _Taken:
 
 
 class CameraGizmo:
-    """There while a camera is chosen.
+    """One gizmo to move and turn the chosen camera, or two for its eye and its target.
+
+    viser's gizmo lies along its own axes and knows no steps. For turning about the world's axes it is laid along them
+    when it is taken, and its rotation since then is applied to the camera. With steps, the camera jumps while the gizmo
+    follows the hand, and the gizmo goes to the camera when it is released. While it is held the server never writes its
+    pose: that would pull it out of the hand.
 
     Args:
-        snap: the steps that are chosen.
+        snap: the chosen steps.
         own_axes: whether it lies along the camera's own axes.
-        look_at: whether there are an eye and a target in its place.
+        look_at: whether to show eye and target.
     """
 
     def __init__(
@@ -85,7 +77,7 @@ class CameraGizmo:
     ) -> None:
         self._placing = placing
         self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
-        # A fixed size on the screen: in a grid of sixteen envs one of 10 cm would be a dot.
+        # A fixed size on the screen: in a grid of sixteen envs 10 cm would be a dot.
         add = partial(server.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
         self._camera = add("/studio/camera", PIXELS)
         self._eye = add("/studio/eye", PIXELS, disable_rotations=True)
@@ -103,7 +95,7 @@ class CameraGizmo:
         return self._start is not None and time.monotonic() - self._held_at < LEFT_ALONE
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Put the handles on this camera; None takes them away."""
+        """Put the gizmos on this camera; None removes them."""
         if self.held:
             if camera is not None:
                 self._draw_line(camera)
@@ -126,14 +118,14 @@ class CameraGizmo:
         _move(self._target, frame.point_to_view(target_of(camera.now)), UNTURNED)
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
-        """From the eye to the target, which otherwise would be any three arrows in the air."""
+        """Draw a line from the eye to the target, which shows what the target's arrows belong to."""
         if camera is None or camera.now is None or not self._look_at():
             self._line.draw()
             return
         ends = camera.now.position, target_of(camera.now)
         self._line.draw(np.stack([self._placing.frame(camera).point_to_view(end) for end in ends])[None])
 
-    # --- what the hand does ----------------------------------------------------------------------------
+    # --- dragging --------------------------------------------------------------------------------------
 
     def _take(self) -> bool:
         camera = self._placing.camera
@@ -146,7 +138,7 @@ class CameraGizmo:
         return True
 
     def _went_on(self, phase: str) -> _Taken | None:
-        """The camera as it was taken, while it is dragged."""
+        """The camera as it was taken, for an update of a drag; else None."""
         self._held_at = time.monotonic()
         if (phase == "start" or self._start is None) and not self._take():
             return None
@@ -170,7 +162,7 @@ class CameraGizmo:
             self._place(start, moved, start.target - pose[:3])
 
     async def _on_point(self, event: viser.TransformControlsEvent) -> None:
-        """The eye or the target is moved."""
+        """Move the eye or the target."""
         moves_eye, start = event.target is self._eye, self._went_on(event.phase)
         if start is None:
             return
@@ -187,7 +179,7 @@ class CameraGizmo:
         self._placing.place(start.key, moved, start, math.inf)
 
     def _let_go(self) -> None:
-        """So that it is put back to where the camera is."""
+        """Release it: the next drawing puts it back on the camera."""
         self._start = None
 
 
@@ -199,9 +191,9 @@ def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats)
 
 
 WIDEST = math.radians(150)
-"""Of the page's own view: what is wider it cannot draw."""
+"""Widest field of view that the page can draw."""
 BORDER_AT = 0.15
-"""Metres in front of the eye: as near as the page draws, or things would hide it."""
+"""Metres in front of the eye: as near as the page draws, or bodies would hide it."""
 BORDER_COLOUR = (245, 159, 0)
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 
@@ -214,10 +206,15 @@ class _Looking:
     up: Floats
     fov: float
     shown: tuple[CameraSettings, bytes] | None = None
-    """The camera, and its place in the view, that the page was last put to."""
+    """Settings and pose in the view that the page was last moved to."""
 
 
 class LookThrough:
+    """Moves a page's viewpoint to the chosen camera, with its field of view, and back. Kept for each page.
+
+    While a page looks through the camera it follows it (typed numbers, undo).
+    """
+
     def __init__(self, server: viser.ViserServer, placing: Placing) -> None:
         self._server, self._placing = server, placing
         self._lock = threading.Lock()
@@ -230,7 +227,7 @@ class LookThrough:
         return bool(self._looking)
 
     def toggle(self, client: viser.ClientHandle | None) -> None:
-        """Go there, or back."""
+        """Look through the chosen camera, or go back."""
         camera = self._placing.camera
         if client is None:
             return
@@ -245,7 +242,7 @@ class LookThrough:
                 self._show(client, camera)
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Follow the camera; go back where it is no longer the chosen one."""
+        """Follow the camera; go back if it is no longer the chosen one."""
         with self._lock:
             clients = self._server.get_clients()
             for number in list(self._looking):
@@ -259,7 +256,7 @@ class LookThrough:
         self._draw_border(camera if self._looking else None)
 
     def _draw_border(self, camera: StudioCamera | None) -> None:
-        """A view is wider than the picture; what is inside of this line is in it."""
+        """Draw the border of the picture, since the page's view is wider."""
         if camera is None or camera.now is None:
             self._border.draw()
             return
@@ -269,10 +266,10 @@ class LookThrough:
     def settings_from(
         self, client: viser.ClientHandle, settings: CameraSettings, frame: Frame
     ) -> CameraSettings:
-        """This camera, where the page looks from.
+        """This camera at the page's viewpoint.
 
         Raises:
-            ValueError: the page says nothing that is a pose.
+            ValueError: the page's viewpoint is no pose.
         """
         return frame.from_view(settings, viewer_pose(client.camera.position, client.camera.wxyz))
 
@@ -286,7 +283,7 @@ class LookThrough:
             return
         looking.shown = shown
         _, left, up = axes_of(pose[3:])
-        # The page's orbit turns about its up: about the camera's own, a drag would tilt a level horizon.
+        # The page orbits about its up axis: with the camera's own, a drag would tilt a level horizon.
         level = abs(left[2]) < 1e-3 and up[2] > 0.05
         eye = client.camera
         aspect = eye.image_width / eye.image_height if eye.image_height and eye.image_width else USUAL_ASPECT
@@ -302,7 +299,7 @@ class LookThrough:
 
 
 def _stand(client: viser.ClientHandle, position: Floats, look_at: Floats, up: Floats, fov: float) -> None:
-    """Let a page look from there."""
+    """Move a page's viewpoint."""
     with client.atomic():
         eye = client.camera
         eye.up_direction, eye.position, eye.look_at, eye.fov = up, position, look_at, fov

@@ -1,10 +1,4 @@
-"""The Cameras tab: what the selected env's cameras see, and which of them are asked for.
-
-A picture costs 50 to 100 ms on a machine without a GPU, so only what is shown is rendered. viser does
-not say which tab a person looks at; the check boxes do: a camera without a tick is not asked of the
-session. A picture that is replaced before the browser has loaded it is never seen at all (measured:
-at 1,000 a second the page shows one in five seconds), hence the limit on how often they are sent.
-"""
+"""The Cameras tab: pictures of the selected env's cameras, and the Studio's picture of the chosen one."""
 
 from __future__ import annotations
 
@@ -27,12 +21,13 @@ from workbench.ui.widgets.parts import Clock, DrawDue
 from workbench.ui.widgets.templates import render
 
 FASTEST = 1 / 15
-"""Seconds between two pictures of one camera."""
+"""Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
+(measured: at 1,000 a second the page shows one in five seconds)."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
 
 
 class CameraImage:
-    """A picture of a camera in a container, from when there is one on."""
+    """A picture of a camera in a container, made with the first picture."""
 
     def __init__(
         self, server: viser.ViserServer, container: viser.GuiFolderHandle, order: float | None = None
@@ -69,20 +64,24 @@ class _Camera:
     images: dict[str, CameraImage]
     depth_span: DepthRange | None = None
     drawn: tuple[Picture, tuple[str, ...]] | None = None
-    """What its images show."""
+    """The picture and the modalities that its images show."""
     stale: bool = False
-    """Whether its pictures are said to be of another moment."""
+    """Whether its pictures are marked as of another moment."""
 
     def wanted(self) -> tuple[str, ...]:
         return tuple(modality for modality, tick in self.ticks.items() if tick.value)
 
 
 class CamerasPanel:
-    """
+    """One folder for each camera, with a check box for each modality.
+
+    A picture costs 50 to 100 ms without a GPU, and viser does not tell which tab is open: so only what is ticked is
+    rendered.
+
     Args:
         ask: Asks for exactly these pictures: a session renders them, a review decodes them.
-        no_camera: What is said where there is none.
-        studio_shows: Which kind of picture of the camera that is being placed is on the page beside its colours.
+        no_camera: The note where there is no camera.
+        studio_shows: The modality that the Studio shows of the camera that is being placed.
     """
 
     def __init__(
@@ -127,13 +126,13 @@ class CamerasPanel:
             picture = seen.pictures.get(key)
             if picture is None or picture.env != seen.env:
                 continue
-            # Kinds come one after the other, and a picture that is sent again is decoded again.
+            # Not again for an equal drawing: the browser would decode the picture again.
             if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != camera.wanted():
                 camera.drawn = (picture, camera.wanted())
                 self._draw_camera(camera, picture, seen)
 
     def shown_pictures(self, seen: Seen) -> dict[tuple[CameraKind, str], Picture]:
-        """The pictures of cameras with a tick, of the selected env: what the view's frustums wear."""
+        """The selected env's pictures of ticked cameras, for the frustums."""
         return {
             key: picture
             for key, picture in seen.pictures.items()
@@ -143,7 +142,7 @@ class CamerasPanel:
         }
 
     def _build(self, seen: Seen) -> None:
-        """One folder a camera. One that is still there keeps it, with its ticks and its place on the page."""
+        """Make one folder for each camera; a camera that is still there keeps its folder and ticks."""
         for key, camera in self._cameras.items():
             for modality, tick in camera.ticks.items():
                 self._remembered[(*key, modality)] = tick.value
@@ -210,14 +209,14 @@ class CamerasPanel:
                 camera.images[modality].show(tick.value)
 
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: Seen) -> tuple[str, ...]:
-        """Those with a tick; and of a camera that is placed what the Studio shows of it, in its own size."""
+        """The ticked modalities; for a camera that is being placed also what the Studio shows, in full size."""
         wanted = camera.wanted()
         if seen.quick or key != seen.placed:
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 
     def _mark_stale(self, seen: Seen) -> None:
-        """Say of pictures that are on the page, and are not of the moment that is, that they are not."""
+        """Mark shown pictures that are not of the present moment."""
         for key, camera in self._cameras.items():
             picture = seen.pictures.get(key)
             here = picture is not None and picture.env == seen.env
@@ -242,11 +241,9 @@ class CamerasPanel:
 
 
 class StudioPicture:
-    """The chosen camera's picture in the present container, above the controls that move it; what lies over it goes into
-    `folder`.
+    """The chosen camera's picture in the present container, in any modality; overlays go into `folder`.
 
-    A camera is placed for what comes out of it, and that is often depth or segmentation: a far plane that is too near, or
-    a gripper that hides the cube, is seen there first. So the picture that follows the hand is any of its kinds.
+    Depth and segmentation too: a far plane that is too near, or a gripper that hides the cube, is seen there first.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
@@ -256,7 +253,7 @@ class StudioPicture:
         self._span: DepthRange | None = None
         self._wanted = COLOUR
         self.kinds: tuple[str, ...] = (COLOUR,)
-        """That the chosen camera gives; `rgb` first."""
+        """Modalities of the chosen camera, `rgb` first."""
         self.folder = server.gui.add_folder(None)
         with self.folder:
             server.gui.add_html(render("studio_picture"))
@@ -265,7 +262,7 @@ class StudioPicture:
 
     @property
     def shows(self) -> str:
-        """Which kind of picture is to be made of the chosen camera."""
+        """The modality to render of the chosen camera."""
         return self._wanted if self._wanted in self.kinds else COLOUR
 
     def show_kind(self, kind: str) -> None:
@@ -285,7 +282,7 @@ class StudioPicture:
         if quick:
             picture = studio.quick
             self._session.studio.look()
-        # The last one stays while the next is drawn; that of another camera does not.
+        # The last picture stays until the next comes; another camera's does not.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)
         kind = self.shows
@@ -304,7 +301,7 @@ class StudioPicture:
 
 
 def modalities_of(info: CameraInfo) -> tuple[str, ...]:
-    """Those that can be shown, in the page's order."""
+    """The modalities that can be shown, in the page's order."""
     return tuple(modality for modality in MODALITIES if modality in info.modalities)
 
 

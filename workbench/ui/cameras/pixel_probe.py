@@ -1,12 +1,4 @@
-"""Press on the chosen camera's picture, and be told what is there, how far it is, and where.
-
-The question behind "is the cube in the picture" is often "what is this pixel": the depth that a policy gets of it, and
-the name that its segmentation id stands for. The answer has the point in the env's own frame, where it is also marked
-in the 3-D view, so that one sees whether the camera looks at what one thinks.
-
-viser's pictures do not say where they are pressed. So a pane of our own HTML lies over the picture that stands before
-it in its container (``.wb-pane`` in page.css), as wide and as tall, and passes on where it was pressed.
-"""
+"""A press on the chosen camera's picture shows the body, the depth and the point there."""
 
 from __future__ import annotations
 
@@ -27,18 +19,19 @@ MARK_SIZE = 0.05
 
 
 class CameraPick:
-    """The pane over the picture before it, what was found, and the mark in the view.
+    """An overlay on the picture, the result, and a mark at the point in the 3-D view.
 
-    Make it in the container of the picture, which must be the last before it.
+    viser's pictures do not tell where they are pressed, so a pane of our own HTML lies over the picture (``.wb-pane`` in
+    page.css). Make it in the container of the picture, directly after it.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, presses: Presses) -> None:
         """
         Args:
-            presses: of the tab or of a folder with a name around it (what has no name hides what comes after it).
+            presses: of the tab or of a folder with a label; without a label it hides what comes after it.
         """
         self._drawn: object = None
-        # After a picture that is put into the container later.
+        # After a picture that is added to the container later.
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
         self._press = presses.place_id("picture", session.studio.judging.pick)
@@ -46,10 +39,10 @@ class CameraPick:
         self._label = view_label(server, "/picked/label", "bottom-left")
 
     def draw(self, view: SessionView, shown: bool) -> None:
-        """Draw what is new.
+        """Draw pane and result, where they changed.
 
         Args:
-            shown: whether the picture of the chosen camera is.
+            shown: whether the chosen camera's picture is visible.
         """
         camera, picked = view.studio.chosen, picked_here(view)
         for handle, wanted in (
@@ -66,10 +59,10 @@ class CameraPick:
             self._found.content = render("camera_found", picked=picked)
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
-        """Mark the point that was picked by a cross and the body's name.
+        """Mark the picked point by a cross and the body's name.
 
         Args:
-            offset: (3,) where the selected env stands in the view.
+            offset: (3,) of the selected env in the view.
         """
         picked = picked_here(view)
         if picked is None or picked.point is None:
@@ -83,7 +76,7 @@ class CameraPick:
 
 
 def picked_here(view: SessionView) -> Picked | None:
-    """What was picked, if it is of the camera and the env that are selected."""
+    """The pick, if it is of the selected camera and env."""
     picked = view.studio.looked.picked
     if picked is None or picked.key != view.studio.selected or picked.env != view.selected_env:
         return None

@@ -1,15 +1,4 @@
-"""What a hand's movement makes of a camera's settings, and the one way from any control of the page to a camera's new
-place.
-
-A camera is moved in the view, where an env stands at its offset in the grid and a mounted camera goes with its link;
-it is written in the frame of its mount. `Frame` is the way between the two. All else here takes a pose in one of
-them and gives another: a turn about the world's axes, snapping, a step with a key, "here is the eye, there the
-target". So the gizmo, the keys and the number fields cannot disagree about what a movement means.
-
-All that moves a camera (a gizmo, keys, typing, where the viewer looks) ends in `Placing`, since all need the same three
-things: the camera that is chosen (and a sentence if none is, or if it cannot be placed), the frame in which its numbers
-are said, and which calls are one movement, so that one undo takes back one movement and not a fiftieth of it.
-"""
+"""Movements of a camera as pure functions, and `Placing`, which applies them to the chosen camera."""
 
 from __future__ import annotations
 
@@ -44,12 +33,12 @@ from workbench.session.live.session import Session
 Floats = NDArray[np.float64]
 
 SAME = 1e-7
-"""Metres, and parts of a unit quaternion: what viser's numbers of 32 bit may differ by."""
+"""Metres, and parts of a unit quaternion: rounding of viser's 32 bit numbers."""
 
 
 @dataclass(frozen=True)
 class Snap:
-    """Steps of a gizmo; 0 for none."""
+    """Steps of a gizmo; 0 for continuous."""
 
     metres: float = 0.0
     degrees: float = 0.0
@@ -57,15 +46,15 @@ class Snap:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where the numbers of a camera's config are said, as seen in the 3-D view."""
+    """The frame of a camera's numbers (its mount's, or the env's), as seen in the 3-D view."""
 
     mount: NDArray[np.float32] | None
-    """(7,) of the link that it rides on, in the env's frame; None for one that stands still."""
+    """(7,) of its link, in the env's frame; None for a camera that is not mounted."""
     offset: NDArray[np.float32]
-    """(3,) where its env stands in the view."""
+    """(3,) of its env in the view."""
 
     def to_view(self, settings: CameraSettings) -> Floats:
-        """(7,) where the camera is in the view."""
+        """(7,) pose of the camera in the view."""
         pose = pose_in_env(settings, self.mount)
         pose[:3] += self.offset
         return pose
@@ -73,11 +62,11 @@ class Frame:
     def from_view(
         self, settings: CameraSettings, pose: ArrayLike, distance: float | None = None
     ) -> CameraSettings:
-        """The same camera, at this pose (7,) of the view; looking as far as it did, or `distance` metres."""
+        """The camera at this pose (7,) of the view, with its distance to the target, or `distance` metres."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
         moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
-        # There and back costs last digits: what was not moved is not said anew.
+        # The way to the view and back rounds: numbers that were not moved keep their exact values.
         if np.allclose(moved.position, settings.position, rtol=0, atol=SAME):
             moved = replace(moved, position=settings.position)
         if np.allclose(moved.quaternion, settings.quaternion, rtol=0, atol=SAME):
@@ -85,16 +74,16 @@ class Frame:
         return moved if distance is None else replace(moved, distance=max(distance, 1e-3))
 
     def turned_to(self, settings: CameraSettings, target: ArrayLike) -> CameraSettings:
-        """The same camera, turned to a target (3,) that is said as its position is.
+        """The camera, turned to a target (3,) in the frame of its position.
 
         Raises:
-            ValueError: that is where it stands.
+            ValueError: the target is its position.
         """
         pose, there = self.to_view(settings), self.point_to_view(target)
         return self.from_view(settings, looking_at(pose, pose[:3], there), math.dist(there, pose[:3]))
 
     def point_to_view(self, point: ArrayLike) -> Floats:
-        """(3,) of a point (3,) that is said as the camera's position is."""
+        """(3,) in the view of a point (3,) in the frame of the camera's position."""
         there = np.asarray(point, np.float64)
         if self.mount is not None:
             there = compose(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]
@@ -102,7 +91,7 @@ class Frame:
 
 
 def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
-    """(7,) the camera at `eye` that looks at `target`, turned about its line of sight as `pose` is.
+    """(7,) pose at `eye` that looks at `target`, with the roll of `pose`.
 
     Raises:
         ValueError: eye and target are one point.
@@ -111,7 +100,7 @@ def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
 
 
 def turned_in_world(start: ArrayLike, position: ArrayLike, turn: ArrayLike) -> Floats:
-    """(7,) the pose `start`, turned by the quaternion `turn` about the axes of the world, at another position."""
+    """(7,) `start` turned by the quaternion `turn` about the world's axes, at another position."""
     s = np.asarray(start, np.float64)
     turned = rotation_matrix(turn) @ rotation_matrix(s[3:])
     return make_pose(position, quaternion_of(turned))
@@ -120,8 +109,8 @@ def turned_in_world(start: ArrayLike, position: ArrayLike, turn: ArrayLike) -> F
 def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origin: ArrayLike) -> Floats:
     """(7,) the pose that a gizmo was dragged to, in whole steps.
 
-    Along the world's axes the position falls on a grid, so that round numbers are written; along the camera's own it
-    goes in steps from where the drag began. It turns in steps from how it stood.
+    Along the world's axes the position snaps to a grid, so that round numbers are written; along the camera's own axes it
+    moves in steps from the start of the drag. It turns in steps from the start.
 
     Args:
         origin: (3,) of the grid.
@@ -132,7 +121,7 @@ def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origi
     if snap.metres and own_axes:
         p[:3] = s[:3] + was @ (np.round(was.T @ moved / snap.metres) * snap.metres)
     elif snap.metres:
-        # An axis that is not dragged along stays as it is, also off the grid.
+        # A coordinate that was not dragged stays as it is, also off the grid.
         grid = np.asarray(origin, np.float64)
         on_grid = np.round((p[:3] - grid) / snap.metres) * snap.metres + grid
         p[:3] = np.where(np.abs(moved) > 1e-6, on_grid, p[:3])
@@ -149,26 +138,26 @@ def nudged(pose: ArrayLike, step: Sequence[float]) -> Floats:
 
 
 def panned(pose: ArrayLike, left: float, up: float) -> Floats:
-    """(7,) turned in place: to the left about the vertical, and up, both in degrees."""
+    """(7,) turned in place, in degrees: to the left about the vertical, and up."""
     p = np.asarray(pose, np.float64)
     about_z, about_left = SO3.from_z_radians(math.radians(left)), SO3.from_y_radians(-math.radians(up))
     return make_pose(p[:3], quaternion_of((about_z @ SO3(p[3:]) @ about_left).as_matrix()))
 
 
 def viewer_pose(position: ArrayLike, wxyz: ArrayLike) -> Floats:
-    """(7,) of viser's own camera, which says its rotation in OpenCV's frame."""
+    """(7,) of a page's viewpoint, whose rotation is in OpenCV's frame."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_matrix(wxyz), np.asarray(position, np.float64)
     return pose_from_matrix(matrix, "opencv", "camera_to_world")
 
 
 def fov_that_shows_all(fov: float, aspect: float, view_aspect: float) -> float:
-    """Vertical field of view of a view of another shape (width over height) in which the whole picture fits."""
+    """Vertical field of view, in a view of another aspect (width over height), that holds the whole picture."""
     return 2 * math.atan(math.tan(fov / 2) * max(1.0, aspect / view_aspect))
 
 
 def picture_corners(settings: CameraSettings, pose: ArrayLike, depth: float) -> Floats:
-    """(4, 3) where the borders of the picture meet, `depth` metres in front of a camera at this pose (7,)."""
+    """(4, 3) corners of the picture, `depth` metres in front of a camera at this pose (7,)."""
     k, p = intrinsic_of(settings), np.asarray(pose, np.float64)
     forward, left, up = axes_of(p[3:])
     w, h = settings.width, settings.height
@@ -180,9 +169,9 @@ def picture_corners(settings: CameraSettings, pose: ArrayLike, depth: float) -> 
 def kept_where_equal(
     exact: Sequence[float] | Floats, typed: Sequence[float], digits: int
 ) -> tuple[float, ...]:
-    """The typed numbers, but the exact one where the field shows just that one rounded.
+    """The typed numbers, but the exact number where the typed one equals it rounded.
 
-    A field of three sends all three: without this, typing x would cut y and z to the digits on the page.
+    A field of three sends all three: without this, typing x would round y and z to the shown digits.
     """
     return tuple(
         float(e) if round(float(e), digits) == round(float(t), digits) else float(t)
@@ -191,12 +180,12 @@ def kept_where_equal(
 
 
 def rounded(numbers: ArrayLike, digits: int) -> tuple[float, ...]:
-    """For a field; without the minus of a zero."""
+    """Numbers for a field, without negative zeros."""
     return tuple(round(float(n), digits) + 0.0 for n in np.asarray(numbers, np.float64))
 
 
 def _in_steps(rotation: Floats, step: float) -> Floats:
-    """(3, 3) about the same axis, by a whole number of steps."""
+    """(3, 3) rotation about the same axis by a whole number of steps."""
     turn = SO3(quaternion_of(rotation)).log()
     angle = float(np.linalg.norm(turn))
     whole = round(angle / step) * step
@@ -204,24 +193,28 @@ def _in_steps(rotation: Floats, step: float) -> Floats:
 
 
 PAUSE = 1.2
-"""Seconds. What one hand does after a shorter pause belongs to the same step of undo."""
+"""Seconds. Movements by the same control with shorter pauses are one step of undo."""
 FARTHEST = 1000.0
-"""Metres from the origin that a page may ask for."""
+"""Most metres from the origin."""
 
 
 class Placing:
+    """Places the chosen camera. Gizmo, keys, number fields and "put it where I look" all end here: it checks that a camera
+    can be placed, knows the frame of its numbers, and makes one movement one step of undo.
+    """
+
     def __init__(self, session: Session) -> None:
         self._session = session
         self.offset: NDArray[np.float32] = np.zeros(3, np.float32)
-        """Where the selected env stands in the view."""
+        """Offset of the selected env in the view."""
 
     @property
     def camera(self) -> StudioCamera | None:
-        """The chosen one, if it can be placed."""
+        """The chosen camera, if it can be placed."""
         return self._session.view().studio.placeable
 
     def require(self) -> tuple[StudioCamera, CameraSettings, Frame]:
-        """The camera to place, as it is now.
+        """The camera to place, its present settings and their frame.
 
         Raises:
             ValueError: there is none.
@@ -245,10 +238,10 @@ class Placing:
         self._session.studio.place(key, settings, hand, pause)
 
     def change(self, hand: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
-        """Place the chosen camera as `change` makes of it; `hand` as in `place`.
+        """Apply `change` to the chosen camera; `hand` as in `place`.
 
         Raises:
-            ValueError: no camera can be placed, or not so.
+            ValueError: no camera is chosen, or it cannot be placed so.
         """
         camera, now, frame = self.require()
         self.place(camera.key, change(now, frame), hand)

@@ -1,10 +1,4 @@
-"""Judge a camera: over the envs as they stand, the steps of an episode, or fresh resets; and the pictures of all envs.
-
-The table says of each object in how many envs it is seen, how large, and what is in its way; the bars say how far
-away is what the camera sees, with planes that would fit it. The sheet has the selected camera's picture of every env,
-worst first once it was judged; pressing one selects that env. Over steps each object has a strip besides, of when it
-is seen; pressing a step of it shows that moment.
-"""
+"""The Studio's report on a camera: what it sees over envs, steps or fresh resets, and a sheet of all envs' pictures."""
 
 from __future__ import annotations
 
@@ -29,12 +23,12 @@ from workbench.ui.widgets.templates import counted, render
 AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"
 OVERS = (AS_THEY_ARE, STEPS, FRESH)
 MOST_PICTURES = 64
-"""On the sheet: the worst of them."""
+"""Pictures on the sheet, worst first."""
 THUMBNAIL = 128
 """Pixels along the longer side of a picture on the sheet."""
 
 
-class CameraVerdict:
+class CameraReportPanel:
     """The folder in the present container."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
@@ -74,7 +68,7 @@ class CameraVerdict:
         self._judge.on_click(lambda _: self._ask())
         self._sheet.on_click(lambda _: self._ask_for_sheet())
 
-    # --- asked ---------------------------------------------------------------------------------------
+    # --- requests ------------------------------------------------------------------------------------
 
     def _ask(self) -> None:
         self._report.asked(self._session.view().studio.looked.report)
@@ -103,7 +97,7 @@ class CameraVerdict:
         if near is not None and far is not None and near < far:
             self._session.studio.place(camera.key, replace(camera.now, near=near, far=far))
 
-    # --- drawn ---------------------------------------------------------------------------------------
+    # --- drawing -------------------------------------------------------------------------------------
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio
@@ -125,7 +119,7 @@ class CameraVerdict:
         self._report.draw(studio.progress, report, told, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
-        """The table, the bars and the planes that would fit; `new`: it is to come into sight."""
+        """The table of objects, the depth histogram and fitting planes; `new`: scroll it into view."""
         looked, depth, lens = studio.looked, report.depth, camera.now or camera.info
         moments = [
             {
@@ -221,32 +215,32 @@ class CameraVerdict:
             self._session.change(selected_env=env)
 
 
-# --- a report in words, rows and bars: plain functions of plain data ---------------------------------
+# --- a report as text, rows and bars: pure functions -------------------------------------------------
 
-# What a person asks first is whether anything is wrong, so the worst is said first: an object that some env's picture
-# lacks comes before one that is only cut, and an env is called by what is worst in it.
+# Worst first: an object that some env's picture lacks comes before one that is only cut, and an env is described by its
+# worst object.
 
 MOSTLY_HIDDEN = 0.1
-"""Share of an object behind the robot from which on it is said of an env."""
+"""Least hidden share of an object that is reported."""
 SMALL = 30.0
-"""Pixels below which an object is called small."""
+"""Pixels below which an object counts as small."""
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Bars of equal width over depth, which is logarithmic; metres at both ends."""
+    """Bars of equal width over logarithmic depth; metres at both ends."""
 
     bars: tuple[tuple[float, bool], ...]
-    """Height in 0..1 (of the highest), and whether it lies behind everything that counts."""
+    """Height in 0..1 of the highest, and whether the bar lies behind every object."""
     low: float
     high: float
     near: float | None
-    """Where the near plane is, in bars from the left; None if it is out of the picture."""
+    """Position of the near plane, in bars from the left; None if it is outside."""
     far: float | None
 
 
 def percent(share: float) -> str:
-    """A share as a whole number of percent, where only none is 0 and only all is 100."""
+    """A share in whole percent; only exactly none is 0 % and only exactly all is 100 %."""
     if math.isnan(share):
         return "–"
     whole = round(100 * share)
@@ -263,7 +257,7 @@ def metres(value: float) -> str:
 
 
 def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]]:
-    """Objects to be seen, the least seen first; then what the task hides. Scenery is left out.
+    """The objects to see, least seen first; then those that the task hides. Without scenery.
 
     ``bad``: which of ``seen cut hidden`` an author should look at. ``moods``: how it is seen in each picture, ``good``,
     ``warn`` (cut, or much hidden), ``bad`` (not seen), ``none`` (absent).
@@ -307,7 +301,7 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
 
 
 def headline(report: CameraReport, unit: str = "envs") -> str:
-    """One sentence: is all well; `unit` as in `object_rows`."""
+    """The worst finding in one sentence; `unit` as in `object_rows`."""
     wanted = [thing for thing in report.wanted_objects() if thing.present.any()]
     if not wanted:
         return f"There is no object to be seen in these {unit}."
@@ -323,7 +317,7 @@ def headline(report: CameraReport, unit: str = "envs") -> str:
 
 
 def env_words(report: CameraReport, position: int) -> str:
-    """What is worst in one env of the report, in a few words; empty where nothing is to be seen.
+    """The worst finding in one env, in a few words; empty where there is no object to see.
 
     Args:
         position: in `CameraReport.envs`.
@@ -347,7 +341,7 @@ def env_words(report: CameraReport, position: int) -> str:
 
 
 def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
-    """The depths of all envs' pictures together; None where all of them are background.
+    """The depths of all envs' pictures; None where all is background.
 
     Args:
         near, far: the camera's planes, metres.

@@ -1,13 +1,4 @@
-"""The Studio tab: one camera is chosen, placed, and written into the file.
-
-Only one camera at a time has handles and numbers: with all of them the view would be full of arrows and nobody could
-tell whose numbers they read. It is chosen here or by a press on its frustum. Its picture stands above the controls,
-since it is what every movement is judged by; what one does all the time (look through it, undo) is under it, then
-where it is; the lens, which is set once, is folded.
-
-This module is the tab and who is told of what. What a movement means, and the one way to the session, is in
-`camera_moves`; `camera_gizmo`, `camera_numbers` and `camera_writing` are the parts.
-"""
+"""The Studio tab: choose one camera, place it, and write it into the file."""
 
 from __future__ import annotations
 
@@ -31,14 +22,14 @@ from workbench.session.live.view import SessionView
 from workbench.ui.cameras.compare import CameraCompare
 from workbench.ui.cameras.export import CameraExport
 from workbench.ui.cameras.fields import CameraNumbers
-from workbench.ui.cameras.frustums import Placed
+from workbench.ui.cameras.frustums import PlacedFrustum
 from workbench.ui.cameras.gizmo import CameraGizmo, LookThrough
 from workbench.ui.cameras.panel import KIND_NAMES, StudioPicture
 from workbench.ui.cameras.pixel_probe import CameraPick
 from workbench.ui.cameras.pose_math import Floats, Frame, Placing, Snap, nudged, panned
-from workbench.ui.cameras.report import CameraVerdict
+from workbench.ui.cameras.report import CameraReportPanel
 from workbench.ui.cameras.suggest import CameraSuggest
-from workbench.ui.cameras.write_to_file import CameraWriting
+from workbench.ui.cameras.write_to_file import WriteToFile
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.hotkeys import Command
 from workbench.ui.widgets.inputs import Control, refusals_told
@@ -76,6 +67,12 @@ class Toggle:
 
 
 class StudioPanel(PagePart[SessionView]):
+    """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by a press on its frustum.
+
+    From the top: the picture, by which every movement is checked; what is used all the time (look through it, undo);
+    the pose; the lens, folded.
+    """
+
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
         self._placing = Placing(session)
@@ -83,7 +80,7 @@ class StudioPanel(PagePart[SessionView]):
         self._names: dict[str, CameraKey | None] = {NOBODY: None}
         self._in_its_eye = False
         self._is_empty = False
-        """All below the choice is hidden, since no camera is chosen."""
+        """No camera is chosen, and everything below the choice is hidden."""
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NOBODY,)
@@ -101,8 +98,8 @@ class StudioPanel(PagePart[SessionView]):
         above = gui.add_folder(None)
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
-        self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer, above)
-        verdict, compare = CameraVerdict(server, session), CameraCompare(server, session)
+        self._writing = WriteToFile(server, session, self._placing, self._new_from_viewer, above)
+        verdict, compare = CameraReportPanel(server, session), CameraCompare(server, session)
         self._suggest = CameraSuggest(server, session)
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
@@ -118,10 +115,10 @@ class StudioPanel(PagePart[SessionView]):
 
     @property
     def shows(self) -> str:
-        """Which kind of picture is to be made of the chosen camera."""
+        """The modality to render of the chosen camera."""
         return self._picture.shows
 
-    # --- chosen ------------------------------------------------------------------------------------------
+    # --- choice ------------------------------------------------------------------------------------------
 
     def select(self, key: CameraKey | None) -> None:
         self._session.studio.select(key)
@@ -131,13 +128,13 @@ class StudioPanel(PagePart[SessionView]):
 
     # --- in the view -------------------------------------------------------------------------------------
 
-    def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, Placed]:
-        """Put the handles where the chosen camera is; return where its frustum is to be drawn.
+    def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, PlacedFrustum]:
+        """Put the gizmos on the chosen camera; return the place of its frustum.
 
-        That is where it was placed and not where its newest picture was taken, or it would lag behind the hand.
+        That is its present place, not that of its newest picture, which would lag behind the hand.
 
         Args:
-            offset: (3,) where the selected env stands in the view.
+            offset: (3,) of the selected env in the view.
         """
         self._placing.offset = offset
         self._suggest.draw_in_view(view, offset)
@@ -151,10 +148,10 @@ class StudioPanel(PagePart[SessionView]):
         self._gizmo.draw(None if covered else camera)
         if chosen is None or eye is None:
             return {}
-        return {chosen.key: Placed(eye, _placed(chosen), hidden=covered)}
+        return {chosen.key: PlacedFrustum(eye, _placed(chosen), hidden=covered)}
 
     def _is_in_eye(self, pose: Floats) -> bool:
-        """Whether a page looks from where the camera stands: its frustum, with its picture, would fill that view."""
+        """Whether a page's viewpoint is at the camera: its frustum, with its picture, would fill that view."""
         near = (
             float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
         )
@@ -177,7 +174,7 @@ class StudioPanel(PagePart[SessionView]):
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
         for part in self._folders:
-            # Folders without a subject would be dead controls.
+            # Without a camera their controls would do nothing.
             part.folder.visible = chosen is not None
             part.draw(view)
         if chosen is not None:
@@ -269,18 +266,18 @@ class StudioPanel(PagePart[SessionView]):
         return render("studio_tools", rows=rows)
 
     def _handles_of(self, scale: float) -> str:
-        """What is dragged in the view, along which axes, in which steps; and how large the picture above is."""
-
-        def keep(name: str) -> Callable[[Any], None]:
-            return partial(setattr, self, name)
-
+        """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size)."""
         kinds = {KINDS.get(kind, kind): kind for kind in self._picture.kinds}
         toggles = (
             Toggle(
-                "Place", PLACE, {"move, turn": False, "eye and target": True}, self._look_at, keep("_look_at")
+                "Place",
+                PLACE,
+                {"move, turn": False, "eye and target": True},
+                self._look_at,
+                self._set_look_at,
             ),
-            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, keep("_own_axes")),
-            Toggle("Steps", STEPS, SNAPS, self._snap, keep("_snap")),
+            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, self._set_own_axes),
+            Toggle("Steps", STEPS, SNAPS, self._snap, self._set_snap),
             Toggle(
                 "Shows", "What the picture above is of.", kinds, self._picture.shows, self._picture.show_kind
             ),
@@ -305,6 +302,15 @@ class StudioPanel(PagePart[SessionView]):
         ]
         return render("studio_tools", rows=rows)
 
+    def _set_look_at(self, on: bool) -> None:
+        self._look_at = on
+
+    def _set_own_axes(self, on: bool) -> None:
+        self._own_axes = on
+
+    def _set_snap(self, snap: Snap) -> None:
+        self._snap = snap
+
     def _tool(
         self,
         name: str,
@@ -317,7 +323,7 @@ class StudioPanel(PagePart[SessionView]):
         press = self._presses.id_of(key, pressed)
         return {"name": name, "hint": hint, "on": on, "press": "" if off else press}
 
-    # --- what is pressed ---------------------------------------------------------------------------------
+    # --- presses -----------------------------------------------------------------------------------------
 
     def _back_to_file(self) -> None:
         key = self._session.view().studio.selected
@@ -334,7 +340,7 @@ class StudioPanel(PagePart[SessionView]):
         return self._look.settings_from(client, settings, Frame(None, self._placing.offset))
 
     def commands(self) -> list[Command]:
-        """Of the page's keys. The arrows alone are the timeline's."""
+        """Commands with keys. The arrow keys alone belong to the timeline."""
         return [
             Command("Take back the last change of a camera", self._session.studio.undo, "Z", "cmd/ctrl"),
             Command("Make it again", self._session.studio.redo, "Z", "cmd/ctrl+shift"),

@@ -1,8 +1,4 @@
-"""Suggest placements: what must be seen, where the eye may be, and the best five with their pictures.
-
-The bounds are two corners of a box in the env's frame, or in that of the body that the camera rides on, and begin as a
-box round the eye. They follow the camera until somebody writes into them. The box is drawn in the view on demand.
-"""
+"""Suggests placements of a camera: objects to see, bounds of the eye, and the best results with pictures."""
 
 from __future__ import annotations
 
@@ -28,11 +24,11 @@ from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1
-"""Metres from the eye to each side of the box that is first offered; less on a body, which has to carry it."""
+"""Metres from the eye to each side of the first box; less for a camera on a body, which has to carry it."""
 MOST_LINKS = 12
-"""An articulation with more offers none of them alone: a list that nobody reads."""
+"""An articulation with more links offers none of them alone."""
 OF_THE_ROBOT = 4
-"""Links of a robot that are offered at once, its hand's; the others on demand."""
+"""Links of a robot that are offered at first, its hand's; the others on demand."""
 MOST_RESETS = 256
 LARGEST = 160
 BOX_COLOUR = (230, 73, 128)
@@ -41,24 +37,28 @@ Corner = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Something that may be asked to be seen."""
+class VisibleObject:
+    """An object or link that a suggestion can be asked to see."""
 
     name: str
     label: str
     first: bool
-    """Chosen before somebody chooses."""
+    """Chosen by default."""
     robot: str = ""
-    """Of which it is a link; empty for the task's own objects."""
+    """The robot that it is a link of; empty for the task's objects."""
 
 
 class CameraSuggest:
-    """The folder in the present container, and the box in the view."""
+    """The folder in the present container, and the box of the bounds in the 3-D view.
+
+    The bounds are two corners of a box in the env's frame, or in that of the body that carries the camera. They are a
+    box around the eye that follows the camera until a person writes into them.
+    """
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._chosen: set[str] | None = None
-        self._choices: tuple[Choice, ...] = ()
+        self._choices: tuple[VisibleObject, ...] = ()
         self._all_links = False
         self._of: CameraKey | None = None
         self._touched = False
@@ -99,7 +99,7 @@ class CameraSuggest:
             corner.on_update(self._on_touch)
         self._box = line_set(server, "/bounds of the eye", BOX_COLOUR, 2.0)
 
-    # --- asked ---------------------------------------------------------------------------------------
+    # --- requests ------------------------------------------------------------------------------------
 
     def _on_touch(self, event: viser.GuiEvent) -> None:
         if event.client is not None:
@@ -128,7 +128,7 @@ class CameraSuggest:
             self._offers.asked(self._session.view().studio.looked.suggestions)
             self._session.studio.judging.suggest(wanted, *self._bounds(), self._resets.value)
 
-    # --- drawn ---------------------------------------------------------------------------------------
+    # --- drawing -------------------------------------------------------------------------------------
 
     def draw(self, view: SessionView) -> None:
         studio, camera = view.studio, view.studio.chosen
@@ -178,7 +178,7 @@ class CameraSuggest:
             more=self._presses.id_of("links", lambda _: self._toggle_links()),
         )
 
-    def _pill(self, choice: Choice, chosen: frozenset[str]) -> dict[str, object]:
+    def _pill(self, choice: VisibleObject, chosen: frozenset[str]) -> dict[str, object]:
         name = choice.name
         press = self._presses.id_of(("object", name), lambda _: self._toggle(name))
         return {"name": choice.label, "title": name, "on": name in chosen, "press": press}
@@ -208,7 +208,7 @@ class CameraSuggest:
         """Draw the box of the bounds.
 
         Args:
-            offset: (3,) where the selected env stands in the view.
+            offset: (3,) of the selected env in the view.
         """
         camera = view.studio.chosen
         nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)
@@ -222,30 +222,30 @@ class CameraSuggest:
         self._box.draw(edges + offset)
 
 
-def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[Choice, ...]:
-    """What a camera of a kind may be asked to see: the task's objects, their links, and links of the robots.
+def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[VisibleObject, ...]:
+    """The task's objects, their links, and links of the robots, for a camera of this kind.
 
-    Of several robots each gives as many in turn, so that no hand comes last.
+    Links of several robots alternate, so that no hand comes last.
     """
-    found: list[Choice] = []
+    found: list[VisibleObject] = []
     robots = [thing for thing in task.objects if thing.robot]
     for thing in task.objects:
         if thing.robot or (thing.hidden and kind == "sensor"):
             continue
-        found.append(Choice(thing.name, thing.name, True))
+        found.append(VisibleObject(thing.name, thing.name, True))
         if len(thing.links) <= MOST_LINKS:
-            found += [Choice(name, name, False) for name in thing.links]
+            found += [VisibleObject(name, name, False) for name in thing.links]
     for place in range(max((len(robot.links) for robot in robots), default=0)):
         for robot in robots:
             if place < len(robot.links):
                 name = robot.links[place]
                 label = name if len(robots) > 1 else name.removeprefix(f"{robot.name}/")
-                found.append(Choice(name, label, False, robot.name))
+                found.append(VisibleObject(name, label, False, robot.name))
     return tuple(found)
 
 
 def box_edges(low: Corner, high: Corner) -> NDArray[np.float32]:
     """(12, 2, 3) the edges of a box."""
-    # A corner's number has a bit for each axis; along an edge one of them changes.
+    # A corner's index has a bit for each axis; along an edge one of them changes.
     pairs = [(i, i ^ bit) for bit in (1, 2, 4) for i in range(8) if i & bit]
     return box_corners(low, high)[np.array(pairs)].astype(np.float32)

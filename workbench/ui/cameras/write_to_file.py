@@ -1,9 +1,4 @@
-"""A camera's way into the author's file: the change is shown as a diff, made, checked, and can be taken back.
-
-The button that makes a change is only beside its diff, and what comes after (the reload, the comparison of the new
-env's camera with what was asked for) is said in the same place. A plan is asked for anew if the camera was moved since.
-Changes are asked for at two places of the tab, so each has a box of its own, which is brought into sight.
-"""
+"""Writes cameras into the author's file: shows the change as a diff, makes it, checks it, and takes it back."""
 
 from __future__ import annotations
 
@@ -37,7 +32,10 @@ NOTHING = Writing()
 
 
 class CameraChange:
-    """One box in the present container."""
+    """The diff of a change with its buttons, and what came of it, in the present container.
+
+    The tab has one at each of the two places where changes are asked for; the new one is scrolled into view.
+    """
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         gui = server.gui
@@ -61,10 +59,10 @@ class CameraChange:
         self._drawn: tuple[Writing, bool, bool] | None = None
 
     def draw(self, writing: Writing, stale: bool) -> None:
-        """Show how far it is; a `Writing` of no stage and no message empties the box.
+        """Show the stage of a change; a `Writing` without stage and message hides all.
 
         Args:
-            stale: the camera was moved since the plan was made.
+            stale: the camera was moved since the change was planned.
         """
         stage = writing.stage
         self._text.visible = stage != "none" or bool(writing.message)
@@ -82,10 +80,10 @@ class CameraChange:
 
 
 def writing_html(writing: Writing, stale: bool, scroll_to: str = "") -> str:
-    """How far the change is; every value escaped.
+    """The stage of a change, as HTML.
 
     Args:
-        scroll_to: id of the element that is to come into sight.
+        scroll_to: id of the element to scroll into view.
     """
     edit, planned = writing.edit, writing.stage == "planned"
     seen = writing.picture.rgb if planned and writing.picture is not None else None
@@ -105,9 +103,9 @@ def writing_html(writing: Writing, stale: bool, scroll_to: str = "") -> str:
 
 
 def diff_lines(diff: str) -> list[tuple[str, str]]:
-    """Each line of a unified diff with its kind (``add``, ``del``, ``at``, ``same``), less the names of the files.
+    """Kind (``add``, ``del``, ``at``, ``same``) and text of each line of a unified diff, without the file names.
 
-    The indentation that all of them have is left out: the panel is narrow.
+    The common indentation is left out: the panel is narrow.
     """
     kinds = {"+": "add", "-": "del", "@": "at"}
     lines = [(kinds.get(line[:1], "same"), line) for line in diff.splitlines()[2:]]
@@ -134,7 +132,7 @@ NEW = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-"""A camera that is added to a task that has none of its kind, but for its place: what ManiSkill's own tasks have."""
+"""Settings, without the pose, of the first camera of a kind: those of ManiSkill's own tasks."""
 NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
 PREVIEW = 256
 """Pixels of the longer side of the new camera's picture."""
@@ -142,12 +140,12 @@ PREVIEW = 256
 FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
 
-class CameraWriting:
-    """The folder that adds, copies, renames and removes, in the present container.
+class WriteToFile:
+    """The button that writes the chosen camera's placement, and the folder to add, copy, rename and remove cameras.
 
     Args:
-        above: takes what writes where the chosen camera was placed.
-        from_viewer: these settings at the place from which a page's own view looks, in the env's frame.
+        above: gets the button and its change.
+        from_viewer: these settings at a page's viewpoint, in the env's frame.
     """
 
     def __init__(
@@ -163,7 +161,7 @@ class CameraWriting:
         self._named: Writing | None = None
         """The last change after which the field for a name was emptied."""
         with above:
-            # Always there: one that came with the first movement would push what is under it out of the hand.
+            # Disabled, not hidden: coming with the first movement it would push the controls below away.
             self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
             self._change = CameraChange(server, session)
         with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
@@ -182,7 +180,7 @@ class CameraWriting:
         self._with_chosen.on_click(self._on_member)
         add.on_click(self._on_member)
 
-    # --- asked -----------------------------------------------------------------------------------------
+    # --- requests --------------------------------------------------------------------------------------
 
     def _plan_write(self) -> None:
         camera = self._placing.camera
@@ -190,7 +188,7 @@ class CameraWriting:
             self._ask(Wish("edit", camera.key))
 
     def _ask(self, wish: Wish) -> None:
-        """Note what is asked for and where, and then ask: the answer may come at once."""
+        """Ask for a plan. Notes the place first: the answer may come at once."""
         self._say("")
         change = self._change if wish.what == "edit" else self._member_change
         change.arrival.asked(self._session.view().studio.writing)
@@ -203,7 +201,7 @@ class CameraWriting:
             self._say(str(error))
 
     def _say(self, why_not: str) -> None:
-        """Beside the buttons that were pressed, where one looks."""
+        """Show a refusal next to the buttons."""
         self._why_not.visible = bool(why_not)
         self._why_not.content = render("warning", text=why_not) if why_not else ""
 
@@ -229,7 +227,11 @@ class CameraWriting:
             self._ask(Wish(change, chosen.key, name=name))
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
-        """The name that was typed, or a free one like another; `ValueError` where neither is there."""
+        """The typed name, or a free one like `like`.
+
+        Raises:
+            ValueError: neither is possible.
+        """
         name = self._name.value.strip()
         if not name and like:
             return free_name(view, kind, like)
@@ -243,14 +245,14 @@ class CameraWriting:
             raise ValueError(f"There is a camera {name} already.")
         return name
 
-    # --- drawn -----------------------------------------------------------------------------------------
+    # --- drawing ---------------------------------------------------------------------------------------
 
     def draw(self, studio: StudioView) -> None:
         chosen, writing = studio.chosen, studio.writing
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
         of_members = writing.what != "edit"
-        # Not at the place of the button that writes: a second press must not write what was not read.
+        # Hidden while "Write it" is shown: a second press must not write a diff that was not read.
         can_plan = can_place and (writing.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and writing.stage != "written"
         self._plan.visible = can_plan
@@ -264,7 +266,7 @@ class CameraWriting:
 
 
 def is_stale(studio: StudioView) -> bool:
-    """The camera was moved since the plan for it was made."""
+    """Whether the camera was moved since its change was planned."""
     wish = studio.writing.wish
     if studio.writing.stage != "planned" or wish is None or wish.what == "add":
         return False
@@ -273,7 +275,7 @@ def is_stale(studio: StudioView) -> bool:
 
 
 def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
-    """A camera like the first of its kind that stands still, as the file has it; else as ManiSkill's tasks have them."""
+    """The file's settings of the first camera of this kind without a mount, or else `NEW`."""
     for camera in studio.cameras:
         if camera.key[0] == kind and camera.info.mount is None and camera.info.settings is not None:
             return camera.info.settings
@@ -281,27 +283,26 @@ def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
 
 
 def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
-    """`like`, or with a number at its end, that no camera of the kind has."""
+    """`like`, with a number at its end if a camera of the kind has that name."""
     taken = {camera.key for camera in studio.cameras}
     names = itertools.chain([like], (f"{like}_{number}" for number in itertools.count(2)))
     return next(name for name in names if (kind, name) not in taken)
 
 
-# --- where a sensor stands that is added ------------------------------------------------------------
+# --- initial pose of a new sensor -------------------------------------------------------------------
 
-# On the side from which somebody looks, near enough to see the task's objects. Who adds a camera looks at a whole table,
-# or at a grid of sixteen, from metres away, and at that distance a cube is four pixels of a picture of 128. What they have
-# chosen is the side. So the direction of their view is kept, and the eye goes along it to where the objects of all envs
-# fill the picture; if they look from about there, it stands where they look from.
+# A person who adds a camera looks at a whole table or a grid of sixteen from metres away, where a cube is four pixels of a
+# picture of 128. So the direction of the page's view is kept, and the eye moves along it to where the objects of all envs
+# fill the picture; if the view is from about there, the eye is the page's viewpoint.
 
 AROUND = 0.1
-"""Metres of room around the middles of the objects."""
+"""Metres of room around the origins of the objects."""
 ROOM = 1.25
-"""Times the distance from which they just fill the picture."""
+"""Factor on the distance at which the objects just fill the picture."""
 NEAREST = 0.6
-"""Metres from which a hand that reaches for one small thing is in the picture too."""
+"""Least metres: a hand that reaches for one small object has to be in the picture too."""
 NEAR_ENOUGH = 1.5
-"""Times the distance that is wanted, up to which an eye stays where it is."""
+"""Factor on the wanted distance up to which the page's viewpoint is kept."""
 NEAREST_TARGET = 0.1
 """Metres."""
 MOST_NAMES = 3
@@ -310,18 +311,18 @@ MOST_NAMES = 3
 def first_place(
     seen_from: CameraSettings, names: tuple[str, ...], places: NDArray[np.float64]
 ) -> tuple[CameraSettings, str]:
-    """A new sensor, and where that is, a sentence.
+    """The initial settings of a new sensor, and a sentence about its place.
 
     Args:
-        seen_from: a camera of the lens that is added, where somebody looks from, in the env's frame.
-        names: of the objects that it is to see.
-        places: (K, 3) where they are in all envs, each in its env's frame.
+        seen_from: its lens at the page's viewpoint, in the env's frame.
+        names: of the objects to see.
+        places: (K, 3) of the objects in all envs, each in its env's frame.
     """
     stays = "It stands where you look from."
     if not len(places):
         return seen_from, stays
     pose = pose_of(seen_from)
-    # One object that fell from the table must not take the camera away from all others.
+    # Median and quantile: one object that fell from the table must not move the camera away from the others.
     middle = np.median(places, axis=0)
     reach = float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.9)) + AROUND
     fov = vertical_fov(intrinsic_of(seen_from), seen_from.height)
@@ -336,7 +337,7 @@ def first_place(
 
 
 def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
-    """Metres along the line of sight to where the middle of some places (K, 3) is nearest; None if that is behind."""
+    """Metres along the line of sight to the point nearest to the median of places (K, 3); None if it is behind."""
     if not len(places):
         return None
     pose = pose_of(settings)
@@ -345,7 +346,7 @@ def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float 
 
 
 def objects_in(view: SessionView) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """What a sensor may see of a task's objects, and (K, 3) where it is in all envs at the shown moment."""
+    """Names of a task's objects that a sensor may see, and their places (K, 3) in all envs at the shown moment."""
     task, step = view.task, view.step
     if task is None or step is None or step.poses.shape[1] != len(task.geometry.body_names):
         return (), np.zeros((0, 3))
