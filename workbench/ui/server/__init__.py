@@ -1,1 +1,1 @@
-"""One port, one gate: what a browser may ask and what it gets."""
+"""Serves the page on one port: who may connect, what a browser may ask, and what it gets."""
