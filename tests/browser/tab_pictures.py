@@ -1,4 +1,4 @@
-"""Pictures of every tab of both pages, to hold one version against another by number and by eye.
+"""Takes pictures of every tab of both pages, and compares those of two versions.
 
     git worktree add /tmp/old COMMIT
     PYTHONPATH=/tmp/old .venv/bin/python /tmp/old/tests/browser/tab_pictures.py take /tmp/before

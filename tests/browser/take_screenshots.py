@@ -1,6 +1,6 @@
-"""Takes the README's screenshots anew, from the running page: python tests/browser/take_screenshots.py [NAME ...]
+"""Takes the README's screenshots: python tests/browser/take_screenshots.py [NAME ...]
 
-Not a test: pictures are looked at by people. It writes ``web_assets/screenshots/*.jpg``.
+Not a test. It writes ``web_assets/screenshots/*.jpg``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""What a viser server shows, and what a person does to it, without a browser.
+"""Reads and presses the controls of a viser server without a browser. Uses viser's private names, so that tests need none.
 
-A control is found by its label, or by the name that the product gave it where the label says nothing; a part of our own
-HTML that can be pressed by the key of its hidden button. A press takes viser's way of a page's message, with a client,
-and is over when all that it began on viser's threads is. Nothing can be pressed that a page does not offer, but for
-`claim`, which says what any stranger can. viser's private names are used here and in no test.
+A control is found by its label, or by its name (`name_control`); a pressable part of our HTML by the key of its hidden
+button. A press goes through viser's handling of a page's message, and returns when everything that it began on viser's
+threads is done. Only controls that a page offers can be pressed; `claim` sends any message, as an attacker can.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportPrivateUsage=false

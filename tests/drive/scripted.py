@@ -1,7 +1,4 @@
-"""A worker that is no process: it answers a session at once with a scene that is made by hand.
-
-For the tests of parts that only need a session with something in it. What a worker really says is tested on real ones.
-"""
+"""A fake worker without a process: it answers a session at once with a scene made by hand."""
 
 from __future__ import annotations
 

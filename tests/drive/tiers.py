@@ -1,6 +1,6 @@
-"""What a test needs is said by its fixtures, which give it its marker; `--fast` runs those that need nothing.
+"""Marks tests by their fixtures; `--fast` runs those that need no process, renderer or browser.
 
-In that run a test that starts a process or renders all the same fails with the name of the fixture that it lacks.
+In that run a test that starts a process or renders fails with the name of the fixture that it lacks.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Tabs without a browser: they connect as viser's page does, take what is sent, and throw it away.
+"""Tabs without a browser: they connect as viser's page does, read every byte, and throw it away.
 
-A real page for each of twenty clients would be twenty times Chromium on two cores. To the server these are the
-same: the handshake with cookie and subprotocol, the first camera message (before it viser does not count a client
-as connected), and every byte read as it comes.
+Twenty real pages would be twenty times Chromium on two cores. To the server these are the same: the handshake with
+cookie and subprotocol, and the first camera message (before it viser does not count a client as connected).
 """
 
 from __future__ import annotations

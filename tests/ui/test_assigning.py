@@ -1,7 +1,7 @@
-"""What viser sends again, and what not, when it is given what stands there: panels assign freely and rely on it.
+"""viser sends no value that is equal to the present one: panels assign freely and rely on it.
 
-A page is drawn many times a second. What were sent each time would be most of what is sent, and HTML that comes again is
-made anew in the browser, under the pointer of whoever is about to press it.
+A page is drawn many times a second. Equal values would be most of the traffic, and HTML that is sent again is rebuilt in
+the browser, under the pointer of a person about to press it.
 """
 
 from __future__ import annotations

@@ -46,9 +46,9 @@ async def in_turn(client: object, do: Callable[[], None]) -> None:
 class Presses:
     """The hidden buttons and inputs of one container. Make it inside the container.
 
-    viser's HTML is one-way, and its buttons cannot be rows of a table. But pressing a viser button sends its message
-    whoever presses it, so a row carries the id of a hidden button (``.wb-presses`` in page.css), and two handlers on
-    the table press that (``pressable.html``). The server learns no more than "this button was pressed".
+    viser's HTML is one-way, and its buttons cannot be rows of a table. So a row carries the id of a hidden viser button
+    (``.wb-presses`` in page.css), and two handlers on the table press that button (``pressable.html``). The server
+    learns no more than "this button was pressed".
 
     A position in a picture (``placeable.html``) and a row of a long table with shift or control (``choosable.html``)
     are whole numbers written into a hidden number input, with a counter, since an input whose value stays the same
