@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from workbench.session.live.live_state import LiveState, SharedState
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions
 from workbench.session.process.askers import Asker, Background
-from workbench.session.protocol.messages import PlaceCamera, Placed, Request
+from workbench.session.protocol.messages import Load, PlaceCamera, Placed, Request
 
 MOVED = replace(FILE, position=(0.45, 0.3, 0.6))
 GEOMETRY, POSES = table_scene(2)
@@ -153,6 +154,7 @@ class PushEnv:
     """Nothing but a place."""
 '''
 PLANNED = Wish("edit", KEY, FILE)
+ADDED = Wish("add", ("human", "side"), FILE)
 
 
 class OfAFile:
@@ -166,13 +168,16 @@ class OfAFile:
         self.task: TaskDescription = replace(TASK, file=str(file), source={str(file): TASK_TEXT})
         self.cameras.task = replace(self.task, source_files=(str(file),))
         self.notes = 0
-        self.asker = Asker(self._refuse)
+        self.load: Load | None = None
+        self.asked: list[Call] = []
+        self.answers = True
+        self.asker = Asker(self._hear)
         self.studio = StudioFile(
             self.cameras,
             self._note,
             lambda file, name: self.opened.append((file, name)),
             self.asker,
-            lambda: None,
+            lambda: self.load,
             lambda: ShownMoment(0, 2, None),
         )
         self.studio.folder = folder
@@ -181,18 +186,30 @@ class OfAFile:
     def _note(self) -> None:
         self.notes += 1
 
-    def _refuse(self, request: Request) -> None:
+    def _hear(self, request: Request) -> None:
         assert isinstance(request, Call)
-        self.asker.take(Answer(request.number, why="nothing can be drawn here"))
+        self.asked.append(request)
+        if self.answers:
+            self.refuses(request)
+
+    def refuses(self, call: Call) -> None:
+        self.asker.take(Answer(call.number, why="nothing can be drawn here"))
+
+    def waits_for_the_worker(self) -> Call:
+        """A plan, which asks the worker what comes of it and gets no answer."""
+        self.load, self.answers = Load(str(self.file), TaskOptions()), False
+        self.studio.plan(ADDED)
+        until(lambda: self.asked, "the worker being asked")
+        return self.asked[0]
 
     def looks(self, wish: Wish) -> None:
         with self.cameras.lock:
             """It was submitted whole."""
         self.studio._look(wish, FILE)
 
-    def writes(self) -> Writing:
+    def writes(self, wish: Wish = PLANNED) -> Writing:
         edit = SourceEdit(str(self.file), TASK_TEXT, TASK_TEXT + "\n", (), FILE)
-        self.studio.view = Writing("planned", PLANNED, edit)
+        self.studio.view = Writing("planned", wish, edit)
         self.studio.write()
         until(lambda: self.studio.view.stage == "written", "the change in the file")
         assert self.file.read_text() == TASK_TEXT + "\n"
@@ -221,7 +238,7 @@ def test_what_is_written_or_refused_is_told_to_the_page(written: OfAFile) -> Non
 
 
 def test_that_there_is_no_picture_of_a_camera_to_be_added_is_said(written: OfAFile) -> None:
-    written.studio._later(written.looks, Wish("add", ("human", "side"), FILE))
+    written.studio._later(written.looks, ADDED)
     until(lambda: written.notes, "the page being told")
     said = "There is no picture of the new camera: nothing can be drawn here."
     assert written.cameras.problem == said and written.studio.view.picture is None
@@ -260,3 +277,61 @@ def test_what_is_asked_for_after_the_end_is_not_begun(written: OfAFile) -> None:
     written.studio.plan(PLANNED)
     written.studio.write()
     assert written.studio.view == Writing()
+
+
+def test_the_end_ends_what_waits_for_the_worker_and_waits_until_that_is_told(written: OfAFile) -> None:
+    asked, stages = written.waits_for_the_worker(), list[str]()
+
+    def close() -> None:
+        written.studio.close()
+        stages.append(written.studio.view.stage)
+
+    closing = threading.Thread(target=close)
+    closing.start()
+    try:
+        until(lambda: stages, "the end, without an answer of the worker", seconds=10)
+    finally:
+        written.refuses(asked)
+        closing.join()
+    assert stages == ["refused"]
+    assert "the task did not answer" in written.studio.view.message
+
+
+def test_what_is_not_begun_at_the_end_is_left(written: OfAFile) -> None:
+    written.waits_for_the_worker()
+    written.studio.plan(PLANNED)
+    written.studio.close()
+    assert written.studio.view.wish == ADDED
+
+
+def test_what_was_refused_is_planned_in_the_copy_when_that_is_loaded_and_only_once(written: OfAFile) -> None:
+    written.copies()
+    until(lambda: written.opened, "the copy being opened")
+    copy = str(written.opened[0][0])
+    for file, planned in ((str(written.file), False), (copy, True), (copy, False)):
+        before = written.studio.view
+        with written.cameras.lock:
+            written.cameras.task = replace(written.task, file=file, source_files=(file,))
+            written.studio.plan_in_copy(written.cameras.task)
+        if planned:
+            until(lambda: written.studio.view.stage == "refused", "the answer in the copy")
+            assert written.studio.view.wish == PLANNED
+            assert written.studio.view.message.startswith(f"This is your copy of the task, {copy}.")
+    written.studio.close()
+    assert written.studio.view == before
+
+
+def test_a_removed_camera_that_comes_back_stands_where_it_was_placed(written: OfAFile) -> None:
+    placed = written.cameras.placements.placed
+    placed[KEY] = MOVED
+    written.writes(Wish("remove", KEY, MOVED))
+    without = replace(written.task, cameras=(), source={str(written.file): TASK_TEXT + "\n"})
+    with written.cameras.lock:
+        assert written.studio.loaded(without) == {KEY}
+        placed.clear()  # the camera is gone
+    assert written.studio.view.stage == "checked"
+    written.studio.undo_write()
+    until(lambda: written.studio.view.stage == "undone", "the file as it was")
+    with written.cameras.lock:
+        assert written.studio.loaded(written.task) == {KEY}
+    assert placed == {KEY: MOVED}
