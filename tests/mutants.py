@@ -110,6 +110,7 @@ PROTECTED = {
     "session/cameras/selection": "session/cameras/test_placements.py",
     "session/cameras/file_edits": "session/cameras/test_studio_alone.py session/cameras/test_edit_state.py",
     "session/cameras/studio": "session/cameras/test_studio_alone.py",
+    "session/worker/cameras": "session/worker/test_cameras.py",
     "ui/server/access": "ui/server/test_access.py",
     "ui/cameras/pose_math": "ui/cameras/test_pose_math.py ui/cameras/test_fields.py",
     "ui/cameras/fields": "ui/cameras/test_fields.py",

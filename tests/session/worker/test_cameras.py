@@ -1,0 +1,272 @@
+"""A worker's cameras without its loop: a real task and renderer, and a clock that goes when the test says so."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import pickle
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.jobs.open_task import OpenedTask, open_task
+from workbench.jobs.pool import CannotAnswer
+from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.wire import MessageSocket
+from workbench.session.process.heartbeat import PulseReader, PulseWriter
+from workbench.session.process.interrupts import Interrupts
+from workbench.session.protocol.messages import (
+    CameraRequest,
+    DrawPast,
+    Event,
+    Failed,
+    PastPictures,
+    Pictures,
+    PlaceCamera,
+    Placed,
+)
+from workbench.session.protocol.questions import CaptureMoment, DrawCamera
+from workbench.session.worker import cameras as under_test
+from workbench.session.worker.cameras import WorkerCameras
+from workbench.session.worker.guarded_task import HeldTask, ServerLine
+from workbench.session.worker.step_events import StepEvents
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+BASE: CameraKey = ("sensor", "base_camera")
+PEOPLE: CameraKey = ("human", "render_camera")
+SENSOR, HUMAN = CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")
+NOTHING = CameraRequest("nothing", "sensor")
+
+
+@dataclass
+class Clock:
+    now: float = 1000.0
+    tick: float = 0.0
+    """By how much every look at it moves it on."""
+
+    def monotonic(self) -> float:
+        self.now += self.tick
+        return self.now
+
+
+class Desk:
+    """A worker's cameras, and what the server hears of them."""
+
+    def __init__(self, opened: OpenedTask, clock: Clock) -> None:
+        ours, theirs = socket.socketpair()
+        self.clock, self.server = clock, MessageSocket(ours, get_args(Event))
+        pulse = os.memfd_create("pulse")
+        os.ftruncate(pulse, mmap.PAGESIZE)
+        self.pulse, interrupts = PulseReader(pulse), Interrupts()
+        line = ServerLine(theirs.detach(), interrupts)
+        self.held = HeldTask(line, interrupts, PulseWriter(pulse), StepEvents(), lambda: None)
+        os.close(pulse)
+        self.held.opened = opened
+        self.first: list[bool] = []
+        self.cameras = WorkerCameras(self.held, self.first.append)
+
+    def heard(self) -> list[Any]:
+        events = []
+        while (event := self.server.receive(0.0)) is not None:
+            events.append(event)
+        return events
+
+    def makes(self) -> list[Any]:
+        """What is heard of one turn of the loop that has nothing else to do."""
+        self.cameras.make(nothing_else_to_do=True)
+        return self.heard()
+
+    def wait(self) -> float | None:
+        return self.cameras.wait(self.clock.now)
+
+    def placed(self, key: CameraKey, **changes: Any) -> CameraSettings:
+        assert self.held.opened is not None
+        info = self.held.opened.description.camera(key)
+        assert info is not None and info.settings is not None
+        return replace(info.settings, **changes)
+
+
+@pytest.fixture(scope="module")
+def opened(renderer: None, task_file: Path) -> Iterator[OpenedTask]:
+    small = task_file.with_name("small.py")
+    small.write_text(task_file.read_text().replace("512", "64"))
+    opened = open_task(str(small), TaskOptions(2, env_kwargs={"obs_mode": "rgb", "render_backend": "cpu"}))
+    yield opened
+    opened.env.close()
+
+
+@pytest.fixture
+def desk(opened: OpenedTask, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
+    clock = Clock()
+    monkeypatch.setattr(under_test, "time", SimpleNamespace(monotonic=clock.monotonic))
+    desk = Desk(opened, clock)
+    yield desk
+    desk.held.opened = opened
+    for key in (BASE, PEOPLE):
+        desk.cameras.place_now(opened, PlaceCamera(key, None))
+    desk.server.end.close()
+
+
+def shown(events: list[Any]) -> list[CameraKey]:
+    """Of the only event: the cameras that it has pictures of."""
+    (event,) = events
+    assert isinstance(event, Pictures)
+    return [(picture.kind, picture.camera) for picture in event.pictures]
+
+
+def test_sensors_come_first_and_each_kind_as_soon_as_it_is_there(desk: Desk) -> None:
+    assert desk.wait() is None and desk.makes() == [], "nobody looks"
+    desk.cameras.watch(1, (HUMAN, NOTHING, SENSOR))
+    assert desk.wait() == 0.0
+    assert desk.makes() == [] and desk.first == [False]
+    assert shown(desk.makes()) == [BASE] and desk.first == [False, True]
+    (human,) = desk.makes()
+    assert [picture.env for picture in human.pictures] == [1] and shown([human]) == [PEOPLE]
+    assert desk.wait() is None and desk.makes() == [], "they are of the moment that is"
+    assert desk.first == [False, True] and desk.pulse.read().doing == "drawing"
+
+
+def test_after_a_round_there_is_a_pause_in_proportion(desk: Desk) -> None:
+    desk.cameras.watch(0, (SENSOR,))
+    desk.makes()
+    desk.clock.now += 2.0
+    (pictures,) = desk.makes()
+    assert pictures.milliseconds == pytest.approx(2000)
+    desk.cameras.scene_changed()
+    assert desk.wait() == pytest.approx(0.6)
+    assert desk.makes() == [] and desk.wait() == pytest.approx(0.6), "not begun before"
+    desk.clock.now += 0.61
+    desk.makes()
+    assert shown(desk.makes()) == [BASE]
+    desk.cameras.scene_changed()
+    assert desk.wait() == pytest.approx(1 / 15), "nor oftener than 15 times a second"
+    desk.cameras.watch(1, (SENSOR,))
+    assert desk.wait() == 0.0, "somebody waits for these"
+
+
+def test_a_picture_is_fetched_when_it_should_be_ready_by_what_the_last_ones_took(desk: Desk) -> None:
+    desk.cameras.watch(0, (SENSOR,))
+    desk.makes()
+    desk.clock.tick = 0.2  # the renderer is waited for
+    (pictures,) = desk.makes()
+    desk.clock.tick = 0.0
+    for expected in (pictures.milliseconds / 1000, 0.9 * pictures.milliseconds / 1000):
+        desk.cameras.scene_changed()
+        desk.clock.now += 1.0
+        desk.cameras.make(nothing_else_to_do=False)
+        assert desk.wait() == pytest.approx(expected)
+        desk.cameras.make(nothing_else_to_do=False)
+        assert desk.heard() == [], "not while there is something else to do"
+        desk.clock.now += expected + 0.001
+        desk.cameras.make(nothing_else_to_do=False)
+        assert shown(desk.heard()) == [BASE], "and was not waited for: the next is looked for earlier"
+
+
+def test_what_is_watched_already_is_not_begun_again(desk: Desk) -> None:
+    desk.cameras.watch(0, (SENSOR,))
+    desk.makes()
+    desk.cameras.watch(0, (SENSOR,))
+    assert shown(desk.makes()) == [BASE]
+    desk.cameras.watch(0, (SENSOR,))
+    assert desk.wait() is None
+
+
+def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_picture_comes_first(
+    desk: Desk,
+) -> None:
+    desk.cameras.watch(0, (SENSOR, HUMAN))
+    desk.makes()
+    first, last = (desk.placed(PEOPLE, position=(0.5, 0.1 * k, 0.7)) for k in (1, 2))
+    for settings in (first, last):
+        desk.cameras.place(PlaceCamera(PEOPLE, settings))
+    assert not desk.cameras.placing_due, "a picture is under way"
+    assert shown(desk.makes()) == [BASE]
+    assert shown(desk.makes()) == [PEOPLE]
+    assert desk.cameras.placing_due
+    desk.cameras.place_waiting()
+    (placed,) = desk.heard()
+    assert isinstance(placed, Placed) and placed.settings == last and not placed.why_not
+    assert not desk.cameras.placing_due and desk.wait() == 0.0, "without a pause"
+    assert desk.makes() == []
+    (pictures,) = desk.makes()
+    assert shown([pictures]) == [PEOPLE], "alone"
+    assert np.allclose(pictures.pictures[0].pose[:3], last.position, atol=1e-5)
+    assert desk.wait() != 0.0, "the others when it rests"
+    desk.clock.now += 1.0
+    assert desk.makes() == [] and shown(desk.makes()) == [BASE]
+
+
+def test_what_waits_is_placed_before_other_cameras_are_watched_and_nothing_without_a_task(desk: Desk) -> None:
+    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
+    desk.cameras.place(PlaceCamera(BASE, there))
+    desk.cameras.look_again()
+    assert [event.settings for event in desk.heard()] == [there]
+    desk.cameras.place(PlaceCamera(BASE, None))
+    desk.held.opened = None
+    desk.cameras.watch(0, (SENSOR,))
+    desk.cameras.put_back()
+    desk.cameras.draw_past(DrawPast(np.zeros((0, 7), np.float32), 0, (SENSOR,), 1))
+    assert desk.heard() == [] and desk.wait() is None and desk.makes() == []
+
+
+def test_a_sensor_of_another_size_is_observed_in_it_and_one_that_is_not_there_is_not_placed(
+    desk: Desk,
+) -> None:
+    opened = desk.held.opened
+    assert opened is not None
+    answer = desk.cameras.place_now(opened, PlaceCamera(BASE, desk.placed(BASE, width=40, height=24)))
+    assert answer.reshaped and answer.info is not None and (answer.info.width, answer.info.height) == (40, 24)
+    assert opened.env.obs["sensor_data"]["base_camera"]["rgb"].shape == (2, 24, 40, 3)
+    wrong = desk.cameras.place_now(opened, PlaceCamera(("sensor", "nothing"), desk.placed(BASE)))
+    assert "nothing" in wrong.why_not and wrong.info is None
+
+
+def test_a_moment_of_the_past_is_drawn_after_what_waits_and_a_failure_is_told(desk: Desk) -> None:
+    opened = desk.held.opened
+    assert opened is not None
+    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
+    desk.cameras.watch(0, (SENSOR,))
+    desk.makes()
+    desk.cameras.place(PlaceCamera(BASE, there))
+    poses = opened.first.poses[1]
+    desk.cameras.draw_past(DrawPast(poses, 1, (SENSOR,), 7))
+    placed, past = desk.heard()
+    assert isinstance(placed, Placed) and isinstance(past, PastPictures) and past.origin == 7
+    assert np.allclose(past.pictures[0].pose[:3], there.position, atol=1e-5)
+    desk.cameras.draw_past(DrawPast(poses, 1, (NOTHING,), 8))
+    (failed,) = desk.heard()
+    assert isinstance(failed, Failed) and "nothing" in failed.problem.message
+    assert desk.makes() == [] and shown(desk.makes()) == [BASE], "the one that was left is made anew"
+
+
+def test_a_question_is_answered_as_the_cameras_were_asked_to_stand_or_why_not(desk: Desk) -> None:
+    opened = desk.held.opened
+    assert opened is not None
+    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
+    desk.cameras.place(PlaceCamera(BASE, there))
+    picture: Any = desk.cameras.answer(opened, DrawCamera(BASE, None, 1), lambda done, total: None)
+    assert np.allclose(picture.pose[:3], there.position, atol=1e-5)
+    with pytest.raises(CannotAnswer, match="env 9"):
+        desk.cameras.answer(opened, DrawCamera(BASE, None, 9), lambda done, total: None)
+    assert desk.pulse.read().doing == "idle"
+
+
+def test_a_moment_is_captured_with_pictures_of_the_envs_that_are_named(desk: Desk) -> None:
+    opened = desk.held.opened
+    assert opened is not None
+    snapshot = pickle.dumps(opened.env.snapshot())
+    with_pictures = desk.cameras.capture(opened, CaptureMoment(snapshot, (1,), pictures=True))
+    assert {(picture.kind, picture.env) for picture in with_pictures.pictures} == {
+        ("sensor", 1),
+        ("human", 1),
+    }
+    without = desk.cameras.capture(opened, CaptureMoment(snapshot, (1,), pictures=False))
+    assert without.pictures == () and without.columns.keys() == with_pictures.columns.keys()
