@@ -305,20 +305,24 @@ def test_what_is_not_begun_at_the_end_is_left(written: OfAFile) -> None:
 
 
 def test_what_was_refused_is_planned_in_the_copy_when_that_is_loaded_and_only_once(written: OfAFile) -> None:
+    studio = written.studio
     written.copies()
     until(lambda: written.opened, "the copy being opened")
     copy = str(written.opened[0][0])
-    for file, planned in ((str(written.file), False), (copy, True), (copy, False)):
-        before = written.studio.view
+    for file in (str(written.file), copy):
+        assert studio.view.stage == "none", "the wish waits for the copy"
         with written.cameras.lock:
             written.cameras.task = replace(written.task, file=file, source_files=(file,))
-            written.studio.plan_in_copy(written.cameras.task)
-        if planned:
-            until(lambda: written.studio.view.stage == "refused", "the answer in the copy")
-            assert written.studio.view.wish == PLANNED
-            assert written.studio.view.message.startswith(f"This is your copy of the task, {copy}.")
-    written.studio.close()
-    assert written.studio.view == before
+            studio.plan_in_copy(written.cameras.task)
+    until(lambda: studio.view.stage == "refused", "the answer in the copy")
+    assert studio.view.wish == PLANNED
+    assert studio.view.message.startswith(f"This is your copy of the task, {copy}.")
+    until(lambda: written.notes == 3, "the page being told: of the copy, the wish and the answer")
+    with written.cameras.lock:
+        studio.plan_in_copy(written.cameras.task)
+    studio.plan(ADDED)
+    until(lambda: studio.view.wish == ADDED and studio.view.stage == "refused", "the next answer")
+    assert written.notes <= 5, "a plan that nobody asked for"
 
 
 def test_a_removed_camera_that_comes_back_stands_where_it_was_placed(written: OfAFile) -> None:
