@@ -156,6 +156,21 @@ def test_from_an_exact_point_a_restore_goes_on_as_the_run_that_was_not_interrupt
     assert not all(same), "nothing touches anything: the test would prove nothing"
 
 
+def test_an_exact_point_reads_back_also_where_physx_turns_a_root_by_a_last_bit() -> None:
+    env = batched("MS-HumanoidWalk-v1", 16)
+    env.reset(seed=list(range(16)))
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        begin_anew(env, list(range(16)))
+        was = take_snapshot(env)
+        restore_snapshot(env, was)
+        now = take_snapshot(env)
+        assert isinstance(was.simulation, CpuState) and isinstance(now.simulation, CpuState)
+        assert now.simulation.packed == was.simulation.packed
+    env.close()
+
+
 def test_whether_an_env_is_where_another_was_is_told_to_the_last_bit(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 3, 0))
