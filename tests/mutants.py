@@ -102,7 +102,7 @@ PROTECTED = {
     "session/history/env_table": "session/history/test_env_table.py session/history/test_outlier_watch.py",
     "session/history/curves": "session/history/test_curves.py",
     "jobs/verdict": "jobs/test_verdict.py",
-    "session/rescore/past": "session/rescore/test_past.py session/rescore/test_judge.py",
+    "session/rescore/past": "session/rescore/test_past.py session/rescore/test_past_rescorer.py",
     "session/process/supervisor": "session/process/test_supervisor.py",
     "session/live/versions": "session/live/test_recovery.py session/live/test_versions.py",
     "jobs/actions": "jobs/test_given_actions.py",

@@ -59,7 +59,7 @@ def place(tmp_path: Path) -> Path:
     return tmp_path
 
 
-class Judging:
+class Rescoring:
     process = "the process in the background"
 
     def __init__(self, place: Path) -> None:
@@ -73,17 +73,17 @@ class Judging:
         return running("workbench.session.worker.start")
 
     def ended(self) -> bool:
-        return self._rescorer.judging.view.state in ("done", "failed")
+        return self._rescorer.rescoring.view.state in ("done", "failed")
 
     def told(self) -> str:
-        return self._rescorer.judging.view.why
+        return self._rescorer.rescoring.view.why
 
     def assert_right(self) -> None:
-        (verdict,) = self._rescorer.judging.view.verdicts
+        (verdict,) = self._rescorer.rescoring.view.verdicts
         assert (verdict.why_not, verdict.differs, verdict.length) == ("", False, 8)
 
     def close(self) -> None:
-        self._rescorer.judging.close()
+        self._rescorer.rescoring.close()
 
 
 class Filming:
@@ -128,15 +128,15 @@ def running(module: str) -> list[int]:
 
 
 @pytest.fixture
-def jobs(place: Path) -> Iterator[list[Judging | Filming]]:
-    jobs = [Judging(place), Filming(place)]
+def jobs(place: Path) -> Iterator[list[Rescoring | Filming]]:
+    jobs = [Rescoring(place), Filming(place)]
     yield jobs
     for job in jobs:
         job.close()
 
 
-@pytest.mark.parametrize("which", [0, 1], ids=["judging", "filming"])
-def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Judging | Filming], which: int) -> None:
+@pytest.mark.parametrize("which", [0, 1], ids=["rescoring", "filming"])
+def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Rescoring | Filming], which: int) -> None:
     killed, other = jobs[which], jobs[1 - which]
     held: dict[int, int] = {}
     for number, job in enumerate(jobs):

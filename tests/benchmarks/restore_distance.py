@@ -138,7 +138,7 @@ def ways(run: Run, moment: int) -> Iterator[tuple[str, Put]]:
             task.step(action)
         task.restore(run.snapshots[moment], fresh_physics=False)
 
-    def lived_through(task: TaskEnv) -> None:
+    def replayed(task: TaskEnv) -> None:
         task.restore(run.snapshots[0])
         for action in run.actions[:moment]:
             task.step(action)
@@ -146,7 +146,7 @@ def ways(run: Run, moment: int) -> Iterator[tuple[str, Put]]:
     yield "put there", put_there
     yield "quick", quick
     yield "warmed", warmed
-    yield "lived through", lived_through
+    yield "lived through", replayed
 
 
 def measure(kind: Kind, options: Options) -> Iterator[str]:

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.drive.waiting import until
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
 pytestmark = pytest.mark.browser
 A_CARD = """
@@ -35,21 +35,21 @@ Show = Callable[..., Page]
 
 
 @pytest.fixture(scope="module")
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
+def gated_server() -> Iterator[GatedServer]:
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
 
 
 @pytest.fixture(scope="module")
-def show(door: Door, browser: Browser) -> Iterator[Show]:
+def show(gated_server: GatedServer, browser: Browser) -> Iterator[Show]:
     """Opens the page on a screen of twice the usual resolution, and waits for its view."""
 
     def opened(*scripts: str, wish: str = "") -> Page:
         page = browser.new_page(viewport={"width": 640, "height": 400}, device_scale_factor=2)
         for script in scripts:
             page.add_init_script(script)
-        page.goto(door.url + wish)
+        page.goto(gated_server.url + wish)
         # A function: of an expression every look but the first is an eval, which the page's policy forbids.
         # Made with 300 x 150, as every canvas; the view's size comes some frames later.
         page.wait_for_function(
@@ -60,9 +60,9 @@ def show(door: Door, browser: Browser) -> Iterator[Show]:
     yield opened
 
 
-def draw_until(door: Door, page: Page, reached: str) -> None:
+def draw_until(gated_server: GatedServer, page: Page, reached: str) -> None:
     """Something moves in the view until this is true in the page."""
-    node = door.server.scene.add_frame("/moved")
+    node = gated_server.server.scene.add_frame("/moved")
 
     def seen() -> bool:
         node.position = (time.monotonic() % 1, 0, 0)
@@ -76,20 +76,20 @@ def width(page: Page) -> int:
 
 
 def test_a_page_drawn_in_software_keeps_its_resolution_while_frames_come_slowly(
-    door: Door, show: Show
+    gated_server: GatedServer, show: Show
 ) -> None:
     page = show(SLOW_FRAMES)
     assert width(page) == 2 * 640
-    draw_until(door, page, f"framesSeen > {ENOUGH_FRAMES}")
+    draw_until(gated_server, page, f"framesSeen > {ENOUGH_FRAMES}")
     assert width(page) == 2 * 640
-    assert page.url == door.url.partition("?")[0]
+    assert page.url == gated_server.url.partition("?")[0]
     page.close()
 
 
-def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(door: Door, show: Show) -> None:
+def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(gated_server: GatedServer, show: Show) -> None:
     page = show(A_CARD, SLOW_FRAMES)
     assert width(page) == 2 * 640
-    draw_until(door, page, f"{CANVAS}.width < {2 * 640}")
+    draw_until(gated_server, page, f"{CANVAS}.width < {2 * 640}")
     page.close()
 
 

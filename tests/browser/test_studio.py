@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from tests.drive.page import page_on
 from tests.drive.studio import HEIGHT, VIEW, WIDTH, choose, field, numbers, option, picture, press, tool, view
 from tests.drive.waiting import until
-from workbench.ui.cameras.studio import NOBODY
+from workbench.ui.cameras.studio import NO_CAMERA
 
 pytestmark = pytest.mark.browser
 FILE = "push_cube.py"
@@ -91,7 +91,7 @@ def arc_about_x(page: Page) -> tuple[float, float] | None:
 
 
 def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> None:
-    choose(opened, NOBODY)
+    choose(opened, NO_CAMERA)
     expect(opened.get_by_text("Choose a camera here, or press its frustum")).to_be_visible()
 
     def orange() -> tuple[NDArray[np.intp], ...]:
@@ -346,7 +346,7 @@ def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_b
     for step in range(1, 4):
         page.keyboard.press("s")
         expect(page.get_by_text(f"env 0: step {step}").first).to_be_visible()
-    unfold(page, "Judge", page.get_by_role("button", name="Judge this camera", exact=True))
+    unfold(page, "PastRescorer", page.get_by_role("button", name="Judge this camera", exact=True))
     option(page, "Over", "this env's steps so far")
     button(page, "Judge this camera")
     expect(page.get_by_text("4 moments of env 0's episode, step 0 to step 3")).to_be_visible()
@@ -367,4 +367,4 @@ def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_b
     page.keyboard.press("Enter")
     button(page, "Judge this camera")
     expect(page.get_by_text("2 fresh resets")).to_be_visible(timeout=120_000)
-    page.get_by_text("Judge", exact=True).click()
+    page.get_by_text("PastRescorer", exact=True).click()

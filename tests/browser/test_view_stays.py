@@ -10,22 +10,23 @@ from playwright.sync_api import Browser
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from workbench.ui.server.gated_server import DoorOptions, open_door
+from workbench.ui.server.gated_server import ServerOptions, open_server
 from workbench.ui.widgets.hotkeys import Command, register
 
 pytestmark = pytest.mark.browser
 
 
 def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
-    door = open_door(DoorOptions(port=0))
+    gated_server = open_server(ServerOptions(port=0))
     stepped, walked = threading.Event(), threading.Event()
     register(
-        door.server, [Command("step", stepped.set, "S"), Command("a step back", walked.set, "arrowleft")]
+        gated_server.server,
+        [Command("step", stepped.set, "S"), Command("a step back", walked.set, "arrowleft")],
     )
     try:
-        with page_at(browser, door.url, 1000, 600) as (page, _):
-            until(lambda: len(door.server.get_clients()) == 1, "the page")
-            (client,) = door.server.get_clients().values()
+        with page_at(browser, gated_server.url, 1000, 600) as (page, _):
+            until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
+            (client,) = gated_server.server.get_clients().values()
             until(lambda: client.camera.image_width > 300, "the view")
             before = client.camera.position.copy()
             for key in ("s", "ArrowLeft", "w", "e", "ArrowUp"):
@@ -45,4 +46,4 @@ def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
             height = client.camera.position[2]
             assert height == pytest.approx(before[2], abs=1e-3), "it was moved up or down by a key"
     finally:
-        door.close()
+        gated_server.close()

@@ -16,9 +16,10 @@ from workbench.core.camera_data import CameraInfo, Picture
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped, TaskDescription
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, KeptWorker, Vitals, WorkerOptions
+from workbench.session.process.supervisor import Death, Supervisor, Vitals, WorkerOptions
 from workbench.session.process.worker_process import Output
 from workbench.session.protocol.messages import (
+    EnterRecording,
     Event,
     Load,
     Loaded,
@@ -30,7 +31,6 @@ from workbench.session.protocol.messages import (
     Settings,
     SingleStep,
     Status,
-    StepBack,
     WarmUp,
 )
 
@@ -45,7 +45,7 @@ def no_success(elapsed: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class ScriptedWorker:
-    """Takes what `KeptWorker` takes, after what its scene is."""
+    """Takes what `Supervisor` takes, after what its scene is."""
 
     pid = None
     load_waits = False
@@ -125,7 +125,7 @@ class ScriptedWorker:
             self._send(self._at(poses, elapsed), envs, seeds=np.arange(count))
         elif isinstance(request, Restore):
             self._restore(request)
-        elif isinstance(request, StepBack) and self.goes_back:
+        elif isinstance(request, EnterRecording) and self.goes_back:
             last, restored = (
                 self._lived[-1],
                 Restored(request.env_idx, (), -1, None, {}, number=request.number),
@@ -166,7 +166,7 @@ class ScriptedWorker:
 
 def scripted(
     num_envs: int, evaluate: Evaluate = no_success, info: CameraInfo | None = None
-) -> Callable[..., KeptWorker]:
+) -> Callable[..., Supervisor]:
     """For `Session`'s ``make_worker``: the table scene with so many envs and one camera."""
     geometry, poses = table_scene(num_envs)
     # No file of it is there to be followed.

@@ -11,7 +11,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.process.supervisor import WorkerOptions
-from workbench.session.rescore.background import JudgedView
+from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.recordings import Rescorer
 
 TASKS = Path(__file__).parents[2] / "tasks"
@@ -85,11 +85,11 @@ def start_over(session: Session, seed: int) -> SessionView:
     return wait_until(session, came, "the reset")
 
 
-def rescored(rescorer: Rescorer, *states: str) -> JudgedView:
+def rescored(rescorer: Rescorer, *states: str) -> RescoreView:
     """What a page shows of the judging of recordings once it is in one of these states."""
 
-    def wanted() -> JudgedView | None:
-        view = rescorer.judging.view
+    def wanted() -> RescoreView | None:
+        view = rescorer.rescoring.view
         return view if view.state in states else None
 
-    return until(wanted, " or ".join(states), 120.0, seen=lambda: rescorer.judging.view)
+    return until(wanted, " or ".join(states), 120.0, seen=lambda: rescorer.rescoring.view)

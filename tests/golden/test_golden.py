@@ -207,7 +207,7 @@ def opened(task: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ses
 def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
     """From the recorded `state` in env 1 to its end, by the recorded actions."""
     episode = read_episode(path)
-    entered = session.step_back(run_of(episode, state))
+    entered = session.enter_recording(run_of(episode, state))
     view = wait_until(session, lambda v: v.timeline.entered == entered, "the state")
     assert view.timeline.not_carried == () and view.step.elapsed_steps[1] == state
     # By its seed and its actions: where these lead elsewhere the recorded state is put in, which is no proof of them.

@@ -34,18 +34,18 @@ def pushes(simulation: Simulation, renderer: str) -> Iterator[tuple[Any, Any]]:
         kwargs = {"obs_mode": MODE, "render_backend": renderer}
         return make_env(PushCubeEnv, EnvOptions(N, backend, kwargs=kwargs))
 
-    looked_at, judge = opened(simulation), opened("cpu")
-    yield looked_at, judge
+    looked_at, rescore = opened(simulation), opened("cpu")
+    yield looked_at, rescore
     looked_at.close()
-    judge.close()
+    rescore.close()
 
 
 @pytest.fixture
 def in_one_state(pushes: tuple[Any, Any]) -> tuple[Any, Any]:
-    looked_at, judge = pushes
-    judge.reset(seed=[3, 4])
+    looked_at, rescore = pushes
+    rescore.reset(seed=[3, 4])
     looked_at.reset(seed=[3, 4])
-    state = judge.get_state_dict()
+    state = rescore.get_state_dict()
     looked_at.set_state_dict(
         {kind: {name: row.to(looked_at.device) for name, row in rows.items()} for kind, rows in state.items()}
     )
@@ -53,7 +53,7 @@ def in_one_state(pushes: tuple[Any, Any]) -> tuple[Any, Any]:
         env.scene._gpu_apply_all()
         env.scene.px.gpu_update_articulation_kinematics()
         env.scene._gpu_fetch_all()
-    return looked_at, judge
+    return looked_at, rescore
 
 
 def seen(env: Any) -> dict[str, np.ndarray]:
@@ -66,15 +66,15 @@ def cube_pixels(env: Any, segmentation: np.ndarray) -> list[int]:
 
 
 def test_the_same_state_gives_the_same_picture(in_one_state: tuple[Any, Any]) -> None:
-    (env, judge), (here, there) = in_one_state, map(seen, in_one_state)
+    (env, rescore), (here, there) = in_one_state, map(seen, in_one_state)
     names = {
         backend: {int(k): v.name for k, v in backend.segmentation_id_map.items()} for backend in in_one_state
     }
-    assert set(names[env].values()) == set(names[judge].values())
+    assert set(names[env].values()) == set(names[rescore].values())
     for picture in ("rgb", "depth", "segmentation"):
         assert here[picture].shape == there[picture].shape and here[picture].dtype == there[picture].dtype
     name_of = np.vectorize(lambda number, table: table.get(number, "-"), otypes=[object])
-    same = name_of(here["segmentation"], names[env]) == name_of(there["segmentation"], names[judge])
+    same = name_of(here["segmentation"], names[env]) == name_of(there["segmentation"], names[rescore])
     assert same.mean() > 0.99, "edges may fall on the other side of a pixel, no more"
     inside = same[..., 0]
     np.testing.assert_allclose(

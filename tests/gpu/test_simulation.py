@@ -39,10 +39,10 @@ def opened(task: str, simulation: Simulation, **kwargs: Any) -> TaskEnv:
 @pytest.fixture(scope="module")
 def picks(simulation: Simulation) -> Iterator[tuple[TaskEnv, TaskEnv]]:
     """PickCube on the backend that is looked at, and on the batched CPU."""
-    looked_at, judge = opened("PickCube-v1", simulation), opened("PickCube-v1", "cpu")
-    yield looked_at, judge
+    looked_at, rescore = opened("PickCube-v1", simulation), opened("PickCube-v1", "cpu")
+    yield looked_at, rescore
     looked_at.close()
-    judge.close()
+    rescore.close()
 
 
 def played(env: TaskEnv, steps: int, seed: int = 0) -> Any:
@@ -60,13 +60,13 @@ def on_cpu(state: Any) -> Any:
 def test_it_opens_with_the_bodies_actions_and_observations_of_the_cpu(
     picks: tuple[TaskEnv, TaskEnv], simulation: Simulation
 ) -> None:
-    env, judge = picks
+    env, rescore = picks
     assert env.env.device.type == ("cuda" if simulation == "gpu" else "cpu")
-    assert scene_index(env.env).names == scene_index(judge.env).names
-    assert [part.names for part in env.parts] == [part.names for part in judge.parts]
-    assert env.env.action_space == judge.env.action_space
-    assert env.env.observation_space.shape == judge.env.observation_space.shape
-    assert env.control_dt == judge.control_dt
+    assert scene_index(env.env).names == scene_index(rescore.env).names
+    assert [part.names for part in env.parts] == [part.names for part in rescore.parts]
+    assert env.env.action_space == rescore.env.action_space
+    assert env.env.observation_space.shape == rescore.env.observation_space.shape
+    assert env.control_dt == rescore.control_dt
 
 
 def test_a_seeded_reset_is_the_same_each_time(picks: tuple[TaskEnv, TaskEnv]) -> None:
@@ -101,15 +101,15 @@ def test_a_partial_reset_begins_the_episode_of_its_seed(picks: tuple[TaskEnv, Ta
 
 def test_steps_from_one_state_agree_with_the_cpu(picks: tuple[TaskEnv, TaskEnv]) -> None:
     """Two solvers differ in the last digits; a pose that was mixed up or never applied differs in the first."""
-    env, judge = picks
-    judge.reset(seed=SEEDS)
+    env, rescore = picks
+    rescore.reset(seed=SEEDS)
     env.reset(seed=SEEDS)
-    state = judge.env.get_state_dict()
+    state = rescore.env.get_state_dict()
     env.env.set_state_dict({k: {n: t.to(env.env.device) for n, t in v.items()} for k, v in state.items()})
     rng = np.random.default_rng(0)
     for _ in range(5):
-        action = actions.random_action(judge.parts, N, rng)
-        here, there = env.step(action), judge.step(action)
+        action = actions.random_action(rescore.parts, N, rng)
+        here, there = env.step(action), rescore.step(action)
     np.testing.assert_allclose(here.poses[..., :3], there.poses[..., :3], atol=0.01)  # pyright: ignore
     turned = np.abs((here.poses[..., 3:] * there.poses[..., 3:]).sum(-1))  # pyright: ignore
     assert turned.min() > 0.995, "quaternions, up to their sign"

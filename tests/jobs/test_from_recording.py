@@ -16,7 +16,7 @@ from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.from_recording import (
-    CannotStepIn,
+    CannotEnterRecording,
     options_of,
     recorded_source,
     reference_of,
@@ -54,7 +54,7 @@ def live(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 
 def into(session: Session, run: RecordedRun, everywhere: bool = False) -> SessionView:
-    number = session.step_back(run, everywhere)
+    number = session.enter_recording(run, everywhere)
     return wait_until(session, lambda v: v.timeline.entered == number, "the recorded state")
 
 
@@ -111,7 +111,7 @@ def test_code_that_raises_on_the_way_leaves_the_envs_where_they_were(live: Sessi
     file.write_text(text.replace(line, f"{line}        assert (self.elapsed_steps != 9).all()\n"))
     view = wait_until(live, lambda v: "!= 9" in v.task.source[str(file)], "the edit")
     stood, last = view.step.poses.copy(), view.timeline.last
-    live.step_back(run.until(20))
+    live.enter_recording(run.until(20))
     view = wait_until(live, lambda v: v.problem is not None, "the problem")
     assert view.problem.file == str(file) and "assert" in (view.problem.code or "")
     assert view.timeline.last == last
@@ -127,7 +127,7 @@ def test_what_changed_since_it_was_recorded_is_told_on_arrival(live: Session, ru
         "tanh(5 * distance)", "tanh(distance)"
     )
     assert then != text
-    number = live.step_back(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
+    number = live.enter_recording(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
     view = wait_until(live, lambda v: v.timeline.entered == number, "the state")
     told = (
         "an episode, step 3 (changed since: GOAL_RADIUS, compute_dense_reward): its actions were made again"
@@ -190,7 +190,7 @@ def test_the_recorded_text_is_opened_in_a_folder_that_goes_again(tmp_path: Path)
         assert (folder / "helpers" / "shapes.py").read_text() == "SIZE = 1\n"
         assert (folder / "outside.py").is_file()  # and nowhere else
     assert not folder.exists()
-    with pytest.raises(CannotStepIn, match="does not hold the text"), recorded_source(info(None)):
+    with pytest.raises(CannotEnterRecording, match="does not hold the text"), recorded_source(info(None)):
         pass
 
 

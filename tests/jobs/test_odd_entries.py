@@ -145,8 +145,8 @@ def test_what_is_not_per_env_is_no_difference_when_it_is_rescored(recordings: Pa
 def test_a_state_is_gone_into(recordings: Path, file: Path) -> None:
     task = opened(str(file), 2, reward_mode="dense", obs_mode="state")
     run = run_of(read_episode(sorted(recordings.glob("*.json"))[1]), 3)
-    step, arrival = arrive(task, run, 3, [1])
-    assert (arrival.metres, arrival.missed) == (0, {})
+    step, replay_result = arrive(task, run, 3, [1])
+    assert (replay_result.metres, replay_result.missed) == (0, {})
     assert "progress" in step.others
     task.env.close()
 

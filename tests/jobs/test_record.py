@@ -26,7 +26,7 @@ from workbench.authoring.problem import TaskError
 from workbench.cli.main import main
 from workbench.cli.record import record_in_terminal
 from workbench.jobs.pool import Deal, Executor, Processes, Work
-from workbench.jobs.record import Progress, Recorded, RecordOptions, Written, record
+from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
@@ -57,7 +57,7 @@ def assert_same(one: Episode, other: Episode) -> None:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """Three short episodes of random actions on two envs, without pictures."""
-    seen: list[Progress] = []
+    seen: list[RecordProgress] = []
     out = tmp_path_factory.mktemp("recorded")
     options = TaskOptions(num_envs=2, seed=10)
     done = record(
@@ -148,7 +148,7 @@ def test_the_kept_successes_are_those_with_the_lowest_numbers(
     wanted: int, tries: int, good: list[bool], slots: int, data: st.DataObject
 ) -> None:
     first = [index for index in range(tries) if good[index]][:wanted]
-    seen: list[Progress] = []
+    seen: list[RecordProgress] = []
     with tempfile.TemporaryDirectory() as folder:
         what = RecordOptions("PushCube-v1", Path(folder), successes=wanted, tries=tries)
         done = record(what, on_progress=seen.append, executor=InAnyOrder(good, slots, data))

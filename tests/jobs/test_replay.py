@@ -50,9 +50,9 @@ def test_what_follows_a_state_that_was_gone_into_is_what_was_recorded_to_the_las
     task: OpenedTask, recorded: Recorded, state: int
 ) -> None:
     run, env = recorded.run(1), 1
-    step, arrival = arrive(task, run, state, [env])
-    assert (arrival.way, arrival.metres, arrival.radians) == ("re-simulated", 0, 0)
-    assert arrival.missed == {} and not arrival.begins_otherwise
+    step, replay_result = arrive(task, run, state, [env])
+    assert (replay_result.way, replay_result.metres, replay_result.radians) == ("re-simulated", 0, 0)
+    assert replay_result.missed == {} and not replay_result.start_differs
     assert step.elapsed_steps[env] == state and task.env.episode_seeds[env] == 7
     for name, values in recorded.steps[state].evaluate.items():
         # The terms of a reward are those of an action, and none was made now.
@@ -79,8 +79,8 @@ def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, r
 
 
 def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recorded: Recorded) -> None:
-    _, arrival = arrive(task, recorded.run(2), 30, range(N))
-    assert arrival.metres == 0
+    _, replay_result = arrive(task, recorded.run(2), 30, range(N))
+    assert replay_result.metres == 0
     for t in range(30, STEPS):
         action = np.broadcast_to(recorded.steps[t + 1].action[2], (N, 8)).astype(np.float32)
         step_checked(task.env, task.loaded, action)
@@ -93,17 +93,17 @@ def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recor
 def test_an_episode_of_a_reset_of_all_envs_begins_where_it_began(task: OpenedTask) -> None:
     # Its seed alone does not say: numbers were drawn for all three at once.
     recorded = record(task, STEPS, None, reaching(STEPS, N))
-    _, arrival = arrive(task, recorded.run(2), 20, [0])
-    assert arrival.begins_otherwise and arrival.metres == 0 and arrival.way == "re-simulated"
+    _, replay_result = arrive(task, recorded.run(2), 20, [0])
+    assert replay_result.start_differs and replay_result.metres == 0 and replay_result.way == "re-simulated"
 
 
 def test_states_that_part_from_the_record_are_put_back_on_it(task: OpenedTask, recorded: Recorded) -> None:
     run = recorded.run(1)
     states = {name: rows.copy() for name, rows in run.env_states.items()}
     states["actors/cube"][12:, 0] += 0.05  # as if somebody had pushed it
-    step, arrival = arrive(task, replace(run, env_states=states), 20, [1])
-    assert arrival.way == "corrected" and 1 <= arrival.corrected <= 8
-    assert arrival.metres is not None and arrival.metres < 1e-4
+    step, replay_result = arrive(task, replace(run, env_states=states), 20, [1])
+    assert replay_result.way == "corrected" and 1 <= replay_result.corrected <= 8
+    assert replay_result.metres is not None and replay_result.metres < 1e-4
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
     assert state_distance(now, {n: rows[20] for n, rows in states.items()})[0] < 1e-4
 
@@ -112,9 +112,9 @@ def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
     task: OpenedTask, recorded: Recorded
 ) -> None:
     run = recorded.run(1)
-    step, arrival = arrive(task, replace(run, action=run.action[:, :5]), 25, [1])
-    assert arrival.way == "put there" and "5 numbers" in arrival.missed["the way there"]
-    assert arrival.metres is not None and arrival.metres < 1e-6
+    step, replay_result = arrive(task, replace(run, action=run.action[:, :5]), 25, [1])
+    assert replay_result.way == "put there" and "5 numbers" in replay_result.missed["the way there"]
+    assert replay_result.metres is not None and replay_result.metres < 1e-6
     assert step.elapsed_steps[1] == 25
     robot = task.env.env.agent.robot
     targets = task.env.env.scene.px.cuda_articulation_target_qpos.torch()[1]

@@ -108,7 +108,7 @@ def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:
     assert [verdict.seed for verdict in verdicts] == [20, 21, 22] and notes == ()
     for verdict in verdicts:
         assert not verdict.differs and verdict.differing == () and verdict.metres == 0
-        assert verdict.missed == {} and not verdict.begins_otherwise and verdict.length == STEPS
+        assert verdict.missed == {} and not verdict.start_differs and verdict.length == STEPS
 
 
 def test_an_edited_reward_differs_by_what_was_edited_and_the_recorded_text_does_not(author: Path) -> None:
@@ -149,9 +149,13 @@ def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: P
 def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
     run = run_of(read_maniskill(foreign, "traj_1"))
     task = opened("PickCube-v1", 2, reward_mode="dense")
-    step, arrival = arrive(task, run, 8, [1])
-    assert arrival.way == "re-simulated" and arrival.metres is not None and arrival.metres < 1e-5
-    assert step.elapsed_steps.tolist()[1] == 8 and arrival.missed == {}
+    step, replay_result = arrive(task, run, 8, [1])
+    assert (
+        replay_result.way == "re-simulated"
+        and replay_result.metres is not None
+        and replay_result.metres < 1e-5
+    )
+    assert step.elapsed_steps.tolist()[1] == 8 and replay_result.missed == {}
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
     assert state_distance(now, run.state(8))[0] < 1e-5
     task.env.close()
@@ -161,8 +165,8 @@ def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
     run = run_of(read_episode(sorted((author / "recordings").glob("*.json"))[2]))
     task = opened(str(author / "push_cube.py"), 2)
     for state in (0, 5, STEPS):
-        _, arrival = arrive(task, run, state, [0])
-        assert (arrival.way, arrival.metres, arrival.missed) == ("re-simulated", 0, {})
+        _, replay_result = arrive(task, run, state, [0])
+        assert (replay_result.way, replay_result.metres, replay_result.missed) == ("re-simulated", 0, {})
     task.env.close()
 
 
@@ -237,8 +241,8 @@ def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreig
     edit(author, REWARD, "return self.nonsense(obs)")
     verdicts, _ = rescore_all(RescoreOptions((author / "recordings", foreign)))
     broken = [verdict for verdict in verdicts if "nonsense" in verdict.why_not]
-    judged = [verdict for verdict in verdicts if not verdict.why_not]
-    assert (len(broken), len(judged)) == (EPISODES, 2)
+    rescored = [verdict for verdict in verdicts if not verdict.why_not]
+    assert (len(broken), len(rescored)) == (EPISODES, 2)
 
 
 def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -278,10 +282,10 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         edit(author, REWARD, "import time; time.sleep(1000)")
         rescorer.start(sources_among((author / "recordings",)))
         rescored(rescorer, "loading")
-        rescorer.judging.stop()
+        rescorer.rescoring.stop()
         rescored(rescorer, "stopped")
     finally:
-        rescorer.judging.close()
+        rescorer.rescoring.close()
 
 
 def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(

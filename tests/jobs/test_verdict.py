@@ -11,7 +11,7 @@ import pytest
 from workbench.jobs.verdict import (
     DOUBTFUL_METRES,
     DOUBTFUL_RADIANS,
-    Said,
+    Scores,
     Verdict,
     compare,
     gap,
@@ -23,8 +23,8 @@ from workbench.session.rescore import verdict_text as words
 REWARD = [0.0, 1.0, 2.0, 3.0]
 
 
-def said(reward: Any = REWARD, **evaluate: Any) -> Said:
-    return Said(np.array(reward, float), {name: np.array(rows) for name, rows in evaluate.items()})
+def said(reward: Any = REWARD, **evaluate: Any) -> Scores:
+    return Scores(np.array(reward, float), {name: np.array(rows) for name, rows in evaluate.items()})
 
 
 def test_what_is_the_same_differs_nowhere() -> None:
@@ -35,7 +35,7 @@ def test_what_is_the_same_differs_nowhere() -> None:
     assert found.returns == (6, 6) and found.largest == 0 and found.has_success
     assert found.success == found.fail == (None, None) and found.look_at is None
     assert (found.metres, found.radians, found.drift_at) == (None, 0, None) and not found.drifted
-    assert (found.task, found.seed, found.begins_otherwise, found.missed) == ("", -1, False, {})
+    assert (found.task, found.seed, found.start_differs, found.missed) == ("", -1, False, {})
     assert words.what_changed(found) == "as it was"
 
 
@@ -96,10 +96,10 @@ def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
         said(success=[0] * 5),
         task="Push-v1",
         seed=7,
-        begins_otherwise=True,
+        start_differs=True,
         missed={"cube": "gone"},
     )
-    assert (found.task, found.seed, found.begins_otherwise, found.missed) == (
+    assert (found.task, found.seed, found.start_differs, found.missed) == (
         "Push-v1",
         7,
         True,

@@ -27,7 +27,7 @@ from workbench.recording.episode.source import UnreadableRecording
 from workbench.recording.episode.tags import write_into_description
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.recover import recover
-from workbench.session.clearance import Clearances, Consent, NotCleared, Since, TrustQuestion, Wanted
+from workbench.session.clearance import Clearances, CodeToRun, Consent, NotCleared, Since, TrustQuestion
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 
 TEXT = "import helper\nclass Push: ...\n"
@@ -76,17 +76,17 @@ def info_of(recording: Path) -> EpisodeInfo:
     return read_episode(recording).info
 
 
-def todays(recording: Path) -> Wanted:
+def todays(recording: Path) -> CodeToRun:
     info = info_of(recording)
-    return Wanted(reference_of(info), info)
+    return CodeToRun(reference_of(info), info)
 
 
-def as_recorded(recording: Path) -> Wanted:
+def as_recorded(recording: Path) -> CodeToRun:
     info = info_of(recording)
-    return Wanted(reference_of(info), info, recorded_text=True)
+    return CodeToRun(reference_of(info), info, recorded_text=True)
 
 
-def asked(wanted: Wanted, answer: Consent = Consent.NO) -> list[TrustQuestion]:
+def asked(wanted: CodeToRun, answer: Consent = Consent.NO) -> list[TrustQuestion]:
     person = Person(answer)
     try:
         Clearances(ask=person).clear(wanted)
@@ -143,8 +143,8 @@ def test_without_anybody_to_ask_the_answer_is_no(foreign: Path) -> None:
 def test_a_file_that_a_person_named_is_not_asked_about(foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
     assert Clearances(lambda: [file]).clear(todays(foreign)) == str(file)
-    assert Clearances().clear(Wanted("any_file.py", info_of(foreign))) == "any_file.py"
-    assert Clearances().clear(Wanted(RecordedTask("PickCube-v1"), info_of(foreign))) == RecordedTask(
+    assert Clearances().clear(CodeToRun("any_file.py", info_of(foreign))) == "any_file.py"
+    assert Clearances().clear(CodeToRun(RecordedTask("PickCube-v1"), info_of(foreign))) == RecordedTask(
         "PickCube-v1"
     )
 
@@ -215,7 +215,7 @@ def test_an_answer_to_a_file_that_has_changed_meanwhile_runs_nothing(foreign: Pa
     "env_id", ["/w/evil.py", "/w/evil.py:Evil", "./evil.py", "evil.py", "~/evil", "..\\evil"]
 )
 def test_a_path_in_place_of_an_id_is_never_opened_and_what_to_do_is_said(foreign: Path, env_id: str) -> None:
-    wanted = Wanted(RecordedTask(env_id), info_of(foreign))
+    wanted = CodeToRun(RecordedTask(env_id), info_of(foreign))
     with pytest.raises(NotCleared, match="never opened: .* with --task FILE"):
         Clearances(all_trusted=True).clear(wanted)
 
@@ -237,7 +237,7 @@ def test_arguments_from_elsewhere_name_no_files(
     (foreign.parent / "evil.urdf").write_text("")
     file = foreign.parents[1] / "push.py"
     edit(foreign, **values)
-    for wanted in (todays(foreign), as_recorded(foreign), Wanted(str(file), info_of(foreign))):
+    for wanted in (todays(foreign), as_recorded(foreign), CodeToRun(str(file), info_of(foreign))):
         with pytest.raises(NotCleared, match="names files for its env to read .* --trust") as refused:
             Clearances(ask=Person(Consent.ALWAYS)).clear(wanted)
         assert refused.value.trust_helps

@@ -205,7 +205,7 @@ def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
 ) -> None:
     keyboard, terminal = pty.openpty()
 
-    def judged(typed: str) -> tuple[int, str]:
+    def rescored(typed: str) -> tuple[int, str]:
         os.write(keyboard, f"{typed}\n".encode())
         with open(terminal, closefd=False) as read, open(terminal, "w", closefd=False) as written:
             monkeypatch.setattr(sys, "stdin", read)
@@ -220,18 +220,18 @@ def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
         return int(ended.value.code or 0), told.decode()
 
     for no in ("n", "", "perhaps"):
-        code, told = judged(no)
+        code, told = rescored(no)
         assert code == Exit.NOT_TRUSTED and not ran(foreign)
     assert "marks.py" in told and str(foreign / "push_cube.py") in told and "Run it?" in told
     assert HELPER.strip() not in told
-    code, told = judged("show\nn")
+    code, told = rescored("show\nn")
     assert code == Exit.NOT_TRUSTED and not ran(foreign) and HELPER.strip() in told
-    code, told = judged("a")
+    code, told = rescored("a")
     assert code == 0 and ran(foreign) and "Run it?" in told
-    code, told = judged("n")
+    code, told = rescored("n")
     assert code == 0 and ran(foreign) and "Run it?" not in told
     (foreign / "marks.py").write_text(HELPER + "# changed\n")
-    code, told = judged("n")
+    code, told = rescored("n")
     assert code == Exit.NOT_TRUSTED and not ran(foreign)
     changed = next(line for line in told.splitlines() if "marks.py" in line)
     unchanged = next(line for line in told.splitlines() if "push_cube.py" in line)
@@ -263,7 +263,7 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         )
         assert ran(foreign) and [[one.name for one in q.modules] for q in asked] == [["marks.py"]] * 2
     finally:
-        rescorer.judging.close()
+        rescorer.rescoring.close()
 
 
 def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
@@ -278,9 +278,9 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
     try:
         rescorer.start(sources_among((foreign / "recordings",)))
         until(lambda: asking, "the question")
-        assert rescorer.judging.view.state == "asking"
-        rescorer.judging.stop()
+        assert rescorer.rescoring.view.state == "asking"
+        rescorer.rescoring.stop()
         rescored(rescorer, "stopped")
     finally:
-        rescorer.judging.close()
+        rescorer.rescoring.close()
     assert len(asking) == 1 and not ran(foreign)

@@ -12,7 +12,7 @@ from tests.drive.session import wait_until
 from workbench.core.camera_data import CameraInfo
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
 
 @pytest.fixture
@@ -24,11 +24,11 @@ def server() -> Iterator[viser.ViserServer]:
 
 
 @pytest.fixture
-def door() -> Iterator[Door]:
+def gated_server() -> Iterator[GatedServer]:
     """A door on a free port, with a token."""
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from websockets.sync.connection import Connection
 
 from tests.drive.waiting import until
 from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.server.viser_private import element_id
 
 PROTOCOL = f"viser-v{viser.__version__}"
@@ -33,20 +33,25 @@ CAMERA = {
 }
 
 
-def token_of(door: Door) -> str:
-    return door.url.partition("token=")[2]
+def token_of(gated_server: GatedServer) -> str:
+    return gated_server.url.partition("token=")[2]
 
 
-def cookie_of(door: Door) -> str:
-    return f"{cookie_name(door.port)}={token_of(door)}"
+def cookie_of(gated_server: GatedServer) -> str:
+    return f"{cookie_name(gated_server.port)}={token_of(gated_server)}"
 
 
-def ask(door: Door, path: str = "/", **headers: str | None) -> tuple[int, http.client.HTTPMessage, bytes]:
+def ask(
+    gated_server: GatedServer, path: str = "/", **headers: str | None
+) -> tuple[int, http.client.HTTPMessage, bytes]:
     """One request. ``headers``: Host, Cookie and so on, with _ for -; the right Host and cookie are sent
     unless they are given, None leaves one out."""
-    fields: dict[str, str | None] = {"Host": f"127.0.0.1:{door.port}", "Cookie": cookie_of(door)}
+    fields: dict[str, str | None] = {
+        "Host": f"127.0.0.1:{gated_server.port}",
+        "Cookie": cookie_of(gated_server),
+    }
     fields.update({name.replace("_", "-"): value for name, value in headers.items()})
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
     try:
         connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
         for name, value in fields.items():
@@ -60,7 +65,7 @@ def ask(door: Door, path: str = "/", **headers: str | None) -> tuple[int, http.c
         connection.close()
 
 
-def knock(door: Door, **headers: str | None) -> int:
+def knock(gated_server: GatedServer, **headers: str | None) -> int:
     """Status of a websocket handshake: 101 is in."""
     handshake: dict[str, str | None] = {
         "Upgrade": "websocket",
@@ -68,30 +73,30 @@ def knock(door: Door, **headers: str | None) -> int:
         "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
         "Sec_WebSocket_Version": "13",
         "Sec_WebSocket_Protocol": PROTOCOL,
-        "Origin": f"http://127.0.0.1:{door.port}",
+        "Origin": f"http://127.0.0.1:{gated_server.port}",
     }
-    return ask(door, "/", **{**handshake, **headers})[0]
+    return ask(gated_server, "/", **{**handshake, **headers})[0]
 
 
-def both(door: Door, **headers: str | None) -> tuple[int, int]:
+def both(gated_server: GatedServer, **headers: str | None) -> tuple[int, int]:
     """Status of a page load and of a websocket handshake."""
-    return ask(door, "/", **headers)[0], knock(door, **headers)
+    return ask(gated_server, "/", **headers)[0], knock(gated_server, **headers)
 
 
 @contextlib.contextmanager
-def client(door: Door) -> Iterator[Connection]:
+def client(gated_server: GatedServer) -> Iterator[Connection]:
     """An authenticated client that viser counts as connected; what it is sent is thrown away."""
-    known = set(door.server.get_clients())
+    known = set(gated_server.server.get_clients())
     with connect(
-        f"ws://127.0.0.1:{door.port}",
+        f"ws://127.0.0.1:{gated_server.port}",
         subprotocols=[PROTOCOL],  # type: ignore[list-item]
-        origin=f"http://127.0.0.1:{door.port}",  # type: ignore[arg-type]
-        additional_headers={"Cookie": cookie_of(door)},
+        origin=f"http://127.0.0.1:{gated_server.port}",  # type: ignore[arg-type]
+        additional_headers={"Cookie": cookie_of(gated_server)},
         max_size=None,
         close_timeout=0.2,
     ) as connection:
         say(connection, CAMERA)
-        until(lambda: set(door.server.get_clients()) - known, "the client")
+        until(lambda: set(gated_server.server.get_clients()) - known, "the client")
         yield connection
 
 

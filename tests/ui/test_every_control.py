@@ -24,7 +24,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.ui.app.workplace import Workplace
 from workbench.ui.server import page_guard
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
 NASTY = (
     *(None, False, 0, 0.5, -1, 1e30, -1e30, 2**63, 2**64 - 1, -(2**63), 1e308, float("nan"), float("inf")),
@@ -43,15 +43,15 @@ ANYTHING = st.recursive(
 class Served:
     """Both pages behind a real door, with a page that only listens."""
 
-    def __init__(self, door: Door, place: Workplace) -> None:
-        self.door, self.place = door, place
+    def __init__(self, gated_server: GatedServer, place: Workplace) -> None:
+        self.gated_server, self.place = gated_server, place
 
     def show(self, which: str) -> None:
         self.place.pages.show(which)  # type: ignore[arg-type]
         assert self.place.pages.wait_for(which, timeout=60)  # type: ignore[arg-type]
 
     def controls(self) -> list[viser.GuiInputHandle]:
-        gui = self.door.server.gui
+        gui = self.gated_server.server.gui
         return inputs_of(gui)
 
 
@@ -59,16 +59,16 @@ class Served:
 def served(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("recordings")
     write(folder, made(5))
-    door = open_door(DoorOptions(port=0))
+    gated_server = open_server(ServerOptions(port=0))
     make_session = functools.partial(Session, recordings=folder, make_worker=scripted(2))
     session = make_session(str(folder / "push.py"), TaskOptions(num_envs=2))
-    place = Workplace(door, folder, make_session, TaskOptions(), session)
+    place = Workplace(gated_server, folder, make_session, TaskOptions(), session)
     place.pages.start("live")
     wait_until(session, lambda view: view.task is not None, "the task")
-    yield Served(door, place)
+    yield Served(gated_server, place)
     place.close()
     session.close()
-    door.close()
+    gated_server.close()
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def listener(served: Served) -> Iterator[Connection]:
         except ConnectionClosed as error:
             closed.append(error)
 
-    with client(served.door) as connection:
+    with client(served.gated_server) as connection:
         thread = threading.Thread(target=listen, args=(connection,))
         thread.start()
         yield connection
@@ -93,13 +93,13 @@ def listener(served: Served) -> Iterator[Connection]:
 
 
 def claim_all(served: Served, values: tuple[object, ...]) -> None:
-    with client(served.door) as attacker:
+    with client(served.gated_server) as attacker:
         for control in served.controls():
             for value in values:
                 # True is a press: that is what a button is for.
                 if not (value is True and isinstance(control, viser.GuiButtonHandle)):
                     say(attacker, claim(control, value))
-        box = served.door.server.gui.add_checkbox("after", False)
+        box = served.gated_server.server.gui.add_checkbox("after", False)
         say(attacker, claim(box, True))
         until(lambda: box.value, "what was said last")
         box.remove()
@@ -114,7 +114,7 @@ def test_no_claim_disturbs_another_page(served, listener, monkeypatch, capfd, wh
     served.show(which)
     assert len(served.controls()) > (30 if which == "live" else 20)
     claim_all(served, NASTY)
-    with client(served.door):  # and a page that comes later is let in and gets all
+    with client(served.gated_server):  # and a page that comes later is let in and gets all
         pass
     printed = capfd.readouterr().err
     assert "Traceback" not in printed

@@ -80,7 +80,7 @@ def open_page(
     from workbench.session.process.debugger import port_for_debugger
     from workbench.session.process.memory_limit import parse_memory
     from workbench.session.process.supervisor import WorkerOptions
-    from workbench.ui.server.gated_server import DoorOptions
+    from workbench.ui.server.gated_server import ServerOptions
 
     try:
         options = envs.options()
@@ -93,7 +93,7 @@ def open_page(
             )
         at_port = port_for_debugger(debug_port) if debug else None
         worker = WorkerOptions(parse_memory(memory_limit), spare, at_port, debug_wait)
-        at = DoorOptions(**vars(page))
+        at = ServerOptions(**vars(page))
     except ValueError as error:
         return refuse(str(error))
     return open_in_terminal(task, options, at, worker, recordings, past, trust)
@@ -169,10 +169,10 @@ def review(
     from workbench.jobs.task import TaskOptions
     from workbench.session.process.memory_limit import parse_memory
     from workbench.session.process.supervisor import WorkerOptions
-    from workbench.ui.server.gated_server import DoorOptions
+    from workbench.ui.server.gated_server import ServerOptions
 
     try:
-        at = DoorOptions(**vars(page))
+        at = ServerOptions(**vars(page))
         base = TaskOptions(rules=rules, imports=imported(imports))
     except ValueError as error:
         return refuse(str(error))

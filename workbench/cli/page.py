@@ -23,17 +23,17 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reader.reading import start_reading
 from workbench.session.live.session import HISTORY_BYTES, Session
 from workbench.session.process.supervisor import WorkerOptions
-from workbench.session.protocol.messages import Event, Failed, Loaded, Loading
+from workbench.session.protocol.messages import Event, Loaded, LoadFailed, Loading
 from workbench.ui.app.workplace import Which, Workplace
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
-from workbench.ui.server.listening import DoorError
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.server.listening import ServerError
 from workbench.ui.widgets.hotkeys import Command
 
 
 def open_in_terminal(
     task: str,
     options: TaskOptions,
-    at: DoorOptions,
+    at: ServerOptions,
     worker: WorkerOptions,
     recordings: Path,
     history_bytes: int,
@@ -44,9 +44,9 @@ def open_in_terminal(
     Args:
         trust: Run what recordings name without asking.
     """
-    door = _opened(at, "Workbench")
-    if isinstance(door, int):
-        return door
+    gated_server = _opened(at, "Workbench")
+    if isinstance(gated_server, int):
+        return gated_server
     end = _End()
     waits_for_a_file = named_file(task) is not None
     begun = 0
@@ -58,7 +58,7 @@ def open_in_terminal(
         print_event(event)
         # A broken file is mended and saved; an env id that cannot be opened has nothing to wait for, and no page to go to.
         if not waits_for_a_file:
-            if isinstance(event, Failed) and not event.kept:
+            if isinstance(event, LoadFailed) and not event.kept:
                 end.now(1)
             elif isinstance(event, Loading):
                 begun += 1
@@ -71,14 +71,14 @@ def open_in_terminal(
     session = _session(task, options, recordings, worker, on_event, history_bytes)
     make_session = _opener(recordings, WorkerOptions(worker.memory_limit))
     base = TaskOptions(rules=options.rules, imports=options.imports)
-    place = Workplace(door, recordings, make_session, base, session, trust=trust, on_notice=warn)
-    _serve(door, place, "live", f"{task}, {options.num_envs} envs", end, session.close)
+    place = Workplace(gated_server, recordings, make_session, base, session, trust=trust, on_notice=warn)
+    _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", end, session.close)
 
 
 def review_in_terminal(
     folder: Path,
     tasks: tuple[Path, ...],
-    at: DoorOptions,
+    at: ServerOptions,
     worker: WorkerOptions,
     base: TaskOptions,
     trust: bool = False,
@@ -89,27 +89,27 @@ def review_in_terminal(
         worker, base: Of tasks that are opened from there.
         trust: Run what recordings name without asking.
     """
-    door = _opened(at, "Recordings")
-    if isinstance(door, int):
-        return door
+    gated_server = _opened(at, "Recordings")
+    if isinstance(gated_server, int):
+        return gated_server
     make_session = _opener(folder, worker)
-    place = Workplace(door, folder, make_session, base, tasks=tasks, trust=trust, on_notice=warn)
+    place = Workplace(gated_server, folder, make_session, base, tasks=tasks, trust=trust, on_notice=warn)
     end = _End()
     end.show_address()
-    _serve(door, place, "review", f"recordings in {folder}", end, lambda: None)
+    _serve(gated_server, place, "review", f"recordings in {folder}", end, lambda: None)
 
 
-def _opened(at: DoorOptions, label: str) -> Door | int:
+def _opened(at: ServerOptions, label: str) -> GatedServer | int:
     """The door, or the exit code where there is none."""
     try:
-        door = open_door(at, label=label)
-    except (ValueError, DoorError) as error:
+        gated_server = open_server(at, label=label)
+    except (ValueError, ServerError) as error:
         return refuse(str(error))
     use_private_driver()
-    for line in (door.warning, door.notice):
+    for line in (gated_server.warning, gated_server.notice):
         if line:
             warn(line)
-    return door
+    return gated_server
 
 
 def _session(
@@ -130,20 +130,25 @@ def _opener(recordings: Path, worker: WorkerOptions) -> Callable[[TaskName, Task
 
 
 def _serve(
-    door: Door, place: Workplace, first: Which, what: str, end: _End, close_session: Callable[[], None]
+    gated_server: GatedServer,
+    place: Workplace,
+    first: Which,
+    what: str,
+    end: _End,
+    close_session: Callable[[], None],
 ) -> NoReturn:
-    if door.options.token:
+    if gated_server.options.token:
         place.commands = (Command("Renew the token and close every page", end.renew),)
     end.at_signals()
     try:
         place.pages.start(first)
         out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
-        end.wait(door)
+        end.wait(gated_server)
     finally:
         out.print("closing")
         place.close()
         close_session()
-        door.close()
+        gated_server.close()
     _leave(end.code)
 
 
@@ -176,15 +181,15 @@ class _End:
         """Say where the page is. Returns at once."""
         self._asked.put("show")
 
-    def wait(self, door: Door) -> None:
+    def wait(self, gated_server: GatedServer) -> None:
         """Return at the end; until then renew the token and say where the page is as often as that is asked for."""
         while (asked := self._next()) != "end":
             if asked == "show":
-                _say_where(door)
-            if asked == "renew" and door.options.token:
-                door.renew_token()
+                _say_where(gated_server)
+            if asked == "renew" and gated_server.options.token:
+                gated_server.renew_token()
                 say("  the token was renewed, and every page was closed; open the new address:")
-                say_addresses(door.addresses())
+                say_addresses(gated_server.addresses())
 
     def _next(self) -> _Asked | None:
         """What is asked for, or None after a while."""
@@ -196,15 +201,15 @@ class _End:
             return None
 
 
-def _say_where(door: Door) -> None:
+def _say_where(gated_server: GatedServer) -> None:
     # Not through rich, which would break the address in a narrow terminal.
-    if door.options.socket is not None:
-        say(f"  socket  {door.options.socket}")
-        say(f"  first   {door.ssh_hint}   on the machine with the browser")
-        say(f"  page    {door.url}   there")
+    if gated_server.options.socket is not None:
+        say(f"  socket  {gated_server.options.socket}")
+        say(f"  first   {gated_server.ssh_hint}   on the machine with the browser")
+        say(f"  page    {gated_server.url}   there")
     else:
-        say_addresses(door.addresses())
-        say(f"  remote  {door.ssh_hint}")
+        say_addresses(gated_server.addresses())
+        say(f"  remote  {gated_server.ssh_hint}")
     say("  Ctrl-C ends it.")
 
 

@@ -15,13 +15,13 @@ from workbench.authoring.problem import TaskError
 from workbench.cli.terminal import err, print_finding, print_problem, progress_bar, refuse, say, warn
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.pool import PoolError
-from workbench.jobs.record import Progress, Recorded, RecordOptions, record, with_given_actions
+from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, record, with_given_actions
 from workbench.recording.reader.reading import mend
 from workbench.recording.writing.publish import try_folder
 from workbench.session.rescore.recordings import hidden_in_words
 
 
-class _Recording:
+class _RecordBar:
     """The bar, and Ctrl-C: while episodes are made it ends the recording in good order; before that, or again, at once."""
 
     def __init__(self, bar: Bar, total: int | None) -> None:
@@ -30,7 +30,7 @@ class _Recording:
         self._began: float | None = None
         """When the first episode began to be made."""
 
-    def __enter__(self) -> _Recording:
+    def __enter__(self) -> _RecordBar:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
         return self
 
@@ -47,7 +47,7 @@ class _Recording:
     def say(self, words: str, kept: int | None = None) -> None:
         self._bar.update(self._row, description=words, completed=kept)
 
-    def show(self, now: Progress) -> None:
+    def show(self, now: RecordProgress) -> None:
         self._began = self._began or time.monotonic()
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.kept)
@@ -69,7 +69,7 @@ def record_in_terminal(what: RecordOptions) -> int:
             warn(left_alone)
         left = (TextColumn("left"), TimeRemainingColumn())
         with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
-            with _Recording(bar, asked.successes or asked.episodes) as shown:
+            with _RecordBar(bar, asked.successes or asked.episodes) as shown:
                 recorded = record(what, shown.say, shown.show, lambda: shown.asked, print_finding)
             shown.say("recorded", len(recorded.written))
     except TaskError as error:

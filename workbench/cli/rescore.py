@@ -37,7 +37,7 @@ from workbench.session.rescore.recordings import (
     Group,
     group_episodes,
     hidden_in_words,
-    judge_each,
+    rescore_each,
     with_renderer,
 )
 
@@ -95,7 +95,7 @@ def rescore_all(
             told.add(finding.key)
             on_finding(finding)
 
-    def judge(group: Group, reference: TaskName) -> None:
+    def rescore_group(group: Group, reference: TaskName) -> None:
         nonlocal steps
         for notice in hidden_in_words(reference):
             if notice not in told:
@@ -121,7 +121,7 @@ def rescore_all(
         finally:
             opened.env.close()
 
-    judge_each(groups, cleared, judge, lambda: verdicts, verdicts.extend)
+    rescore_each(groups, cleared, rescore_group, lambda: verdicts, verdicts.extend)
     place = {file.id: number for number, file in enumerate(files)}
     verdicts.sort(key=lambda verdict: place[verdict.of.id])
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
@@ -199,14 +199,14 @@ def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
 
 
 def _cells(verdict: Verdict[Source]) -> list[str]:
-    judged = not verdict.why_not
+    rescored = not verdict.why_not
     cells = [
         verdict.of.name,
         str(verdict.seed) if verdict.seed >= 0 else "",
-        str(verdict.length) if judged else "",
-        words.returns(verdict) if judged else "",
+        str(verdict.length) if rescored else "",
+        words.returns(verdict) if rescored else "",
         words.what_changed(verdict),
-        words.drift(verdict) if judged else "",
+        words.drift(verdict) if rescored else "",
     ]
     return [plain_text(cell) for cell in cells]
 

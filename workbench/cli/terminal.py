@@ -126,7 +126,7 @@ def print_finding(finding: Finding) -> None:
 
 def print_event(event: Event) -> None:
     """What the page shows of loads and failures, in the terminal as well."""
-    from workbench.session.protocol.messages import Failed, Loaded, RulesBroken
+    from workbench.session.protocol.messages import Loaded, LoadFailed, RulesBroken
 
     if isinstance(event, Loaded):
         parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())
@@ -142,7 +142,7 @@ def print_event(event: Event) -> None:
             if notice not in _told:
                 _told.add(notice)
                 warn(notice)
-    elif isinstance(event, Failed):
+    elif isinstance(event, LoadFailed):
         print_problem(event.problem)
         if event.kept:
             back = "comes back where it was" if event.problem.stage == "worker" else "keeps running"

@@ -32,17 +32,17 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
 
 def _in_page(files: Sequence[Path], host: str, port: int) -> int:
     from workbench.ui.server.file_response import Downloads
-    from workbench.ui.server.gated_server import DoorOptions, open_door
+    from workbench.ui.server.gated_server import ServerOptions, open_server
     from workbench.ui.share.rerun_view import RerunPages
 
     web_viewer_folder()
-    door = open_door(DoorOptions(host=host, port=port))
+    gated_server = open_server(ServerOptions(host=host, port=port))
     try:
-        address = RerunPages(door, Downloads(door)).address(files)
-        if door.warning:
-            warn(door.warning)
-        say_addresses(door.addresses(address))
-        say(f"  remote  {door.ssh_hint}")
+        address = RerunPages(gated_server, Downloads(gated_server)).address(files)
+        if gated_server.warning:
+            warn(gated_server.warning)
+        say_addresses(gated_server.addresses(address))
+        say(f"  remote  {gated_server.ssh_hint}")
         say("  Ctrl-C ends it.")
         while True:
             # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
@@ -50,5 +50,5 @@ def _in_page(files: Sequence[Path], host: str, port: int) -> int:
     except KeyboardInterrupt:
         say("closing")
     finally:
-        door.close()
+        gated_server.close()
     return 0

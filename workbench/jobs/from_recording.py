@@ -149,7 +149,7 @@ _IMPORTED = (".py", ".pyc", ".pyo", ".so", ".pyd", ".pth", ".zip", ".egg")
 """Ends of the names of files that Python imports or reads at an import."""
 
 
-class CannotStepIn(ValueError):
+class CannotEnterRecording(ValueError):
     """The recording cannot be gone into; the message says why, and what to do."""
 
 
@@ -160,7 +160,7 @@ def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
         CannotStepIn: it has no such state.
     """
     if state is not None and not 0 <= state <= episode.length:
-        raise CannotStepIn(f"this episode has states 0 to {episode.length}, and not {state}")
+        raise CannotEnterRecording(f"this episode has states 0 to {episode.length}, and not {state}")
     info = episode.info
     run = RecordedRun(
         name=name_of(info),
@@ -248,11 +248,11 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
         CannotStepIn: as of `recorded_source`.
     """
     if not info.source or info.source_file is None:
-        raise CannotStepIn("this recording does not hold the text of its task")
+        raise CannotEnterRecording("this recording does not hold the text of its task")
     try:
         main, texts = below_one_folder(info.source_file, info.source)
     except NoText as error:
-        raise CannotStepIn(str(error)) from error
+        raise CannotEnterRecording(str(error)) from error
     folder = Path(tempfile.mkdtemp(prefix="workbench-recorded-"))
     try:
         for name, text in texts.items():
@@ -262,7 +262,7 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
         _link_side_files(info, folder)
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise CannotStepIn(f"the recorded text cannot be written: {error}") from error
+        raise CannotEnterRecording(f"the recorded text cannot be written: {error}") from error
     name = _class_of(texts[main], info.task)
     return folder, str(folder / main) if name is None else f"{folder / main}:{name}"
 

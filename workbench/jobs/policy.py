@@ -69,7 +69,7 @@ def load_policy(reference: str, beside: Path | None = None) -> Policy:
     name = str(named)
     if isinstance(named, Path):
         path, name = named, f"workbench_policy_{named.stem}"
-        spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
+        spec = importlib.util.spec_from_file_location(name, path, loader=_PolicyLoader(name, str(path)))
         if spec is None or spec.loader is None:
             raise NoPolicy(f"{path} cannot be imported")
         module = importlib.util.module_from_spec(spec)
@@ -102,7 +102,7 @@ def _hint(name: str, attribute: str, beside: Path | None) -> str:
     return ""
 
 
-class _Loader(importlib.machinery.SourceFileLoader):
+class _PolicyLoader(importlib.machinery.SourceFileLoader):
     """Reads only what a program can be; see `regular_file`."""
 
     def get_data(self, path: str) -> bytes:

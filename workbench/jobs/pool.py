@@ -178,7 +178,7 @@ class Processes:
         self._chunk = chunk
 
     def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
-        pool = _Pool(work, deal, self._chunk)
+        pool = _WorkerPool(work, deal, self._chunk)
         try:
             pool.start()
             pool.serve()
@@ -215,7 +215,7 @@ class _Process:
     """The items that it has and has told nothing of."""
 
 
-class _Pool:
+class _WorkerPool:
     """The processes."""
 
     def __init__(self, work: Work, deal: Deal, chunk: int) -> None:

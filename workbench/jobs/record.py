@@ -68,7 +68,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Progress:
+class RecordProgress:
     kept: int
     """Episodes that are kept so far."""
     steps: int
@@ -129,7 +129,7 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
 def record(
     what: RecordOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: Callable[[RecordProgress], None] = lambda progress: None,
     stop: Callable[[], bool] = lambda: False,
     on_finding: Callable[[Finding], None] = warn_of,
     executor: Executor | None = None,
@@ -150,7 +150,7 @@ def record(
     what, given = with_given_actions(what)
     envs = shares(what.options.num_envs, what.workers)
     setups = [replace(what, options=replace(what.options, num_envs=count)) for count in envs]
-    recording = _Recording(what, on_activity, on_progress, stop, on_finding)
+    recording = _RecordRun(what, on_activity, on_progress, stop, on_finding)
     run = _record_share
     if executor is None and len(setups) == 1:
         executor, run = Here(), partial(_record_share, given=given)
@@ -159,7 +159,7 @@ def record(
     return recording.so_far(stop())
 
 
-class _Recording:
+class _RecordRun:
     """What is heard of the episodes, whoever makes them.
 
     Who wants K successes gets those with the lowest numbers, and that is where order matters: with many envs, or several
@@ -170,7 +170,7 @@ class _Recording:
         self,
         what: RecordOptions,
         on_activity: Callable[[str], None],
-        on_progress: Callable[[Progress], None],
+        on_progress: Callable[[RecordProgress], None],
         stop: Callable[[], bool],
         on_finding: Callable[[Finding], None],
     ) -> None:
@@ -199,14 +199,14 @@ class _Recording:
             self.deal.lower(last + 1)
             for surplus in [number for number in self._kept if number > last]:
                 self._remove(self._kept.pop(surplus))
-        self._on_progress(Progress(len(self._kept), self._steps))
+        self._on_progress(RecordProgress(len(self._kept), self._steps))
 
     def _news(self, news: str | int | Finding) -> None:
         if isinstance(news, str):
             self._on_activity(news)
         elif isinstance(news, int):
             self._steps += news
-            self._on_progress(Progress(len(self._kept), self._steps))
+            self._on_progress(RecordProgress(len(self._kept), self._steps))
         elif news.key not in self._found:
             self._found.add(news.key)
             self._on_finding(news)

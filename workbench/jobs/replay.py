@@ -46,7 +46,7 @@ Way = Literal["re-simulated", "corrected", "put there"]
 
 
 @dataclass(frozen=True)
-class Arrival:
+class ReplayResult:
     """How an env came to a recorded state."""
 
     way: Way
@@ -57,7 +57,7 @@ class Arrival:
     """The same of turning: bodies and joints."""
     corrected: int = 0
     """Steps after which it was put back on the record."""
-    begins_otherwise: bool = False
+    start_differs: bool = False
     """The reset with its seed gave another state than the recorded one, which was put in its place."""
     missed: dict[str, str] = field(default_factory=dict)
     """What could not be put back, and why."""
@@ -67,7 +67,7 @@ class Arrival:
 class Beginning:
     """How an env came to the first state of a run."""
 
-    otherwise: bool
+    differs: bool
     """The reset gave another state, which the recorded one then took the place of."""
     missed: dict[str, str]
     """What could not be put back, and why."""
@@ -108,7 +108,7 @@ def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int
 def put_there(
     opened: OpenedTask, states: Mapping[int, Mapping[str, NDArray]], action: NDArray[np.float32] | None = None
 ) -> StepResult:
-    """Put a recorded state into each of these envs, and let the task say what it is; as `TaskEnv.judge`.
+    """Put a recorded state into each of these envs, and let the task say what it is; as `TaskEnv.rescore`.
 
     Raises:
         TaskError: the task's code raised.
@@ -124,7 +124,7 @@ def arrive(
     state: int,
     env_idx: Sequence[int],
     on_step: Callable[[int], None] = lambda done: None,
-) -> tuple[StepResult, Arrival]:
+) -> tuple[StepResult, ReplayResult]:
     """Let envs stand at one state of a recorded run, all of them at the same; the others are not disturbed.
 
     Args:
@@ -141,7 +141,7 @@ def arrive(
     if not chosen or any(not 0 <= i < task.num_envs for i in chosen):
         raise IndexError(f"env_idx {chosen} is out of range for {task.num_envs} envs")
     others = [i for i in range(task.num_envs) if i not in chosen]
-    why_not = why_not_lived_through(opened, run)
+    why_not = why_not_replayed(opened, run)
     kept, reason = _kept(opened, others)
     why_not = why_not or reason
     corrected = 0
@@ -169,18 +169,18 @@ def arrive(
         step = task.rescore()
     metres, radians = _distance(env, chosen, run.state(state))
     way: Way = "put there" if why_not and state > 0 else "corrected" if corrected else "re-simulated"
-    return step, Arrival(
+    return step, ReplayResult(
         way,
         state,
         metres,
         radians,
         corrected,
-        any(each.otherwise for each in beginnings.values()),
+        any(each.differs for each in beginnings.values()),
         missed,
     )
 
 
-def why_not_lived_through(opened: OpenedTask, run: RecordedRun) -> str:
+def why_not_replayed(opened: OpenedTask, run: RecordedRun) -> str:
     """Why the recorded actions cannot be made; empty where they can."""
     width = actions.width(opened.env.parts)
     recorded = run.action.shape[1] if run.action.ndim == 2 else 0
@@ -224,26 +224,26 @@ def _distance(
     return max(metres for metres, _ in found), max(radians for _, radians in found)
 
 
-def how(arrival: Arrival) -> str:
+def how(replay_result: ReplayResult) -> str:
     """One sentence: the way, and how near it came."""
-    if arrival.way == "put there":
+    if replay_result.way == "put there":
         words = (
             "the recorded state was put in place; contacts, and what the task counts on itself, begin anew"
         )
-    elif arrival.way == "corrected":
+    elif replay_result.way == "corrected":
         words = (
-            f"its actions were made again, and its state put back at {arrival.corrected} of {arrival.steps} steps, "
+            f"its actions were made again, and its state put back at {replay_result.corrected} of {replay_result.steps} steps, "
             "where they had parted"
         )
-    elif arrival.steps == 0:
-        words = "reset with its seed" + (", then its first state put in place" * arrival.begins_otherwise)
+    elif replay_result.steps == 0:
+        words = "reset with its seed" + (", then its first state put in place" * replay_result.start_differs)
     else:
         words = "its actions were made again"
-        words += " from its first state" if arrival.begins_otherwise else " from its seed"
-    if arrival.metres is None:
+        words += " from its first state" if replay_result.start_differs else " from its seed"
+    if replay_result.metres is None:
         words += "; it holds no states to compare with"
-    elif arrival.metres == 0 and not arrival.radians:
+    elif replay_result.metres == 0 and not replay_result.radians:
         words += "; every body is where it was, to the last bit"
     else:
-        words += f"; bodies are within {length(arrival.metres)} of where they were"
+        words += f"; bodies are within {length(replay_result.metres)} of where they were"
     return words + "."

@@ -23,8 +23,8 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.snapshot import step_only
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.open_task import OpenedTask, blamed, step_checked
-from workbench.jobs.replay import begin_again, put_there, why_not_lived_through
-from workbench.jobs.verdict import Rescore, Rescored, Said, Verdict, compare, single_numbers
+from workbench.jobs.replay import begin_again, put_there, why_not_replayed
+from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, single_numbers
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.source import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_source
@@ -42,7 +42,7 @@ class _Seat:
     run: RecordedRun
     missed: dict[str, str]
     """What of it cannot be read or be put into the env, and why."""
-    begins_otherwise: bool = False
+    start_differs: bool = False
     reward: list[float] = field(default_factory=list)
     """(T,) What the task says of it now, as the following."""
     evaluate: dict[str, list[float]] = field(default_factory=dict)
@@ -62,12 +62,12 @@ class _Seat:
         now = {name: np.array(rows) for name, rows in self.evaluate.items()}
         return compare(
             self.file,
-            Said(old, single_numbers(run.evaluate)),
-            Said(np.array(self.reward), now),
+            Scores(old, single_numbers(run.evaluate)),
+            Scores(np.array(self.reward), now),
             np.array(self.drift) if run.env_states else None,
             task=self.task,
             seed=run.seed,
-            begins_otherwise=self.begins_otherwise,
+            start_differs=self.start_differs,
             missed=self.missed,
         )
 
@@ -158,7 +158,7 @@ def _ready(
     except (UnreadableRecording, OSError) as error:
         return Verdict(file, why_not=str(error))
     run, info = run_of(episode), episode.info
-    why_not = why_not_lived_through(opened, run)
+    why_not = why_not_replayed(opened, run)
     if run.length == 0:
         why_not = "it has no step"
     elif use_env_states and not run.env_states:
@@ -176,7 +176,7 @@ def _begin(opened: OpenedTask, seats: dict[int, _Seat]) -> None:
         first = task.rescore()
     now = read_states(task.env)
     for env, seat in seats.items():
-        seat.begins_otherwise = beginnings[env].otherwise
+        seat.start_differs = beginnings[env].differs
         seat.missed = beginnings[env].missed | seat.missed
         _hear(seat, first, env, now)
 

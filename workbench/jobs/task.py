@@ -98,7 +98,7 @@ NO_MOMENT = -1
 
 @dataclass(frozen=True)
 class Restored:
-    """What a `Restore` or a `StepBack` did."""
+    """What a `Restore` or a `EnterRecording` did."""
 
     env_idx: tuple[int, ...]
     source: tuple[int, ...]
@@ -107,12 +107,12 @@ class Restored:
     not_carried: dict[str, str]
     """What could not be put back, and why; empty within one version of a task."""
     recording: str = ""
-    """Of a `StepBack`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
+    """Of a `EnterRecording`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
     how: str = ""
     """How the state was come to, in a sentence; empty where it was put there."""
     number: int = 0
-    """Of the `StepBack` that it answers; 0 for a `Restore`."""
-    lived_through: tuple[int, ...] = ()
+    """Of the `EnterRecording` that it answers; 0 for a `Restore`."""
+    replayed: tuple[int, ...] = ()
     """The envs that came there by the steps that led to it. For them it is no exact point, as a state that is put there
     is, from which the same actions give the same bits."""
 

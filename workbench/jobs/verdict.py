@@ -28,7 +28,7 @@ Of = TypeVar("Of")
 
 
 @dataclass(frozen=True)
-class Said:
+class Scores:
     """What a task says of a run, as far as it is one number or flag."""
 
     reward: NDArray
@@ -66,7 +66,7 @@ class Verdict(Generic[Of]):
     """How much the body or joint that was turned most was."""
     drift_at: int | None = None
     """The step after which the body was furthest."""
-    begins_otherwise: bool = False
+    start_differs: bool = False
     """The reset with its seed gave another first state, and the recorded one was put in its place."""
     missed: dict[str, str] = field(default_factory=dict)
     """What of the record could not be put into the env, and why."""
@@ -95,14 +95,14 @@ class Verdict(Generic[Of]):
 
 def compare(
     of: Of,
-    old: Said,
-    new: Said,
+    old: Scores,
+    new: Scores,
     drift: NDArray | None = None,
     *,
     begin: int = 0,
     task: str = "",
     seed: int = -1,
-    begins_otherwise: bool = False,
+    start_differs: bool = False,
     missed: Mapping[str, str] | None = None,
 ) -> Verdict[Of]:
     """Compare what was recorded with what is said now.
@@ -161,7 +161,7 @@ def compare(
         metres=metres,
         radians=radians,
         drift_at=drift_at,
-        begins_otherwise=begins_otherwise,
+        start_differs=start_differs,
         missed=dict(missed or {}),
         old_reward=was[0, 1:].astype(np.float32),
         new_reward=np.asarray(new.reward, np.float32),

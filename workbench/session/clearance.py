@@ -134,7 +134,7 @@ Ask = Callable[[TrustQuestion, Callable[[], bool]], Consent]
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CodeToRun:
     """Something that would run."""
 
     reference: TaskName
@@ -177,7 +177,7 @@ class Clearances:
         """Whether there is a person to ask."""
         return self._ask is not None
 
-    def clear(self, wanted: Wanted, stopped: Callable[[], bool] = lambda: False) -> TaskName:
+    def clear(self, wanted: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
         """What may be opened for it; asks if need be, and waits for the answer.
 
         Raises:
@@ -189,11 +189,11 @@ class Clearances:
         return cleared
 
     def clear_all(
-        self, wanted: Sequence[Wanted], stopped: Callable[[], bool] = lambda: False
+        self, wanted: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
     ) -> list[TaskName | NotCleared]:
         """The same for several; each text is asked about once."""
         found = [self._without_asking(one) for one in wanted]
-        open_ones: dict[str, tuple[Wanted, _Open]] = {}
+        open_ones: dict[str, tuple[CodeToRun, _Open]] = {}
         for one, its in zip(wanted, found):
             if isinstance(its, _Open):
                 open_ones.setdefault(its.content.hash, (one, its))
@@ -239,7 +239,7 @@ class Clearances:
             f"({', '.join(named[:3])}), which it may only with --trust on the command line"
         )
 
-    def _without_asking(self, wanted: Wanted) -> TaskName | NotCleared | _Open:
+    def _without_asking(self, wanted: CodeToRun) -> TaskName | NotCleared | _Open:
         """What may be opened; or the texts that have to be asked about."""
         made = made_here(wanted.info)
         if (why := self.why_not_its_arguments(wanted.info, made)) is not None:
@@ -270,7 +270,7 @@ class Clearances:
             return _approved(wanted, content)
         return _Open(content, agreed)
 
-    def _question(self, wanted: Wanted, its: _Open) -> TrustQuestion:
+    def _question(self, wanted: CodeToRun, its: _Open) -> TrustQuestion:
         content = its.content
         before = None if wanted.recorded_text or its.agreed else self._store.trusted_before(content)
         return TrustQuestion(
@@ -358,7 +358,7 @@ def recorded_content(info: EpisodeInfo) -> TaskContent:
     return TaskContent(main, {main: texts[main], **texts})
 
 
-def _approved(wanted: Wanted, content: TaskContent) -> TaskName:
+def _approved(wanted: CodeToRun, content: TaskContent) -> TaskName:
     if wanted.recorded_text or isinstance(wanted.reference, str):
         return wanted.reference
     return replace(wanted.reference, file=content.main, approved=content.texts)

@@ -21,7 +21,7 @@ from workbench.authoring.camera_source.cameras import HOOKS as KINDS
 from workbench.authoring.camera_source.cameras import Ran, Run
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls, owners
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraKey, CameraSettings
 
 FILE = "/author/task.py"
@@ -51,11 +51,11 @@ def unit(quaternion: Sequence[float]) -> tuple[float, float, float, float]:
     return w, x, y, z
 
 
-def planned(plan: Callable[..., SourceEdit], *given: object) -> SourceEdit | Refused:
+def planned(plan: Callable[..., SourceEdit], *given: object) -> SourceEdit | RefusedEdit:
     """What comes of a plan."""
     try:
         return plan(*given)
-    except Refused as refused:
+    except RefusedEdit as refused:
         return refused
 
 
@@ -107,7 +107,7 @@ def run_class(sources: Mapping[str, str], class_name: str = "Task") -> Ran:
             }
             return Ran({key: camera_run(config, noted) for key, config in configs.items()}, owners(cls))
     except (SyntaxError, NameError, TypeError, AttributeError) as error:
-        raise Refused(f"with it the file fails: {error}") from error
+        raise RefusedEdit(f"with it the file fails: {error}") from error
 
 
 def run_as(class_name: str) -> Run:

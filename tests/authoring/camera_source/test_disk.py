@@ -16,7 +16,7 @@ from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source.disk import FileChange, SourceEdit, apply, revert
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.loading.modules import exact_text
-from workbench.authoring.source.text import Refused, plain_line_ends
+from workbench.authoring.source.text import RefusedEdit, plain_line_ends
 
 SOURCE = WRITTEN["an argument a line, with remarks"]
 
@@ -31,7 +31,7 @@ def planned(path: Path) -> SourceEdit:
 
 
 def refusal(do: Callable[[SourceEdit], None], edit: SourceEdit) -> str:
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RefusedEdit) as caught:
         do(edit)
     return caught.value.reason
 

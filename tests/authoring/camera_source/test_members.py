@@ -25,7 +25,7 @@ from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraKind, CameraSettings
 from workbench.core.cameras.conventions import LookAt, pose_from_look_at, with_pose
 
@@ -53,7 +53,7 @@ def same_cameras(a: dict[tuple[str, str], CameraSettings], b: dict[tuple[str, st
 def test_a_camera_is_added_last(name: str) -> None:
     source = WRITTEN[name]
     plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    if isinstance(plan, Refused):
+    if isinstance(plan, RefusedEdit):
         assert "branches with" in name and "2 returns" in plan.reason and plan.snippet
         return
     assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
@@ -73,7 +73,7 @@ def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
     assert isinstance(again, SourceEdit) and not again.notes
     assert list(cameras(again.new_text)) == [(hook, "added"), (hook, "more")]
     twice = planned(plan_add, {FILE: plan.new_text}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
-    assert isinstance(twice, Refused) and "already" in twice.reason
+    assert isinstance(twice, RefusedEdit) and "already" in twice.reason
 
 
 def test_what_cannot_be_added_to_is_refused() -> None:
@@ -86,17 +86,17 @@ def test_what_cannot_be_added_to_is_refused() -> None:
         NEW,
         run_as("Task"),
     )
-    assert isinstance(plan, Refused) and "neither" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "neither" in plan.reason
     assert 'CameraConfig(\n    "added"' in plan.snippet
     parent = WRITTEN["a pose of nothing"] + "\n\nclass Child(Task):\n    pass\n"
     plan = planned(plan_add, {FILE: parent}, FILE, "Child", ("sensor", "added"), NEW, run_as("Child"))
-    assert isinstance(plan, Refused) and "inherits" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "inherits" in plan.reason
     library = "from mani_skill.envs.tasks import PickCubeEnv\n\n\nclass Task(PickCubeEnv):\n    pass\n"
     plan = planned(plan_add, {FILE: library}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    assert isinstance(plan, Refused) and "would take away" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "would take away" in plan.reason
     for name in ("no name", 'x"); import os; ("', ""):
         plan = planned(plan_add, {FILE: parent}, FILE, "Task", ("sensor", name), NEW, run_as("Task"))
-        assert isinstance(plan, Refused) and "is not a name" in plan.reason
+        assert isinstance(plan, RefusedEdit) and "is not a name" in plan.reason
 
 
 @pytest.mark.parametrize("name", ["sapien", "CameraConfig"])
@@ -109,7 +109,7 @@ def test_a_name_that_means_something_else_in_the_file_is_not_imported_over_it(na
     plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
     line = source.splitlines().index(f"{name} = 2") + 1
     assert (
-        isinstance(plan, Refused)
+        isinstance(plan, RefusedEdit)
         and f"`{name}` means something else in this file (line {line})" in plan.reason
     )
     free = source.replace(f"{name} = 1\n{name} = 2\n", "")
@@ -124,7 +124,7 @@ def test_a_copy_stands_beside_its_original(name: str) -> None:
     now = cameras(source)
     key = next(key for key in now if key[1] == "cam")
     plan = planned(plan_duplicate, {FILE: source}, key_of(source), "copy", now[key], run_class)
-    if isinstance(plan, Refused):
+    if isinstance(plan, RefusedEdit):
         assert "stands alone" in plan.reason and plan.snippet
         assert name in ALONE
         return
@@ -143,7 +143,7 @@ def test_a_camera_has_another_name(name: str) -> None:
     other = next((uid for _, uid in now if uid != "cam"), None)
     if other is not None:
         assert isinstance(
-            planned(plan_rename, {FILE: source}, key_of(source), other, now[key], run_class), Refused
+            planned(plan_rename, {FILE: source}, key_of(source), other, now[key], run_class), RefusedEdit
         )
 
 
@@ -151,7 +151,7 @@ def test_a_camera_has_another_name(name: str) -> None:
 def test_a_camera_is_taken_out(name: str) -> None:
     source = WRITTEN[name]
     plan = planned(plan_remove, {FILE: source}, key_of(source), run_class)
-    if isinstance(plan, Refused):
+    if isinstance(plan, RefusedEdit):
         assert "by hand" in plan.reason
         assert name in ALONE
         return
@@ -167,7 +167,7 @@ def test_what_is_made_in_a_loop_is_refused() -> None:
         planned(plan_rename, {FILE: source}, key_of(source), "front", NEW, run_class),
         planned(plan_duplicate, {FILE: source}, key_of(source), "front", NEW, run_class),
     ):
-        assert isinstance(plan, Refused) and "loop" in plan.reason
+        assert isinstance(plan, RefusedEdit) and "loop" in plan.reason
 
 
 def test_settings_are_those_that_are_written() -> None:
@@ -296,8 +296,8 @@ def test_a_file_of_windows_is_edited_as_any_other_and_keeps_its_line_ends(name: 
         lambda source: planned(plan_remove, {FILE: source}, key, run_class),
     ):
         one, other = (plan(source) for source in sources)
-        if isinstance(one, Refused):
-            assert isinstance(other, Refused) and vars(other) == vars(one)
+        if isinstance(one, RefusedEdit):
+            assert isinstance(other, RefusedEdit) and vars(other) == vars(one)
         else:
             assert isinstance(other, SourceEdit) and other.old_text == sources[1]
             assert other.new_text == one.new_text.replace("\n", "\r\n")

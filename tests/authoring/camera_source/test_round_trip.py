@@ -25,7 +25,7 @@ from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source.cameras import changed_fields
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import angle_between
 
@@ -84,7 +84,7 @@ def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
     after = dataclasses.replace(before, position=pose[0], quaternion=pose[1], fov=fov or before.fov)
     assume(changed_fields(before, after))
     plan = planned(plan_edit, {FILE: source}, KEY, before, after, run_class)
-    if isinstance(plan, Refused):
+    if isinstance(plan, RefusedEdit):
         assert "smaller than what is written" in plan.reason
         assume(False)
     assert isinstance(plan, SourceEdit) and plan.settings is not None

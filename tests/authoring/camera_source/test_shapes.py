@@ -25,7 +25,7 @@ from tests.authoring.camera_source.real_cameras import (
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import angle_between
 
@@ -64,7 +64,7 @@ def test_what_is_written_is_what_maniskill_then_makes(name: str, edit: Edit) -> 
     after = edit(before)
     plan = planned(plan_edit, {FILE: source}, key_of(source), before, after, run_class)
     if name == "more arguments by **" and edit is lens:
-        assert isinstance(plan, Refused) and "`near` is given by * or **" in plan.reason
+        assert isinstance(plan, RefusedEdit) and "`near` is given by * or **" in plan.reason
         return
     assert isinstance(plan, SourceEdit), plan
     assert plan.settings is not None
@@ -100,7 +100,7 @@ def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: s
     before = real_settings({FILE: source}, "cam")
     after = level(before)
     plan = planned(plan_edit, {FILE: source}, key_of(source), before, after, run_class)
-    assert isinstance(plan, Refused), plan.diff
+    assert isinstance(plan, RefusedEdit), plan.diff
     assert reason in plan.reason
     assert ast.parse(plan.snippet)
     # What it gives to copy is the camera that was asked for.

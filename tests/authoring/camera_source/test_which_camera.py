@@ -15,7 +15,7 @@ from tests.authoring.camera_source.real_cameras import FILE, HEADER, planned, re
 from workbench.authoring.camera_source.cameras import Ran, Run
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.authoring.source.trace import Place, Read
 from workbench.core.camera_data import CallSite, CameraKey, CameraSettings
 
@@ -48,7 +48,7 @@ def higher(now: CameraSettings) -> CameraSettings:
     return dataclasses.replace(now, position=(0.5, 0.0, 0.75))
 
 
-def edited_line(plan: SourceEdit | Refused) -> int:
+def edited_line(plan: SourceEdit | RefusedEdit) -> int:
     assert isinstance(plan, SourceEdit), plan
     pairs = zip(plan.old_text.splitlines(), plan.new_text.splitlines(), strict=True)
     (line,) = [number for number, (old, new) in enumerate(pairs, 1) if old != new]
@@ -110,7 +110,7 @@ def test_what_is_no_camera_never_reaches_the_file(change: dict[str, Any]) -> Non
     plan = planned(
         plan_edit, {FILE: TWO}, ("sensor", "cam"), before, dataclasses.replace(before, **change), run_class
     )
-    assert isinstance(plan, Refused) and not plan.snippet
+    assert isinstance(plan, RefusedEdit) and not plan.snippet
 
 
 def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
@@ -120,7 +120,7 @@ def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
     )
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     plan = planned(plan_edit, {FILE: source}, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refused) and "    mount=self.camera_link,\n" in plan.snippet
+    assert isinstance(plan, RefusedEdit) and "    mount=self.camera_link,\n" in plan.snippet
 
 
 def told(ran: Ran, **changes: Any) -> Run:
@@ -145,7 +145,7 @@ def test_a_place_that_is_none_is_refused(changes: dict[str, Any], reason: str) -
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     run = told(run_class({FILE: TWO}), **changes)
     plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), run)
-    assert isinstance(plan, Refused) and reason in plan.reason
+    assert isinstance(plan, RefusedEdit) and reason in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet
 
 
@@ -178,22 +178,22 @@ def test_a_worker_that_lies_about_places_changes_nothing(place: Place, reason: s
         lie = dataclasses.replace(pose, parts={**pose.parts, "p": vector})
         trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
     plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), told(ran, trace=trace))
-    assert isinstance(plan, Refused) and reason in plan.reason
+    assert isinstance(plan, RefusedEdit) and reason in plan.reason
 
 
 def test_an_installed_file_is_left_alone() -> None:
     path = "/usr/lib/python3/site-packages/mani_skill/envs/tasks/task.py"
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     plan = planned(plan_edit, {path: TWO}, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refused) and "copy the task" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "copy the task" in plan.reason
 
 
 def test_what_is_not_in_the_files_or_not_python_is_refused() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     plan = planned(plan_edit, {FILE: TWO}, ("sensor", "hand"), before, higher(before), run_class)
-    assert isinstance(plan, Refused) and "'hand'" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "'hand'" in plan.reason
     plan = planned(plan_edit, {FILE: "cam = (\n"}, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refused) and "not valid Python" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "not valid Python" in plan.reason
 
 
 def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None:
@@ -211,7 +211,7 @@ def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None
         higher(before),
         run_class,
     )
-    assert isinstance(plan, Refused) and "is given by * or **" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "is given by * or **" in plan.reason
     handed_on = TWO.replace("from mani_skill.sensors.camera import", "from mani_skill.sensors import")
     assert (
         edited_line(
@@ -304,7 +304,7 @@ def test_a_change_that_would_not_be_seen_in_what_is_written_is_refused() -> None
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     after = dataclasses.replace(before, position=(0.5, 0.0, 0.50003))
     plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, after, run_class)
-    assert isinstance(plan, Refused) and "smaller than what is written" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "smaller than what is written" in plan.reason
 
 
 SHARED = dedent(
@@ -378,12 +378,14 @@ def test_what_an_argument_of_the_env_decides_is_left_alone_and_said() -> None:
     plan = planned(
         plan_edit, {FILE: TWO}, ("sensor", "cam"), running, dataclasses.replace(running, width=320), run_class
     )
-    assert isinstance(plan, Refused) and "gym.make" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "gym.make" in plan.reason
 
 
 def test_nothing_changed_is_said() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    assert isinstance(planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, before, run_class), Refused)
+    assert isinstance(
+        planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, before, run_class), RefusedEdit
+    )
 
 
 def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
@@ -439,5 +441,5 @@ def test_a_change_that_another_camera_would_make_too_is_refused() -> None:
     sources = {FILE: source, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, Refused) and "of the camera hand as well" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "of the camera hand as well" in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet

@@ -120,7 +120,9 @@ def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path)
 
 
 def test_robots_are_those_asked_for_or_the_constructors_default() -> None:
-    push, door = REGISTERED_ENVS["PushCube-v1"].cls, REGISTERED_ENVS["PickCubeWidowXAI-v1"].cls
+    push, gated_server = REGISTERED_ENVS["PushCube-v1"].cls, REGISTERED_ENVS["PickCubeWidowXAI-v1"].cls
     assert robots_of(push, {}) == "panda"
     assert robots_of(push, {"robot_uids": "fetch"}) == "fetch"
-    assert robots_of(door, {}) is None, "it hands on another one than the constructor that it overrides"
+    assert robots_of(gated_server, {}) is None, (
+        "it hands on another one than the constructor that it overrides"
+    )

@@ -15,7 +15,7 @@ from workbench.core.env.task_env import TaskEnv
 N = 4
 
 
-class Door(PushCubeEnv):
+class GatedServer(PushCubeEnv):
     """With a hinge that is driven."""
 
     where = ""
@@ -34,8 +34,8 @@ class Door(PushCubeEnv):
         leaf.set_joint_name("hinge")
         leaf.set_joint_properties("revolute", [[-2, 2]], sapien.Pose(), sapien.Pose())
         builder.initial_pose = sapien.Pose([0, 1, 1])
-        self.door = builder.build("door", fix_root_link=True)
-        self.hinge = self.door.active_joints[0]
+        self.gated_server = builder.build("door", fix_root_link=True)
+        self.hinge = self.gated_server.active_joints[0]
         self.hinge.set_drive_properties(100, 10)
         self.drive("_load_scene", self.num_envs)
 
@@ -50,19 +50,19 @@ class Door(PushCubeEnv):
     def drive(self, where: str, rows: int) -> None:
         if where != self.where:
             return
-        door: Any = self.door
+        gated_server: Any = self.gated_server
         if self.one_joint and self.velocity:
             self.hinge.set_drive_velocity_target(torch.full((rows,), 0.5))
         elif self.one_joint:
             self.hinge.set_drive_target(torch.full((rows,), 0.5))
         elif self.velocity:
-            door.set_joint_drive_velocity_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
+            gated_server.set_joint_drive_velocity_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
         else:
-            door.set_joint_drive_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
+            gated_server.set_joint_drive_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
 
 
 def made(**attributes: Any) -> TaskEnv:
-    task = type("Door", (Door,), attributes)
+    task = type("GatedServer", (GatedServer,), attributes)
     return TaskEnv(batched(task, N))
 
 
@@ -83,7 +83,7 @@ def test_set_where_the_message_says_it_drives(where: str) -> None:
     task.reset(env_idx=[1, 2])
     for _ in range(30):
         task.step(None)
-    assert torch.allclose(env.door.qpos, torch.full((N, 1), 0.5), atol=0.05)
+    assert torch.allclose(env.gated_server.qpos, torch.full((N, 1), 0.5), atol=0.05)
     task.close()
 
 
@@ -110,7 +110,9 @@ def test_a_target_that_is_no_number_is_refused_with_the_name_and_the_env(velocit
     task: Any = made()
     task.reset(0)
     set_targets = (
-        task.env.door.set_joint_drive_velocity_targets if velocity else task.env.door.set_joint_drive_targets
+        task.env.gated_server.set_joint_drive_velocity_targets
+        if velocity
+        else task.env.gated_server.set_joint_drive_targets
     )
     set_targets(torch.tensor([[0.1], [0.1], [torch.nan], [0.1]]), joints=[task.env.hinge])
     with pytest.raises(ValueError, match="^door of env 2: .* NaN"):

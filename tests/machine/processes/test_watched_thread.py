@@ -8,7 +8,7 @@ import pytest
 from tests.drive.waiting import until
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening, watched_thread
-from workbench.session.process.job_lane import Job, Lane
+from workbench.session.process.job_lane import Job, JobLane
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_a_job_that_fails_unforeseen_is_told_and_the_next_is_done(said: list[str
     def broken(job: Job) -> None:
         raise AttributeError("no such thing")
 
-    lane = Lane("lane", lambda: None, lambda job, failure: failed.append(str(failure)))
+    lane = JobLane("lane", lambda: None, lambda job, failure: failed.append(str(failure)))
     lane.start("counting", broken)
     until(lambda: failed, "the failure")
     lane.start("counting", lambda job: done.set())
@@ -80,7 +80,7 @@ def test_a_lane_whose_listener_fails_goes_on(said: list[str]) -> None:
         if threading.current_thread().name == "lane" and len(said) == 0:
             raise RuntimeError("the page is gone")
 
-    lane = Lane("lane", on_change, lambda job, failure: None)
+    lane = JobLane("lane", on_change, lambda job, failure: None)
     lane.start("one", lambda job: None)
     until(lambda: said, "a word of it")
     lane.start("two", lambda job: done.set())

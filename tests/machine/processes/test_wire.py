@@ -25,7 +25,7 @@ from workbench.jobs.task import Stepped, TaskOptions
 from workbench.jobs.verdict import Rescore
 from workbench.machine.processes.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
 from workbench.recording.episode.source import Source
-from workbench.session.protocol.messages import Event, Failed, Load, Loaded, Loading, Status
+from workbench.session.protocol.messages import Event, Load, Loaded, LoadFailed, Loading, Status
 from workbench.session.protocol.questions import QUESTIONS
 
 EVENTS: tuple[type, ...] = get_args(Event)
@@ -242,7 +242,7 @@ def array(name: str, shape: tuple[int, ...], code: int = 1) -> msgspec.msgpack.E
         (framed(("Load", None, {})), "it was a Load, which is no message"),
         (framed(("Loading", 3, {"activity": "x"})), "it was a Loading, which is no message"),
         (framed(["Loading"]), "at least|length"),
-        (framed(("Failed", None, {"problem": None, "kept": True})), "Expected `object`"),
+        (framed(("LoadFailed", None, {"problem": None, "kept": True})), "Expected `object`"),
     ],
 )
 def test_what_is_no_message_is_said_to_be_unreadable(sent: bytes, says: str) -> None:
@@ -289,7 +289,9 @@ def test_bytes_that_changed_on_the_way_raise_nothing_else(seed: int) -> None:
 
 def test_a_failure_without_its_author_s_file_is_one(tmp_path: Path) -> None:
     with pytest.raises(Unreadable):
-        Unpacker([Failed]).message(framed(("Failed", None, {"problem": {"stage": "step"}, "kept": False})))
+        Unpacker([LoadFailed]).message(
+            framed(("LoadFailed", None, {"problem": {"stage": "step"}, "kept": False}))
+        )
 
 
 def test_a_path_is_the_bytes_that_the_disk_has_and_nothing_else_is_one() -> None:

@@ -52,7 +52,7 @@ def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
     obs, info = env.reset(seed=SEED)
     env.action_space.seed(SEED)
     rows: dict[str, list[Any]] = {name: [] for name in ("action", "reward", "terminated", "truncated")}
-    states, seen, judged = [flat(base.get_state_dict())], [flat(obs)], [base.evaluate()]
+    states, seen, rescored = [flat(base.get_state_dict())], [flat(obs)], [base.evaluate()]
     for _ in range(STEPS):
         action = env.action_space.sample()
         obs, reward, terminated, truncated, info = env.step(action)
@@ -60,7 +60,7 @@ def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
             rows[name].append(value)
         states.append(flat(base.get_state_dict()))
         seen.append(flat(obs))
-        judged.append(base.evaluate())
+        rescored.append(base.evaluate())
     actions = np.stack(rows["action"]).astype(np.float32)
     episode = Made(
         info=EpisodeInfo(
@@ -84,7 +84,7 @@ def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
         reward=np.array(rows["reward"], np.float32),
         terminated=np.array(rows["terminated"]),
         truncated=np.array(rows["truncated"]),
-        evaluate=stacked([flat(one) for one in judged]),
+        evaluate=stacked([flat(one) for one in rescored]),
         cameras=[],
         env_states=stacked(states),
         obs=stacked(seen),

@@ -320,12 +320,12 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
 
 
 def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
-    session.studio.judging.judge()
+    session.studio.reports.measure()
     report = settled(session, lambda s: s.looked.report_of == BASE, "the judgement").looked.report
     assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.studio.judging.make_sheet()
+    session.studio.reports.make_sheet()
     sheet = settled(session, lambda s: len(s.looked.sheet) == 2, "the pictures of all envs").looked.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
     # Turned to the sky.
@@ -333,10 +333,10 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
     session.studio.place(BASE, away)
     assert session.view().studio.report_stale
-    session.studio.judging.judge()
+    session.studio.reports.measure()
     studio = settled(session, lambda s: s.looked.report is not report, "the judgement of the placement")
     assert studio.looked.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
-    session.studio.judging.compare(start)
+    session.studio.reports.compare(start)
     pair = settled(session, lambda s: s.looked.compared is not None, "the comparison").looked.compared
     assert pair is not None
     here, there = pair
@@ -347,7 +347,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
 def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
     start_over(session, 0)
     step(session, 4)
-    session.studio.judging.judge_steps()
+    session.studio.reports.measure_steps()
     studio = settled(session, lambda s: len(s.looked.report_moments) == 5, "five moments")
     assert [moment.step for moment in studio.looked.report_moments] == [0, 1, 2, 3, 4]
     assert {moment.env for moment in studio.looked.report_moments} == {0} == set(studio.looked.report.envs)
@@ -355,7 +355,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     assert cube.summary().seen == 1.0
     session.past.seek(studio.looked.report_moments[2].serial)
     assert session.view().step.elapsed_steps[0] == 2
-    session.studio.judging.judge_steps(2)
+    session.studio.reports.measure_steps(2)
     moments = settled(session, lambda s: len(s.looked.report_moments) == 2, "its ends").looked.report_moments
     assert [moment.step for moment in moments] == [0, 4], (
         "of the whole episode, also where a moment in it is shown"
@@ -363,7 +363,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     session.reset()
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
     session.past.seek(None)
-    session.studio.judging.judge_steps()
+    session.studio.reports.measure_steps()
     settled(session, lambda s: len(s.looked.report_moments) == 1, "the episode that has just begun")
 
 
@@ -374,7 +374,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
     x, y, z = (float(v) for v in cube[:3])
     beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
     session.studio.place(BASE, beside)
-    session.studio.judging.pick(0.5, 0.5)
+    session.studio.reports.pick(0.5, 0.5)
     picked = settled(session, lambda s: s.looked.picked is not None, "the pixel").looked.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
     assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
@@ -382,27 +382,29 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
 
 def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
     studio = session.studio
-    studio.judging.judge(3)
+    studio.reports.measure(3)
     assert session.view().studio.progress is not None
     found = settled(session, lambda s: s.looked.report_seeds == 3, "three seeds")
-    assert len(found.looked.report.envs) == 3 and found.looked.report_of == BASE and not found.looked.judging
-    studio.judging.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+    assert (
+        len(found.looked.report.envs) == 3 and found.looked.report_of == BASE and not found.looked.measuring
+    )
+    studio.reports.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
     offered = settled(session, lambda s: len(s.looked.suggestions) > 0, "suggestions").looked.suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
     studio.take_suggestion(0)
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
-    studio.judging.judge(500)
+    studio.reports.measure(500)
     wait_until(
         session,
-        said(lambda s: s.looked.judging and s.looked.report is not None),
+        said(lambda s: s.looked.measuring and s.looked.report is not None),
         "what is known, as from before",
     )
     wait_until(
         session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
-    studio.judging.stop()
-    wait_until(session, said(lambda s: s.progress is None and not s.looked.judging), "its end")
-    studio.judging.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
+    studio.reports.stop()
+    wait_until(session, said(lambda s: s.progress is None and not s.looked.measuring), "its end")
+    studio.reports.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
     wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
 
 

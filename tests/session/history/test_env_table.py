@@ -152,8 +152,11 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(event
     for env, episode in enumerate(episodes):
         kept = rows.rewards[env]
         assert kept[np.isfinite(kept)].tolist() == episode.rewards[-KEPT_REWARDS:]
-        lived = [(m.serial, int(m.step.elapsed_steps[of])) for m, of in history.lived(env, history.last)]
-        assert [step for _, step in lived] == list(range(episode.steps, -1, -1))
+        episode_backwards = [
+            (m.serial, int(m.step.elapsed_steps[of]))
+            for m, of in history.episode_backwards(env, history.last)
+        ]
+        assert [step for _, step in episode_backwards] == list(range(episode.steps, -1, -1))
     assert rows.last.steps.tolist() == [-1 if e is None else e.end for e in last]
     assert rows.last.outcome.tolist() == [0 if e is None else e.outcome for e in last]
     assert rows.last.total.tolist() == [0 if e is None else e.total for e in last]

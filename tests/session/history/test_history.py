@@ -22,7 +22,7 @@ from workbench.session.history.history import (
     History,
 )
 from workbench.session.protocol.messages import PastPictures, Pictures
-from workbench.session.rescore.past import Judgement
+from workbench.session.rescore.past import RescoredPast
 
 
 def picture(env: int, size: int = 64, kind: CameraKind = "sensor", name: str = "eye") -> Picture:
@@ -282,8 +282,8 @@ def test_what_a_newer_version_says_of_a_moment_is_not_its_record() -> None:
     moment = history.at(2)
     assert moment is not None and moment.as_recorded is first and moment.step.reward[0] == 8.0
     assert history.rewards(0, 2, 2).tolist() == [8.0]
-    judged = Judgement(history).curve("reward", 0)
-    assert judged is not None and judged.old.tolist() == [1.0, 2.0]
+    rescored = RescoredPast(history).curve("reward", 0)
+    assert rescored is not None and rescored.old.tolist() == [1.0, 2.0]
 
 
 def test_the_first_reward_of_an_episode_that_is_no_number_is_an_event() -> None:
@@ -312,9 +312,9 @@ def test_the_moments_of_an_episode_are_its_steps_through_what_it_was_put_back_to
     history.add(stepped(7))
     history.add(stepped(8, jumped=(2,)))  # another env's reset is no step
     history.add(stepped(9))
-    lived = history.episode(0, 7, 100)
+    episode_backwards = history.episode(0, 7, 100)
     # Before it was put where env 1 was at moment 3, it was env 1.
-    assert [(moment.serial, env) for moment, env in lived] == [
+    assert [(moment.serial, env) for moment, env in episode_backwards] == [
         (0, 1),
         (1, 1),
         (2, 1),
@@ -335,8 +335,8 @@ def test_the_way_to_a_moment_begins_at_the_last_exact_point() -> None:
     history.add(stepped(7))
     assert way(history, 0, 7) == (6, 0, 1), "a moment that was put there is an exact point"
     assert way(history, 1, 7) == (0, 1, 6)
-    lived = Restored((0,), (1,), 3, None, {}, lived_through=(0,))
-    history.add(stepped(8, jumped=(0,), restored=lived))
+    episode_backwards = Restored((0,), (1,), 3, None, {}, replayed=(0,))
+    history.add(stepped(8, jumped=(0,), restored=episode_backwards))
     history.add(stepped(9))
     assert way(history, 0, 9) == (0, 1, 4), "one that was lived up to is none: on from where it began"
     assert history.way_to(0, 9, 3) is None, "more steps than may be made"

@@ -19,11 +19,11 @@ from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.live.live_state import LiveState
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.process.supervisor import KeptWorker
+from workbench.session.process.supervisor import Supervisor
 from workbench.session.protocol.messages import (
     CameraRequest,
-    Failed,
     Loaded,
+    LoadFailed,
     Loading,
     Pictures,
     ReloadReport,
@@ -128,7 +128,7 @@ def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(
 
 def test_what_failed_while_running_stands_until_a_step_follows() -> None:
     state = running()
-    state.take(Failed(problem(), kept=True))
+    state.take(LoadFailed(problem(), kept=True))
     assert (view(state).state, view(state).stale) == ("error", False)
     state.stepped(stepped(4))
     assert view(state).state == "running" and view(state).problem is None
@@ -137,7 +137,7 @@ def test_what_failed_while_running_stands_until_a_step_follows() -> None:
 def test_the_reset_that_a_new_scene_begins_with_mends_no_failure_at_run() -> None:
     state = LiveState("push.py", TaskOptions(), 10**8)
     state.loaded(loaded(), restored=False, stale=False)
-    state.take(Failed(problem(), kept=True))
+    state.take(LoadFailed(problem(), kept=True))
     state.stepped(stepped(0, jumped=True))
     assert view(state).problem is not None
     state.stepped(stepped(1))
@@ -147,7 +147,7 @@ def test_the_reset_that_a_new_scene_begins_with_mends_no_failure_at_run() -> Non
 def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on() -> None:
     state = running()
     state.take(Loading("importing"))
-    state.take(Failed(problem(), kept=True))
+    state.take(LoadFailed(problem(), kept=True))
     state.stepped(stepped(4))
     assert view(state).stale and view(state).problem is not None and view(state).state == "error"
 
@@ -237,7 +237,7 @@ def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved()
 def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path: Path) -> None:
     sent: list[Settings] = []
 
-    def overtaken(*arguments: Any, **named: Any) -> KeptWorker:
+    def overtaken(*arguments: Any, **named: Any) -> Supervisor:
         worker = scripted(2)(*arguments, **named)
         send = worker.send
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.ui.scenes import description, table_scene
-from workbench.session.live.versions import Recovery, Wanted, is_on_disk
+from workbench.session.live.versions import LoadInputs, Recovery, is_on_disk
 
 TASK = replace(description(table_scene(1)[0]), source={"push.py": "good"})
 
@@ -17,7 +17,7 @@ TASK = replace(description(table_scene(1)[0]), source={"push.py": "good"})
 def ran() -> Recovery:
     moments: list[bytes] = []
     recovery = Recovery(lambda: moments[-1] if moments else None)
-    assert recovery.wanted() == Wanted(None, None)
+    assert recovery.wanted() == LoadInputs(None, None)
     recovery.loaded(TASK)
     moments += [b"first", b"newest"]
     return recovery
@@ -26,7 +26,7 @@ def ran() -> Recovery:
 def test_what_ran_comes_back_at_its_newest_moment() -> None:
     recovery = ran()
     recovery.died(file_waits=False)
-    assert recovery.wanted() == Wanted({"push.py": "good"}, b"newest") and recovery.restoring
+    assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest") and recovery.restoring
 
 
 def test_a_moment_that_kills_is_not_tried_twice_and_then_the_version_neither() -> None:
@@ -34,7 +34,7 @@ def test_a_moment_that_kills_is_not_tried_twice_and_then_the_version_neither() -
     recovery.died(file_waits=False)
     recovery.wanted()
     recovery.died(file_waits=False)
-    assert recovery.wanted() == Wanted({"push.py": "good"}, None)
+    assert recovery.wanted() == LoadInputs({"push.py": "good"}, None)
     recovery.died(file_waits=False)
     assert recovery.wanted() is None
 
@@ -44,22 +44,22 @@ def test_a_file_that_kills_before_anything_ran_is_waited_for() -> None:
     recovery.wanted()
     recovery.died(file_waits=False)
     assert recovery.wanted() is None
-    assert recovery.file_asked() == Wanted(None, None)
+    assert recovery.file_asked() == LoadInputs(None, None)
 
 
 def test_a_new_version_that_kills_gives_way_to_the_last_good_one() -> None:
     recovery = ran()
     recovery.file_asked()
     recovery.died(file_waits=False)
-    assert recovery.wanted() == Wanted({"push.py": "good"}, b"newest")
+    assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest")
 
 
 def test_a_file_that_waits_is_loaded_at_the_newest_moment_and_if_it_fails_the_last_good_one_is() -> None:
     recovery = ran()
     recovery.died(file_waits=True)
-    assert recovery.wanted() == Wanted(None, b"newest") and not recovery.restoring
+    assert recovery.wanted() == LoadInputs(None, b"newest") and not recovery.restoring
     assert recovery.failed(kept=False)
-    assert recovery.wanted() == Wanted({"push.py": "good"}, b"newest") and recovery.restoring
+    assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest") and recovery.restoring
 
 
 def test_a_failure_that_leaves_the_version_before_asks_for_nothing() -> None:

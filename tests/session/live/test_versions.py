@@ -15,7 +15,7 @@ from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.live.live_state import LiveState, SharedState
 from workbench.session.live.versions import Versions
-from workbench.session.protocol.messages import Failed, Load, Loaded, Play, Request
+from workbench.session.protocol.messages import Load, Loaded, LoadFailed, Play, Request
 
 GOOD, NEW = "x = 1\n", "x = 2\n"
 FILE_WAITS = replace(DEATH, file_waits=True)
@@ -87,7 +87,7 @@ def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Open) ->
     beside.write_text("x =\n")
     one.versions.start()
     one.loads()
-    one.versions.failed(Failed(replace(problem(), file=str(beside)), kept=False))
+    one.versions.failed(LoadFailed(replace(problem(), file=str(beside)), kept=False))
     assert one.sent == []
     beside.write_text(GOOD)
     until(lambda: one.sent, "the load for the module that was mended")
@@ -110,12 +110,12 @@ def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Ope
     one.versions.died(FILE_WAITS, "")
     (asked,) = one.loads()
     assert asked.source is None
-    one.versions.failed(Failed(problem(), kept=False))
+    one.versions.failed(LoadFailed(problem(), kept=False))
     (load,) = one.sent
     assert isinstance(load, Load) and load.source == {str(one.file): GOOD} and load.snapshot is not None
     one.file.write_text(NEW)
     assert one.runs() == (True, True), "brought back, and the file holds another"
-    one.versions.failed(Failed(problem(), kept=True))
+    one.versions.failed(LoadFailed(problem(), kept=True))
     assert one.sent == [load], "what ran before still runs"
 
 

@@ -22,9 +22,9 @@ from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Call, pack
 from workbench.session.process.askers import Asker, Background
-from workbench.session.process.job_lane import Job, JobFailed, Lane, Stopped
+from workbench.session.process.job_lane import Job, JobFailed, JobLane, Stopped
 from workbench.session.protocol.messages import Load, Request, Reset
-from workbench.session.protocol.questions import JudgeCamera, MakeScene
+from workbench.session.protocol.questions import MakeScene, MeasureCamera
 
 BASE = ("sensor", "base_camera")
 PROBLEM = Problem("step", "it broke", None, None, None, "")
@@ -34,8 +34,8 @@ def go_on() -> None:
     """Nobody stops it."""
 
 
-def question(env: int) -> JudgeCamera:
-    return JudgeCamera(BASE, None, env)
+def question(env: int) -> MeasureCamera:
+    return MeasureCamera(BASE, None, env)
 
 
 class Line:
@@ -111,7 +111,7 @@ def test_who_is_told_to_stop_waits_no_longer_and_a_late_answer_is_nobody_s() -> 
 
 
 def a_job() -> Job:
-    return Job(Lane("test", go_on, lambda job, failure: None), "judging", lambda job: None)
+    return Job(JobLane("test", go_on, lambda job, failure: None), "rescoring", lambda job: None)
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
         step = background.ask(job.check, Reset((1,), 7))
         assert step.poses.shape[0] == 2
         with pytest.raises(JobFailed, match="no human camera 'nothing'"):
-            background.ask(job.check, JudgeCamera(("human", "nothing"), None, 0))
+            background.ask(job.check, MeasureCamera(("human", "nothing"), None, 0))
         first = background.pid
         assert first is not None
         assert psutil.Process(first).nice() > psutil.Process().nice(), "what plays comes first"

@@ -20,7 +20,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Call
 from workbench.session.process import supervisor, worker_process
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, KeptWorker, SpareWorker, WorkerOptions
+from workbench.session.process.supervisor import Death, SpareWorker, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import Event, Load, Loading, Request, WarmUp
 from workbench.session.protocol.questions import RunCameras
 
@@ -30,7 +30,7 @@ OPTIONS = TaskOptions(num_envs=1)
 
 
 class Minded:
-    """A `KeptWorker`, and all that it told."""
+    """A `Supervisor`, and all that it told."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self.events: list[Event] = []
@@ -41,7 +41,7 @@ class Minded:
         self.fails = 0
         """So many events cannot be taken."""
         self.taking: Callable[[Event], None] = lambda event: None
-        self.worker = KeptWorker(
+        self.worker = Supervisor(
             options,
             WarmUp(OPTIONS),
             greet=self._greet,

@@ -123,7 +123,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
 
 def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(session: Session) -> None:
     """A keep to a camera that is judged over seeds; that, and a search, to a keep."""
-    judging = session.studio.judging
+    reports = session.studio.reports
     session.studio.select(BASE)
 
     def keep(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
@@ -138,17 +138,17 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
         progress = view.recording.keeping.progress
         return progress is not None and progress.what == "drawing it again" and progress.done > 0
 
-    def judge() -> None:
-        judging.judge(60)
+    def measure() -> None:
+        reports.measure(60)
 
-    def judged() -> tuple[tuple[int, ...], ObjectSummary]:
+    def measured() -> tuple[tuple[int, ...], ObjectSummary]:
         view = wait_until(session, lambda view: view.studio.progress is None, "the judgement")
         report = view.studio.looked.report
         assert report is not None and view.studio.looked.report_seeds == 60 and not view.studio.problem
         return report.envs, report.wanted_objects(("cube",))[0].summary()
 
     def search() -> None:
-        judging.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+        reports.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
 
     def found() -> list[tuple[float, CameraSettings]]:
         view = wait_until(session, lambda view: view.studio.progress is None, "the search")
@@ -162,17 +162,17 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
     keep()
     episode = kept()
     assert episode.length == 20
-    judge()
-    alone = judged()
+    measure()
+    alone = measured()
     search()
     offers = found()
     assert offers and not session.view().studio.problem
 
     keep(drawing)
-    judge()
-    assert judged() == alone and not session.view().recording.keeping.said, "the keep came first"
+    measure()
+    assert measured() == alone and not session.view().recording.keeping.said, "the keep came first"
     assert_same(kept(), episode)
-    for begin, came, of in ((judge, judged, alone), (search, found, offers)):
+    for begin, came, of in ((measure, measured, alone), (search, found, offers)):
         begin()
         wait_until(session, is_at_it, "its beginning")
         keep()

@@ -17,7 +17,7 @@ from tests.ui.scenes import description, table_scene
 from workbench.jobs.task import Stepped
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.recording.reader.read_episode import read_episode
-from workbench.session.process.job_lane import Progress
+from workbench.session.process.job_lane import JobProgress
 from workbench.session.record import live
 from workbench.session.record.live import LiveRecorder, recovered_in_words
 from workbench.session.record.status import KeepStatus, RecordingStatus
@@ -86,7 +86,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
 
 
 def test_how_far_keeping_is_and_what_came_of_it_stand_on_the_page() -> None:
-    under_way = KeepStatus(progress=Progress("drawing it again", 3, 12))
+    under_way = KeepStatus(progress=JobProgress("drawing it again", 3, 12))
     html = recording_html(RecordingStatus(keeping=under_way))
     assert "keeping what was seen: drawing it again, 3 of 12 moments" in html and "width: 25%" in html
     assert "Each episode becomes" not in html

@@ -20,7 +20,7 @@ from workbench.session.history.history import History
 from workbench.session.process.askers import Background
 from workbench.session.protocol.messages import Load
 from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import MOST_ENTRIES, Judge, Judgement
+from workbench.session.rescore.past import MOST_ENTRIES, PastRescorer, RescoredPast
 
 BODIES = 2
 
@@ -72,16 +72,16 @@ def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepR
 @given(st.integers(0, 10**6), st.integers(2, 30), st.integers(1, 4), st.floats(0, 1))
 def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs: int, part: float) -> None:
     old, new, jumped = drawn(seed, rows, envs)
-    judgement = Judgement(recorded(old, jumped))
-    judged = [row for run in judgement.runs() for row in run][: max(1, int(part * rows))]
-    for row in judged:
-        judgement.add(row, new[row])
+    rescored = RescoredPast(recorded(old, jumped))
+    chosen = [row for run in rescored.runs() for row in run][: max(1, int(part * rows))]
+    for row in chosen:
+        rescored.add(row, new[row])
 
     wanted = {}
     for env in range(envs):
         begins = [row for row in range(rows) if jumped[row, env]]
         for begin, end in zip(begins, [*begins[1:], rows], strict=True):
-            inside = [r for r in range(begin, end) if r in judged and (r == begin or not jumped[r].any())]
+            inside = [r for r in range(begin, end) if r in chosen and (r == begin or not jumped[r].any())]
             steps = [r for r in inside if not jumped[r].any()]
             if not steps:
                 continue
@@ -110,14 +110,14 @@ def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs:
             v.first_difference,
             None if v.look_at is None else v.of.at(v.look_at),
         )
-        for v in judgement.verdicts()
+        for v in rescored.verdicts()
     }
     assert found == wanted
     names = set()
-    if any(v.differs for v in judgement.verdicts()):
-        names = {name for v in judgement.verdicts() for name in v.differing}
+    if any(v.differs for v in rescored.verdicts()):
+        names = {name for v in rescored.verdicts() for name in v.differing}
         assert names & {"reward", "success"}
-    assert judgement.names()[1] == names
+    assert rescored.names()[1] == names
 
 
 def looked_at(
@@ -142,59 +142,59 @@ def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> 
     jumped = np.zeros((9, 2), bool)
     jumped[[0, 6]] = True
     jumped[3, 1] = True
-    judgement = Judgement(recorded(old, jumped))
-    assert judgement.runs() == [range(6, 9), range(6)]
-    jump = judgement.to_judge(3)
+    rescored = RescoredPast(recorded(old, jumped))
+    assert rescored.runs() == [range(6, 9), range(6)]
+    jump = rescored.to_rescore(3)
     assert jump.snapshot is not None and jump.env_idx == (1,) and jump.action is None
-    assert judgement.to_judge(4).snapshot is None
-    assert judgement.steps == 6
+    assert rescored.to_rescore(4).snapshot is None
+    assert rescored.steps == 6
 
 
 def test_a_snapshot_that_many_runs_begin_with_goes_to_the_worker_once() -> None:
     old, new, _ = drawn(0, 6, 64)
     jumped = np.zeros((6, 64), bool)
     jumped[0], jumped[4, :2] = True, True
-    judgement = Judgement(recorded(old, jumped))
-    (rows,) = judgement.runs()
-    sent = {row: judgement.to_judge(row) for row in rows}
+    rescored = RescoredPast(recorded(old, jumped))
+    (rows,) = rescored.runs()
+    sent = {row: rescored.to_rescore(row) for row in rows}
     assert {row: one.env_idx for row, one in sent.items() if one.snapshot} == {0: tuple(range(64)), 4: (0, 1)}
     for row in rows:
-        judgement.add(row, new[row])
-    begins = [int(verdict.of.serials[0]) for verdict in judgement.verdicts()]
+        rescored.add(row, new[row])
+    begins = [int(verdict.of.serials[0]) for verdict in rescored.verdicts()]
     assert begins.count(0) == 64 and begins.count(4) == 2
 
 
 def test_a_record_that_begins_in_the_middle_of_an_episode_begins_with_its_first_moment() -> None:
     old, _, _ = drawn(1, 5, 2)
-    judgement = Judgement(recorded(old, np.zeros((5, 2), bool)))
-    assert judgement.runs() == [range(5)]
-    assert judgement.to_judge(0).snapshot is not None and judgement.steps == 4
+    rescored = RescoredPast(recorded(old, np.zeros((5, 2), bool)))
+    assert rescored.runs() == [range(5)]
+    assert rescored.to_rescore(0).snapshot is not None and rescored.steps == 4
 
 
 def test_the_record_ends_at_a_jump_that_cannot_be_put_back() -> None:
     old, _, _ = drawn(2, 6, 2)
     jumped = np.zeros((6, 2), bool)
     jumped[[0, 4]] = True
-    assert Judgement(recorded(old, jumped, [b"b"] * 4 + [b""] * 2)).runs() == [range(4)]
-    assert Judgement(recorded(old, jumped, [b""] * 6)).steps == 0
+    assert RescoredPast(recorded(old, jumped, [b"b"] * 4 + [b""] * 2)).runs() == [range(4)]
+    assert RescoredPast(recorded(old, jumped, [b""] * 6)).steps == 0
 
 
 def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_difference() -> None:
     old, _, _ = drawn(3, 5, 2)
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
-    judgement = Judgement(recorded(old, jumped))
+    rescored = RescoredPast(recorded(old, jumped))
     for row in range(5):
-        judgement.add(row, old[row])
-    assert [verdict.differing for verdict in judgement.verdicts()] == [(), ()]
-    assert judgement.names() == (("reward", "success", "height"), frozenset())
-    judgement.add(3, replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32)))
-    first, second = judgement.verdicts()
-    assert judgement.verdicts()[0] is first, "what nothing was added to is not compared again"
+        rescored.add(row, old[row])
+    assert [verdict.differing for verdict in rescored.verdicts()] == [(), ()]
+    assert rescored.names() == (("reward", "success", "height"), frozenset())
+    rescored.add(3, replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32)))
+    first, second = rescored.verdicts()
+    assert rescored.verdicts()[0] is first, "what nothing was added to is not compared again"
     assert first.of.env == 0 and first.differing == ("reward",) and np.isinf(first.largest)
     assert first.look_at is not None and first.of.at(first.look_at) == 3
     assert second.of.name == "env 1" and not second.differs
-    assert judgement.names() == (("reward", "success", "height"), frozenset({"reward"}))
+    assert rescored.names() == (("reward", "success", "height"), frozenset({"reward"}))
 
 
 def test_an_entry_that_is_called_reward_is_told_apart_from_the_reward() -> None:
@@ -202,15 +202,15 @@ def test_an_entry_that_is_called_reward_is_told_apart_from_the_reward() -> None:
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
     said = [replace(step, evaluate={"reward": np.full(2, 7.0)}) for step in old]
-    judgement = Judgement(recorded(said, jumped))
+    rescored = RescoredPast(recorded(said, jumped))
     for row in range(5):
-        judgement.add(row, replace(said[row], evaluate={"reward": np.full(2, 8.0)}))
-    assert judgement.names() == (("reward", "evaluate/reward"), frozenset({"evaluate/reward"}))
-    for env, verdict in enumerate(judgement.verdicts()):
+        rescored.add(row, replace(said[row], evaluate={"reward": np.full(2, 8.0)}))
+    assert rescored.names() == (("reward", "evaluate/reward"), frozenset({"evaluate/reward"}))
+    for env, verdict in enumerate(rescored.verdicts()):
         np.testing.assert_array_equal(verdict.old_reward, [step.reward[env] for step in old[1:]])
         np.testing.assert_array_equal(verdict.new_reward, verdict.old_reward)
         assert verdict.differing == verdict.others == ("evaluate/reward",) and not verdict.differs
-    curve = judgement.curve("reward", 0)
+    curve = rescored.curve("reward", 0)
     assert curve is not None and curve.new.tolist() == [step.reward[0] for step in old[1:]]
 
 
@@ -219,68 +219,68 @@ def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past()
     begun, goes_on = threading.Event(), threading.Event()
 
     def on_change() -> None:
-        if threading.current_thread().name == "judge":
+        if threading.current_thread().name == "rescore":
             begun.set()
             goes_on.wait(30)
 
     process = Background()
-    judge = Judge(on_change, process)
+    rescore = PastRescorer(on_change, process)
     old, _, jumped = drawn(1, 6, 2)
     load = Load("Nothing-v1", TaskOptions())
     try:
-        judge.judge(load, Judgement(recorded(old, jumped)))
+        rescore.rescore(load, RescoredPast(recorded(old, jumped)))
         assert begun.wait(30)
         history = recorded(old, jumped)
         moment = weakref.ref(history.at(0))
-        judge.judge(load, Judgement(history))
+        rescore.rescore(load, RescoredPast(history))
         del history
         gc.collect()
         assert moment() is not None
-        judge.stop(StoppedBy.HAND)
+        rescore.stop(StoppedBy.HAND)
         gc.collect()
-        assert moment() is None and judge.curve("reward", 0) is not None
+        assert moment() is None and rescore.curve("reward", 0) is not None
     finally:
         goes_on.set()
-        judge.judging.close()
+        rescore.rescoring.close()
         process.end()
 
 
 def test_an_entry_that_only_one_version_has_differs_and_comes_first() -> None:
     old, _, jumped = drawn(3, 5, 2)
-    judgement = Judgement(recorded(old, jumped))
-    assert judgement.names() == (("reward", "success", "height"), frozenset())
-    for row in judgement.runs()[0]:
-        judgement.add(row, replace(old[row], evaluate={**old[row].evaluate, "width": old[row].reward}))
-    assert judgement.names() == (("reward", "width", "success", "height"), frozenset({"width"}))
-    assert not any(verdict.differing for verdict in judgement.verdicts())
-    curve = judgement.curve("width", 1)
+    rescored = RescoredPast(recorded(old, jumped))
+    assert rescored.names() == (("reward", "success", "height"), frozenset())
+    for row in rescored.runs()[0]:
+        rescored.add(row, replace(old[row], evaluate={**old[row].evaluate, "width": old[row].reward}))
+    assert rescored.names() == (("reward", "width", "success", "height"), frozenset({"width"}))
+    assert not any(verdict.differing for verdict in rescored.verdicts())
+    curve = rescored.curve("width", 1)
     assert curve is not None and np.isnan(curve.old).all() and np.isfinite(curve.new).all()
 
 
 def test_of_very_many_entries_the_first_are_compared() -> None:
     old, _, jumped = drawn(3, 5, 2)
     many = {f"entry {k}": old[0].reward for k in range(MOST_ENTRIES + 2)}
-    judgement = Judgement(recorded([replace(step, evaluate=many) for step in old], jumped))
+    rescored = RescoredPast(recorded([replace(step, evaluate=many) for step in old], jumped))
     assert MOST_ENTRIES == 24, "each takes 8 bytes for every moment and env"
-    assert judgement.names()[0] == ("reward", *list(many)[:MOST_ENTRIES])
+    assert rescored.names()[0] == ("reward", *list(many)[:MOST_ENTRIES])
 
 
 def test_of_nothing_that_was_lived_through_nothing_is_judged() -> None:
-    judgement = Judgement(History(table(drawn(0, 2, 2)[0][0]), 10**9))
-    assert (judgement.steps, judgement.judged_steps, judgement.num_envs) == (0, 0, 0)
-    assert judgement.verdicts() == []
-    assert judgement.names() == (("reward",), frozenset())
+    rescored = RescoredPast(History(table(drawn(0, 2, 2)[0][0]), 10**9))
+    assert (rescored.steps, rescored.rescored_steps, rescored.num_envs) == (0, 0, 0)
+    assert rescored.verdicts() == []
+    assert rescored.names() == (("reward",), frozenset())
 
 
 def test_a_run_is_compared_from_its_first_step_on_and_what_was_judged_is_counted() -> None:
     old, new, _ = drawn(4, 5, 2)
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
-    judgement = Judgement(recorded(old, jumped))
-    judgement.add(0, new[0])
-    assert judgement.verdicts() == [] and judgement.judged_steps == 0
-    judgement.add(1, new[1])
-    assert [verdict.length for verdict in judgement.verdicts()] == [1, 1] and judgement.judged_steps == 1
+    rescored = RescoredPast(recorded(old, jumped))
+    rescored.add(0, new[0])
+    assert rescored.verdicts() == [] and rescored.rescored_steps == 0
+    rescored.add(1, new[1])
+    assert [verdict.length for verdict in rescored.verdicts()] == [1, 1] and rescored.rescored_steps == 1
 
 
 def test_steps_are_those_of_the_episode_also_where_its_beginning_is_not_kept() -> None:
@@ -288,11 +288,11 @@ def test_steps_are_those_of_the_episode_also_where_its_beginning_is_not_kept() -
     jumped = np.zeros((6, 2), bool)
     elapsed = [np.full(2, 40 + row, np.int32) for row in range(6)]
     same = [replace(old[row], elapsed_steps=elapsed[row], evaluate={}) for row in range(6)]
-    judgement = Judgement(recorded(same, jumped))
+    rescored = RescoredPast(recorded(same, jumped))
     for row in range(6):
-        judgement.add(row, same[row])
-    judgement.add(4, replace(same[4], reward=same[4].reward + 1))
-    verdict = judgement.verdicts()[1]
+        rescored.add(row, same[row])
+    rescored.add(4, replace(same[4], reward=same[4].reward + 1))
+    verdict = rescored.verdicts()[1]
     assert (verdict.first_difference, verdict.look_at, verdict.of.begin) == (44, 44, 40)
     assert verdict.of.at(44) == 4
 
@@ -301,13 +301,13 @@ def test_drift_is_that_of_each_env_in_its_own_run() -> None:
     old, _, _ = drawn(1, 6, 2)
     jumped = np.zeros((6, 2), bool)
     jumped[0] = True
-    judgement = Judgement(recorded(old, jumped))
+    rescored = RescoredPast(recorded(old, jumped))
     for row in range(6):
         poses = old[row].poses.copy()
         poses[1, 0, 0] += 0.1 * (row == 3)
         poses[1, 1, 3:] = (np.cos(0.1), np.sin(0.1), 0, 0)
-        judgement.add(row, replace(old[row], poses=poses))
-    still, moved = judgement.verdicts()
+        rescored.add(row, replace(old[row], poses=poses))
+    still, moved = rescored.verdicts()
     assert (still.metres, still.radians, still.drift_at) == (0, 0, None)
     assert moved.metres == pytest.approx(0.1) and moved.radians == pytest.approx(0.2, rel=1e-5)
     assert moved.drift_at == 3
@@ -317,22 +317,22 @@ def test_what_is_not_judged_yet_has_no_new_value() -> None:
     old, new, _ = drawn(4, 5, 2)
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
-    judgement = Judgement(recorded(old, jumped))
+    rescored = RescoredPast(recorded(old, jumped))
     for row in range(3):
-        judgement.add(row, new[row])
-    curve = judgement.curve("height", 1)
+        rescored.add(row, new[row])
+    curve = rescored.curve("height", 1)
     assert curve is not None and curve.serial.tolist() == [1, 2, 3, 4]
     np.testing.assert_array_equal(curve.old, [step.reward[1] + 1 for step in old[1:]])
     np.testing.assert_array_equal(curve.new, [new[1].reward[1] + 1, new[2].reward[1] + 1, np.nan, np.nan])
-    assert judgement.curve("pose", 0) is None
-    assert judgement.curve("reward", 2) is None and judgement.curve("reward", -1) is None
+    assert rescored.curve("pose", 0) is None
+    assert rescored.curve("reward", 2) is None and rescored.curve("reward", -1) is None
 
 
 def test_other_bodies_cannot_be_compared() -> None:
     old, new, jumped = drawn(5, 3, 2)
-    judgement = Judgement(recorded(old, jumped))
+    rescored = RescoredPast(recorded(old, jumped))
     with pytest.raises(ValueError, match="bodies"):
-        judgement.add(0, replace(new[0], poses=np.zeros((2, BODIES + 1, 7), np.float32)))
+        rescored.add(0, replace(new[0], poses=np.zeros((2, BODIES + 1, 7), np.float32)))
 
 
 def test_drift_is_the_furthest_body_in_metres_and_radians() -> None:

@@ -57,7 +57,7 @@ def recorded() -> Recorded:
     return recorded
 
 
-def judged(
+def rescored(
     tmp_path: Path, recorded: Recorded, edits: dict[str, str], num_envs: int = 2, use_env_states: bool = False
 ) -> list[Verdict]:
     """Verdicts of the five episodes, of five lengths, in their order."""
@@ -78,10 +78,10 @@ def judged(
 def test_unchanged_code_says_what_was_recorded_to_the_last_bit(
     tmp_path: Path, recorded: Recorded, use_env_states: bool
 ) -> None:
-    for k, verdict in enumerate(judged(tmp_path, recorded, {}, use_env_states=use_env_states)):
+    for k, verdict in enumerate(rescored(tmp_path, recorded, {}, use_env_states=use_env_states)):
         assert verdict.why_not == "" and verdict.length == STEPS - 3 * k and verdict.seed == 3 + k
         assert not verdict.differs and verdict.differing == () and verdict.missed == {}
-        assert verdict.metres == 0 and not verdict.begins_otherwise
+        assert verdict.metres == 0 and not verdict.start_differs
         np.testing.assert_array_equal(verdict.new_reward, verdict.old_reward)
 
 
@@ -89,7 +89,7 @@ def test_unchanged_code_says_what_was_recorded_to_the_last_bit(
 def test_a_doubled_reward_is_the_double_whatever_the_number_of_envs(
     tmp_path: Path, recorded: Recorded, num_envs: int
 ) -> None:
-    for k, verdict in enumerate(judged(tmp_path, recorded, {REWARD: f"{REWARD} * 2"}, num_envs)):
+    for k, verdict in enumerate(rescored(tmp_path, recorded, {REWARD: f"{REWARD} * 2"}, num_envs)):
         old = recorded.run(k).reward[: STEPS - 3 * k]
         np.testing.assert_array_equal(verdict.new_reward, 2 * old)
         assert verdict.returns == pytest.approx((float(old.sum()), float(2 * old.sum())), rel=1e-6)
@@ -102,7 +102,7 @@ def test_another_success_is_found_at_the_state_at_which_a_direct_look_finds_it(
 ) -> None:
     heights = [np.array([step.poses[k, TCP[0], 2] for step in recorded.steps]) for k in range(5)]
     limit = float(np.float32(0.5 * (heights[0][0] + heights[0].min())))
-    verdicts = judged(tmp_path, recorded, {SUCCESS: f'"success": self.agent.tcp.pose.p[:, 2] < {limit!r},'})
+    verdicts = rescored(tmp_path, recorded, {SUCCESS: f'"success": self.agent.tcp.pose.p[:, 2] < {limit!r},'})
     firsts = []
     for k, (verdict, height) in enumerate(zip(verdicts, heights, strict=True)):
         states = np.flatnonzero(height[: STEPS - 3 * k + 1] < np.float32(limit))
@@ -116,8 +116,8 @@ def test_with_the_recorded_states_nothing_drifts_where_the_scene_is_another(
     tmp_path: Path, recorded: Recorded
 ) -> None:
     heavier = {"builder.add_box_collision(half_size=": "builder.add_box_collision(density=8000, half_size="}
-    by_actions = judged(tmp_path, recorded, heavier)
-    by_states = judged(tmp_path, recorded, heavier, use_env_states=True)
+    by_actions = rescored(tmp_path, recorded, heavier)
+    by_states = rescored(tmp_path, recorded, heavier, use_env_states=True)
     assert max(verdict.metres for verdict in by_states) < 1e-6
     assert max(verdict.metres for verdict in by_actions) >= max(verdict.metres for verdict in by_states)
     for verdict in by_states:
@@ -125,7 +125,7 @@ def test_with_the_recorded_states_nothing_drifts_where_the_scene_is_another(
 
 
 def test_what_was_not_carried_is_in_the_verdict(tmp_path: Path, recorded: Recorded) -> None:
-    for verdict in judged(tmp_path, recorded, {'name="cube"': 'name="box"'}):
+    for verdict in rescored(tmp_path, recorded, {'name="cube"': 'name="box"'}):
         assert "none of this name" in verdict.missed["actors/cube"]
         assert "none of this name" in verdict.missed["actors/box"]
 

@@ -26,7 +26,7 @@ from workbench.session.protocol.messages import (
     CameraRequest,
     DrawPast,
     Event,
-    Failed,
+    LoadFailed,
     PastPictures,
     Pictures,
     PlaceCamera,
@@ -35,7 +35,7 @@ from workbench.session.protocol.messages import (
 from workbench.session.protocol.questions import CaptureMoment, DrawCamera
 from workbench.session.worker import cameras as under_test
 from workbench.session.worker.cameras import WorkerCameras
-from workbench.session.worker.guarded_task import HeldTask, ServerLine
+from workbench.session.worker.guarded_task import GuardedTask, ServerLine
 from workbench.session.worker.step_events import StepEvents
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -67,7 +67,7 @@ class Desk:
         os.ftruncate(pulse, mmap.PAGESIZE)
         self.pulse, interrupts = PulseReader(pulse), Interrupts()
         line = ServerLine(theirs.detach(), interrupts)
-        self.held = HeldTask(line, interrupts, PulseWriter(pulse), StepEvents(), lambda: None)
+        self.held = GuardedTask(line, interrupts, PulseWriter(pulse), StepEvents(), lambda: None)
         os.close(pulse)
         self.held.opened = opened
         self.first: list[bool] = []
@@ -243,7 +243,7 @@ def test_a_moment_of_the_past_is_drawn_after_what_waits_and_a_failure_is_told(de
     assert np.allclose(past.pictures[0].pose[:3], there.position, atol=1e-5)
     desk.cameras.draw_past(DrawPast(poses, 1, (NOTHING,), 8))
     (failed,) = desk.heard()
-    assert isinstance(failed, Failed) and "nothing" in failed.problem.message
+    assert isinstance(failed, LoadFailed) and "nothing" in failed.problem.message
     assert desk.makes() == [] and shown(desk.makes()) == [BASE], "the one that was left is made anew"
 
 

@@ -23,7 +23,7 @@ N = 3
 T = 12
 
 
-class Lived:
+class EnvMoment:
     """A humanoid's fall: what was, moment by moment."""
 
     def __init__(self, opened: OpenedTask) -> None:
@@ -70,18 +70,18 @@ class Lived:
 
 
 @pytest.fixture(scope="module")
-def lived() -> Iterator[Lived]:
+def lived() -> Iterator[EnvMoment]:
     options = TaskOptions(num_envs=N, env_kwargs={"obs_mode": "state", "render_backend": "none"})
     opened = build_task(
         load_task("MS-HumanoidStand-v1"), options, Opening(on_finding=lambda finding: None, begins_anew=True)
     )
-    yield Lived(opened)
+    yield EnvMoment(opened)
     opened.env.close()
 
 
-def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: Lived) -> None:
+def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None:
     did = lived.back(T, dict.fromkeys(range(N), 0))
-    assert did.lived_through == tuple(range(N)) and not did.not_carried
+    assert did.replayed == tuple(range(N)) and not did.not_carried
     assert did.how == f"{T} steps were made again, and every body is where it was, to the last bit."
     assert lived.told == [(done, T) for done in range(1, T + 1)]
     assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N
@@ -91,22 +91,22 @@ def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: Lived) -> None:
     assert lived.packed() == lived.packs[2 * T]
 
 
-def test_one_env_alone_and_as_another_while_the_others_notice_nothing(lived: Lived) -> None:
+def test_one_env_alone_and_as_another_while_the_others_notice_nothing(lived: EnvMoment) -> None:
     before = lived.packed()
     did = lived.back(T, {1: 0}, {1: 2})
-    assert did.lived_through == (1,)
+    assert did.replayed == (1,)
     now = lived.packed()
     assert now[1] == lived.packs[T][2]
     assert [now[0], now[2]] == [before[0], before[2]]
 
 
-def test_ways_of_several_lengths_end_together(lived: Lived) -> None:
+def test_ways_of_several_lengths_end_together(lived: EnvMoment) -> None:
     """Moment T put there is an exact point: what follows it is another run, and repeats itself."""
     go_back.go_back(
         lived.opened, Restore(pickle.dumps(lived.snapshots[T]), (0,), (0,), T), lambda *done: None
     )
     middle = lived.opened.env.snapshot()
-    assert lived.back(T, {1: 0, 2: 0}).lived_through == (1, 2)
+    assert lived.back(T, {1: 0, 2: 0}).replayed == (1, 2)
     for after in range(T, T + 3):
         step_checked(lived.opened.env, lived.opened.loaded, lived.actions[after])
     wanted, end = lived.packed(), lived.opened.env.snapshot()
@@ -119,17 +119,17 @@ def test_ways_of_several_lengths_end_together(lived: Lived) -> None:
     every = tuple(range(N))
     request = Restore(pickle.dumps(end), every, every, 0, None, ways, starts)
     _, did = go_back.go_back(lived.opened, request, lambda *done: None)
-    assert did.lived_through == every and lived.packed() == wanted
+    assert did.replayed == every and lived.packed() == wanted
 
 
-def test_where_it_does_not_come_out_the_moment_is_put_there(lived: Lived) -> None:
+def test_where_it_does_not_come_out_the_moment_is_put_there(lived: EnvMoment) -> None:
     kept = lived.actions[3]
     lived.actions[3] = kept * np.array([[1.0], [0.5], [1.0]], np.float32)  # as an edited hook would
     try:
         did = lived.back(T, dict.fromkeys(range(N), 0))
     finally:
         lived.actions[3] = kept
-    assert did.lived_through == (0, 2) and "in 2 of 3 envs" in did.how
+    assert did.replayed == (0, 2) and "in 2 of 3 envs" in did.how
     wanted, now = lived.packs[T], lived.packed()
     assert [now[0], now[2]] == [wanted[0], wanted[2]]
     np.testing.assert_allclose(
@@ -137,10 +137,10 @@ def test_where_it_does_not_come_out_the_moment_is_put_there(lived: Lived) -> Non
     )
 
 
-def test_a_way_that_takes_too_long_is_given_up(lived: Lived, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_way_that_takes_too_long_is_given_up(lived: EnvMoment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(go_back, "MOST_SECONDS", 0.0)
     did = lived.back(T, dict.fromkeys(range(N), 0))
-    assert did.lived_through == () and did.how == "" and len(lived.told) == 1
+    assert did.replayed == () and did.how == "" and len(lived.told) == 1
     np.testing.assert_allclose(
         np.frombuffer(b"".join(lived.packed()), np.float32),
         np.frombuffer(b"".join(lived.packs[T]), np.float32),

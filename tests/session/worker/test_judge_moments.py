@@ -16,8 +16,8 @@ from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
 from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.questions import Judged, JudgeMoments, MomentToJudge
-from workbench.session.worker.go_back import judge_moments
+from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
+from workbench.session.worker.go_back import rescore_moments
 
 N = 3
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
@@ -43,11 +43,11 @@ class Record:
 
     def __init__(self, opened: OpenedTask) -> None:
         task, rng = opened.env, np.random.default_rng(0)
-        self.moments: list[MomentToJudge] = []
+        self.moments: list[MomentToRescore] = []
         self.steps: list[StepResult] = []
 
         def jump(step: StepResult, envs: tuple[int, ...]) -> None:
-            self.moments.append(MomentToJudge(None, pickle.dumps(task.snapshot()), envs))
+            self.moments.append(MomentToRescore(None, pickle.dumps(task.snapshot()), envs))
             self.steps.append(step)
 
         jump(reset_checked(task, opened.loaded, 5), tuple(range(N)))
@@ -55,7 +55,7 @@ class Record:
             for _ in range(4):
                 action = actions.random_action(task.parts, N, rng)
                 self.steps.append(step_checked(task, opened.loaded, action))
-                self.moments.append(MomentToJudge(action))
+                self.moments.append(MomentToRescore(action))
             if envs:
                 jump(reset_checked(task, opened.loaded, [90 + i for i in envs], envs), envs)
 
@@ -69,9 +69,9 @@ def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_t
     assert len({step.evaluate["noise"].tobytes() for step in made}) == len(made) == 16
     for _ in range(2):
         step_checked(draws.env, draws.loaded, np.zeros((N, 8), np.float32))  # it draws on meanwhile
-        judged = judge_moments(draws, JudgeMoments(tuple(record.moments)))
-        assert judged.problem is None and judged.not_carried == {}
-        for moment, was, now in zip(record.moments, record.steps, judged.steps, strict=True):
+        rescored = rescore_moments(draws, RescoreMoments(tuple(record.moments)))
+        assert rescored.problem is None and rescored.not_carried == {}
+        for moment, was, now in zip(record.moments, record.steps, rescored.steps, strict=True):
             np.testing.assert_array_equal(now.poses, was.poses)
             if moment.snapshot is None:
                 np.testing.assert_array_equal(now.evaluate["noise"], was.evaluate["noise"])
@@ -80,9 +80,9 @@ def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_t
 
 def test_in_pieces_it_comes_to_what_it_comes_to_at_once(draws: OpenedTask) -> None:
     record = Record(draws)
-    whole = judge_moments(draws, JudgeMoments(tuple(record.moments)))
-    pieces: list[Judged] = [
-        judge_moments(draws, JudgeMoments(tuple(record.moments[at : at + 3])))
+    whole = rescore_moments(draws, RescoreMoments(tuple(record.moments)))
+    pieces: list[RescoredMoments] = [
+        rescore_moments(draws, RescoreMoments(tuple(record.moments[at : at + 3])))
         for at in range(0, len(record.moments), 3)
     ]
     parts = [step for piece in pieces for step in piece.steps]

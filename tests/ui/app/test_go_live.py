@@ -14,13 +14,13 @@ from tests.drive.waiting import until
 from tests.ui.scenes import problem
 from workbench.authoring.loading.reference import TaskName
 from workbench.jobs.task import TaskOptions
-from workbench.session.clearance import Clearances, NotCleared, Wanted
+from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
-from workbench.session.protocol.messages import Failed
-from workbench.ui.app.go_live import ONE, StepIn, StepInPart
+from workbench.session.protocol.messages import LoadFailed
+from workbench.ui.app.go_live import ONE, GoLive, GoLivePart
 from workbench.ui.app.workplace import Workplace
 from workbench.ui.review.rescore import RECORDED, TODAYS
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 
 
 class Person(Clearances):
@@ -31,7 +31,7 @@ class Person(Clearances):
         self.says_yes = threading.Event()
         self.asked = self.left = 0
 
-    def clear(self, wanted: Wanted, stopped: Callable[[], bool] = lambda: False) -> TaskName:
+    def clear(self, wanted: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
         self.asked += 1
         until(lambda: self.says_yes.is_set() or stopped(), "an answer")
         if stopped():
@@ -47,16 +47,16 @@ class Desk:
         self.place, self.live, self.other, self.panels = place, live, other, panels
         self.person = Person()
         self.opened: list[TaskName] = []
-        self.step_in = StepIn(place, self._make, self.person, TaskOptions())
-        self.part = StepInPart(place.server, self.step_in)
-        place.step_in = self.step_in
+        self.go_live = GoLive(place, self._make, self.person, TaskOptions())
+        self.part = GoLivePart(place.server, self.go_live)
+        place.go_live = self.go_live
 
     def _make(self, task: TaskName, options: TaskOptions) -> Session:
         self.opened.append(task)
         return self.other
 
     def go(self, which: int, state: int = 2) -> None:
-        self.step_in.go(self.place.shelf.review.view().opened[which].id, state)
+        self.go_live.go(self.place.shelf.review.view().opened[which].id, state)
 
     def draw(self) -> None:
         self.part.draw(self.place.shelf.review.view())
@@ -67,7 +67,7 @@ def desk(
     child_process: None,
     scripted_session: Callable[..., Session],
     tmp_path: Path,
-    door: Door,
+    gated_server: GatedServer,
     panels: Panels,
 ) -> Iterator[Desk]:
     folder = tmp_path / "recordings"
@@ -78,14 +78,14 @@ def desk(
     def no_other(task: TaskName, options: TaskOptions) -> Session:
         raise AssertionError("this test opens it itself")
 
-    place = Workplace(door, folder, no_other, TaskOptions(), session=live)
+    place = Workplace(gated_server, folder, no_other, TaskOptions(), session=live)
     library, review = place.shelf.library, place.shelf.review
     library.refresh()
     review.open([row.id for row in sorted(library.rows(), key=lambda row: row.seed or 0)])
     until(lambda: len(review.view().opened) == 2, "the recordings", seen=lambda: review.view().problems)
     desk = Desk(place, live, other, panels)
     yield desk
-    desk.step_in.close()
+    desk.go_live.close()
     place.close()
 
 
@@ -94,41 +94,41 @@ def test_into_the_task_that_is_open_one_goes_at_once_and_the_page_follows(desk: 
     assert desk.person.asked == 0 and desk.opened == [] and desk.place.session is desk.live
     until(lambda: desk.live.view().timeline.entered, "the recorded state")
     desk.draw()
-    assert desk.step_in.going() == "" and desk.place.pages._wish == "live"
-    assert not desk.step_in.can_go_home()
+    assert desk.go_live.going() == "" and desk.place.pages._wish == "live"
+    assert not desk.go_live.can_go_home()
 
 
 def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason_to(desk: Desk) -> None:
-    desk.live._handle(Failed(problem(), kept=True))
+    desk.live._handle(LoadFailed(problem(), kept=True))
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
     desk.draw()
-    assert desk.step_in.going() == "putting Push-v1 into step 2 …" and desk.place.pages._wish is None
-    desk.live._handle(Failed(problem(), kept=True))
+    assert desk.go_live.going() == "putting Push-v1 into step 2 …" and desk.place.pages._wish is None
+    desk.live._handle(LoadFailed(problem(), kept=True))
     desk.draw()
-    assert desk.step_in.going() == "" and desk.place.pages._wish == "live"
+    assert desk.go_live.going() == "" and desk.place.pages._wish == "live"
 
 
 def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
-    assert desk.step_in.going() == "asking whether the code of Pull-v1 may run"
+    assert desk.go_live.going() == "asking whether the code of Pull-v1 may run"
     assert desk.place.session is desk.live and desk.opened == []
     desk.person.says_yes.set()
     until(lambda: desk.place.session is desk.other, "the other session")
-    assert desk.opened == ["Pull-v1"] and desk.step_in.can_go_home()
+    assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
     desk.draw()
     assert desk.place.pages._wish == "live"
-    desk.step_in.go_home()
-    assert desk.place.session is desk.live and not desk.step_in.can_go_home()
+    desk.go_live.go_home()
+    assert desk.place.session is desk.live and not desk.go_live.can_go_home()
 
 
 def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> None:
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
     desk.go(1)
-    assert desk.step_in.going() == ""
+    assert desk.go_live.going() == ""
     until(lambda: desk.person.left, "that nobody waits for the answer")
     assert desk.opened == [] and desk.place.session is desk.live
 
@@ -136,12 +136,12 @@ def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> Non
 def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: Desk) -> None:
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
-    assert desk.step_in.going()
-    StepInPart(desk.place.server, desk.step_in)
-    assert desk.step_in.going() == ""
+    assert desk.go_live.going()
+    GoLivePart(desk.place.server, desk.go_live)
+    assert desk.go_live.going() == ""
 
 
 def test_the_code_and_the_envs_are_chosen(desk: Desk) -> None:
     assert (desk.part._code.options, desk.part._envs.value) == ((TODAYS, RECORDED), ONE)
     desk.part._code.value = RECORDED
-    assert desk.step_in.recorded_source and not desk.step_in.everywhere
+    assert desk.go_live.recorded_source and not desk.go_live.everywhere

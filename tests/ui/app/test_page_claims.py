@@ -23,7 +23,7 @@ from tests.ui.tabs import messages_in
 from workbench.ui.server import page_guard
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES
 from workbench.ui.server.control_values import LONGEST_LINE
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.server.viser_private import element_id
 
 unhurried = settings(
@@ -38,9 +38,9 @@ ANYTHING = st.recursive(
 
 
 @pytest.fixture
-def bystander(door: Door) -> Iterator[Callable[[], None]]:
+def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
     """A page that was there before; call it to see that it still works, and still hears of others' changes."""
-    box = door.server.gui.add_checkbox("alive", False)
+    box = gated_server.server.gui.add_checkbox("alive", False)
     heard: list[bool] = []
 
     def listen(connection: Connection) -> None:
@@ -50,7 +50,7 @@ def bystander(door: Door) -> Iterator[Callable[[], None]]:
                 if message["type"] == "GuiUpdateMessage" and message["uuid"] == element_id(box):
                     heard.append(message["updates"]["value"])
 
-    with client(door) as reader, client(door) as other:
+    with client(gated_server) as reader, client(gated_server) as other:
         thread = threading.Thread(target=listen, args=(reader,))
         thread.start()
 
@@ -72,9 +72,9 @@ def hands_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_guard, "HANDS_OFF", 0.05)
 
 
-def caught_up(door: Door, connection: Connection) -> None:
+def caught_up(gated_server: GatedServer, connection: Connection) -> None:
     """Return when all that this page said before was taken or dropped."""
-    box = door.server.gui.add_checkbox("after", False)
+    box = gated_server.server.gui.add_checkbox("after", False)
     say(connection, claim(box, True))
     until(lambda: box.value, "what was said last")
     box.remove()
@@ -83,17 +83,17 @@ def caught_up(door: Door, connection: Connection) -> None:
 @pytest.mark.parametrize(
     "number", [1e30, -1e30, 99999999999999999999999.0, 2**64 - 1, -(2**63), float("inf"), float("nan"), 0.5]
 )
-def test_a_number_that_is_none_of_an_integers_disturbs_no_page(door, bystander, capfd, number):
-    seed = door.server.gui.add_number("Seed", 7, min=0, max=2**32 - 1, step=1)
-    bare = door.server.gui.add_number("bare", 7)
-    with client(door) as connection:
+def test_a_number_that_is_none_of_an_integers_disturbs_no_page(gated_server, bystander, capfd, number):
+    seed = gated_server.server.gui.add_number("Seed", 7, min=0, max=2**32 - 1, step=1)
+    bare = gated_server.server.gui.add_number("bare", 7)
+    with client(gated_server) as connection:
         for control in (seed, bare):
             say(connection, claim(control, number))
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
         bystander()
         assert (seed.value, bare.value) == (7, 7)
-    with client(door) as late:  # a page that comes later gets all that is kept for it
-        caught_up(door, late)
+    with client(gated_server) as late:  # a page that comes later gets all that is kept for it
+        caught_up(gated_server, late)
     bystander()
     seed.remove()
     bare.remove()
@@ -123,22 +123,22 @@ CONTROLS: dict[str, Callable[[viser.GuiApi], viser.GuiInputHandle | viser.GuiBut
 
 
 @pytest.fixture
-def controls(door: Door) -> dict[str, viser.GuiInputHandle]:
-    return {name: make(door.server.gui) for name, make in CONTROLS.items()}  # type: ignore[misc]
+def controls(gated_server: GatedServer) -> dict[str, viser.GuiInputHandle]:
+    return {name: make(gated_server.server.gui) for name, make in CONTROLS.items()}  # type: ignore[misc]
 
 
 @pytest.fixture
-def attacker(door: Door) -> Iterator[Connection]:
-    with client(door) as connection:
+def attacker(gated_server: GatedServer) -> Iterator[Connection]:
+    with client(gated_server) as connection:
         yield connection
 
 
 @unhurried
 @given(st.sampled_from(sorted(CONTROLS)), ANYTHING | st.lists(NUMBERS, min_size=2, max_size=4))
-def test_whatever_is_claimed_a_control_holds_what_it_can_hold(door, controls, attacker, name, value):
+def test_whatever_is_claimed_a_control_holds_what_it_can_hold(gated_server, controls, attacker, name, value):
     control = controls[name]
     say(attacker, claim(control, value))
-    caught_up(door, attacker)
+    caught_up(gated_server, attacker)
     held = control.value
     # What viser keeps is what it sends to every page.
     msgspec.msgpack.encode(held if name != "upload" else None)
@@ -203,11 +203,11 @@ def test_what_a_control_can_hold_is_taken(controls, attacker, name, claimed, hel
     ],
 )
 def test_the_page_that_sent_it_is_told_and_shown_the_true_value(
-    door, controls, hands_off, caplog, name, claimed, sentence
+    gated_server, controls, hands_off, caplog, name, claimed, sentence
 ):
     control = controls[name]
     told: list[dict] = []
-    with caplog.at_level(logging.WARNING), client(door) as connection:
+    with caplog.at_level(logging.WARNING), client(gated_server) as connection:
         say(connection, claim(control, claimed))
 
         def shown() -> bool:
@@ -228,11 +228,11 @@ def test_the_page_that_sent_it_is_told_and_shown_the_true_value(
     assert bodies == [sentence]
 
 
-def test_what_is_typed_on_the_way_to_a_number_is_not_held_against_it(door, monkeypatch):
+def test_what_is_typed_on_the_way_to_a_number_is_not_held_against_it(gated_server, monkeypatch):
     """12 is typed as 1, then 12: a correction that comes in between would take the 1 away."""
     monkeypatch.setattr(page_guard, "HANDS_OFF", 0.2)
-    number = door.server.gui.add_number("Steps", 50, min=10, max=99)
-    with client(door) as connection:
+    number = gated_server.server.gui.add_number("Steps", 50, min=10, max=99)
+    with client(gated_server) as connection:
         say(connection, claim(number, 1))
         say(connection, claim(number, 12))
         until(lambda: number.value == 12, "the number")
@@ -246,25 +246,25 @@ def test_what_is_typed_on_the_way_to_a_number_is_not_held_against_it(door, monke
     number.remove()
 
 
-def test_an_option_that_went_while_it_was_clicked_is_not_taken(door, bystander):
-    dropdown = door.server.gui.add_dropdown("camera", ("front", "wrist"))
-    with client(door) as connection:
+def test_an_option_that_went_while_it_was_clicked_is_not_taken(gated_server, bystander):
+    dropdown = gated_server.server.gui.add_dropdown("camera", ("front", "wrist"))
+    with client(gated_server) as connection:
         dropdown.options = ("front",)
         say(connection, claim(dropdown, "wrist"))
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
         assert dropdown.value == "front"
         dropdown.remove()
         say(connection, claim(dropdown, "front"))  # nor a control that went
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
     bystander()
 
 
-def test_many_impossible_values_are_one_line(door, hands_off, capfd):
-    number = door.server.gui.add_number("\x1b[31mred", 1)
-    with client(door) as connection:
+def test_many_impossible_values_are_one_line(gated_server, hands_off, capfd):
+    number = gated_server.server.gui.add_number("\x1b[31mred", 1)
+    with client(gated_server) as connection:
         for value in (1e30, "x", None, [1], {}, 1e30) * 20:
             say(connection, claim(number, value))
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
     number.remove()
     printed = capfd.readouterr().err
     assert len(printed.splitlines()) <= 1
@@ -299,27 +299,29 @@ NAN, INF = float("nan"), float("inf")
     ],
     ids=str,
 )
-def test_a_camera_that_cannot_be_is_dropped_and_the_page_stays(door, bystander, change):
-    with client(door) as connection:
-        known = {number: one.camera.position.copy() for number, one in door.server.get_clients().items()}
+def test_a_camera_that_cannot_be_is_dropped_and_the_page_stays(gated_server, bystander, change):
+    with client(gated_server) as connection:
+        known = {
+            number: one.camera.position.copy() for number, one in gated_server.server.get_clients().items()
+        }
         say(connection, {**CAMERA, "position": (7.0, 7.0, 7.0), **change})
-        caught_up(door, connection)
-        for number, one in door.server.get_clients().items():
+        caught_up(gated_server, connection)
+        for number, one in gated_server.server.get_clients().items():
             assert (one.camera.position == known[number]).all()
     bystander()
 
 
-def test_a_gizmo_goes_nowhere_that_is_no_place(door, bystander):
-    gizmo = door.server.scene.add_transform_controls("/gizmo")
+def test_a_gizmo_goes_nowhere_that_is_no_place(gated_server, bystander):
+    gizmo = gated_server.server.scene.add_transform_controls("/gizmo")
     update = {"type": "TransformControlsUpdateMessage", "name": "/gizmo", "owner": gizmo._impl.api._owner_id}
-    with client(door) as connection:
+    with client(gated_server) as connection:
         for wxyz, position in (
             ((1.0, 0.0, 0.0, 0.0), (NAN, 0.0, 0.0)),
             ((NAN, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
             ((0.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
         ):
             say(connection, {**update, "wxyz": wxyz, "position": position})
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
         assert tuple(gizmo.position) == (0.0, 0.0, 0.0)
         say(connection, {**update, "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 2.0, 3.0)})
         until(lambda: tuple(gizmo.position) == (1.0, 2.0, 3.0), "the gizmo's place")
@@ -327,44 +329,44 @@ def test_a_gizmo_goes_nowhere_that_is_no_place(door, bystander):
     bystander()
 
 
-def test_forms_that_are_none_leave_nothing_behind(door):
+def test_forms_that_are_none_leave_nothing_behind(gated_server):
     """viser keeps such a message for every later page, whatever id it has."""
-    buffer = door.server._websock_server._broadcast_buffer.message_from_id
-    with client(door) as connection:
-        caught_up(door, connection)
+    buffer = gated_server.server._websock_server._broadcast_buffer.message_from_id
+    with client(gated_server) as connection:
+        caught_up(gated_server, connection)
         before = len(buffer)
         for number in range(200):
             say(connection, {"type": "GuiFormDirtyMessage", "uuid": f"none-{number}"})
             say(connection, {"type": "GuiFormSubmitMessage", "uuid": f"none-{number}"})
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
         assert len(buffer) <= before + 10
 
 
 @pytest.mark.parametrize("item", [b"\xc0", b"\x90", b"\x80", b"\xa0", b"\x01"], ids=repr)
-def test_a_large_message_of_tiny_objects_is_not_taken_apart(door, bystander, item):
-    with client(door) as connection:
+def test_a_large_message_of_tiny_objects_is_not_taken_apart(gated_server, bystander, item):
+    with client(gated_server) as connection:
         connection.send(b"\xdd" + (20_000_000).to_bytes(4, "big") + item * 20_000_000)
         assert close_code(connection) == 1009
     bystander()
 
 
-def test_tiny_objects_in_a_value_are_refused(door, bystander):
-    number = door.server.gui.add_number("n", 1)
-    with client(door) as connection:
+def test_tiny_objects_in_a_value_are_refused(gated_server, bystander):
+    number = gated_server.server.gui.add_number("n", 1)
+    with client(gated_server) as connection:
         say(connection, claim(number, [[]] * (MAX_BYTES - 1000)))
-        caught_up(door, connection)
+        caught_up(gated_server, connection)
         assert number.value == 1
     number.remove()
     bystander()
 
 
-def test_a_page_that_floods_is_slowed_then_let_go_and_the_others_go_on(door, bystander, monkeypatch):
+def test_a_page_that_floods_is_slowed_then_let_go_and_the_others_go_on(gated_server, bystander, monkeypatch):
     monkeypatch.setattr(page_guard, "PATIENCE", 0.5)
-    slider = door.server.gui.add_slider("x", 0, 1000, 1, 0)
+    slider = gated_server.server.gui.add_slider("x", 0, 1000, 1, 0)
     gone = threading.Event()
 
     def flood() -> None:
-        with client(door) as connection, contextlib.suppress(ConnectionClosed):
+        with client(gated_server) as connection, contextlib.suppress(ConnectionClosed):
             for number in itertools.count():
                 say(connection, claim(slider, number % 1000))
         gone.set()

@@ -20,15 +20,15 @@ from tests.ui.tabs import tabs_of
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 
 SWAPS = 20
 
 
 @pytest.fixture
-def server(door: Door) -> viser.ViserServer:
+def server(gated_server: GatedServer) -> viser.ViserServer:
     """Of the pages that are swapped."""
-    return door.server
+    return gated_server.server
 
 
 def no_session(task: object, options: object) -> Session:
@@ -37,17 +37,17 @@ def no_session(task: object, options: object) -> Session:
 
 @pytest.fixture
 def place(
-    child_process: None, tmp_path: Path, door: Door, scripted_session: Callable[..., Session]
+    child_process: None, tmp_path: Path, gated_server: GatedServer, scripted_session: Callable[..., Session]
 ) -> Iterator[Workplace]:
     write(tmp_path, made(5))
-    place = Workplace(door, tmp_path, no_session, TaskOptions(), scripted_session(2))
+    place = Workplace(gated_server, tmp_path, no_session, TaskOptions(), scripted_session(2))
     yield place
     place.close()
 
 
 @pytest.mark.slow
 def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
-    place: Workplace, door: Door, server: viser.ViserServer, panels: Panels
+    place: Workplace, gated_server: GatedServer, server: viser.ViserServer, panels: Panels
 ) -> None:
     session = place.session
     assert session is not None
@@ -59,7 +59,7 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         which = "review" if number % 2 == 0 else "live"
         place.pages.show(which)
         assert place.pages.wait_for(which, timeout=60)
-        with tabs_of(door.url) as tabs:
+        with tabs_of(gated_server.url) as tabs:
             tab = tabs.open()
             until(lambda tab=tab: tab.open and panels.html("wb-status"), f"the {which} page, drawn")
             if number < 4 or number >= SWAPS - 2:
@@ -87,10 +87,10 @@ def drawn_whole(server: viser.ViserServer) -> dict[str, int]:
 
 
 def test_an_episode_whose_writer_was_killed_is_mended_and_said(
-    child_process: None, tmp_path: Path, door: Door
+    child_process: None, tmp_path: Path, gated_server: GatedServer
 ) -> None:
     begin(tmp_path, made(5, seed=8))
-    place = Workplace(door, tmp_path, no_session, TaskOptions())
+    place = Workplace(gated_server, tmp_path, no_session, TaskOptions())
     place.pages.start("review")
     try:
         until(lambda: "can be seen again" in " ".join(place.shelf.review.view().problems), "the word for it")

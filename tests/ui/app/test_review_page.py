@@ -23,7 +23,7 @@ from workbench.ui.app.review_page import ReviewPage, walk
 from workbench.ui.app.workplace import Workplace
 from workbench.ui.review.panel import GHOSTS, GO_LIVE
 from workbench.ui.review.scene import MOST_NAMED
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ class Shown:
 
 
 @pytest.fixture
-def server(door: Door) -> viser.ViserServer:
-    return door.server
+def server(gated_server: GatedServer) -> viser.ViserServer:
+    return gated_server.server
 
 
 def no_session(task: object, options: object) -> Session:
@@ -73,8 +73,10 @@ def no_session(task: object, options: object) -> Session:
 
 
 @pytest.fixture
-def shown(child_process: None, folder: Path, door: Door, panels: Panels, clock: Clock) -> Iterator[Shown]:
-    place = Workplace(door, folder, no_session, TaskOptions())
+def shown(
+    child_process: None, folder: Path, gated_server: GatedServer, panels: Panels, clock: Clock
+) -> Iterator[Shown]:
+    place = Workplace(gated_server, folder, no_session, TaskOptions())
     place.shelf.library.refresh()
     yield Shown(ReviewPage(place, clock=clock), place.shelf.review, place.shelf.library, panels, clock)
     place.close()

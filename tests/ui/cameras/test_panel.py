@@ -16,7 +16,7 @@ from workbench.ui.cameras.panel import CamerasPanel
 POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
 
 
-class Asked:
+class RequestParts:
     """Of a session only this is needed: which pictures are wanted."""
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
 
 
 def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
-    asked = Asked()
+    asked = RequestParts()
     panel = CamerasPanel(panels.server, asked, clock=clock)
     panel.draw(seen(1, (camera("base"), camera("hand"))))
     base = panels.part(BASE)
@@ -65,7 +65,7 @@ def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: P
 
 
 def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
-    panel = CamerasPanel(panels.server, Asked())
+    panel = CamerasPanel(panels.server, RequestParts())
     cameras = (camera("base"),)
     panel.draw(seen(1, cameras))
     assert "another moment" not in panels.html()

@@ -208,8 +208,8 @@ def test_a_press_on_a_row_that_has_moved_selects_that_row_and_made_up_numbers_se
 
 
 def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) -> None:
-    judged: list[tuple[str, ...]] = []
-    table.panel.add_action(Action("Judge again", "With today's code", judged.append))
+    rescored: list[tuple[str, ...]] = []
+    table.panel.add_action(Action("Judge again", "With today's code", rescored.append))
     table.draw()
     assert table.panels.html("wb-pill").count("wb-off") >= 5
     ids = newest(0, 5)
@@ -217,7 +217,7 @@ def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) ->
     table.press_row(ids[4], RANGE)
     assert '<span class="wb-pill wb-off" title="At most 4 at once">Open' in table.panels.html("wb-pill")
     table.press("action 4")
-    assert judged == [tuple(ids)]
+    assert rescored == [tuple(ids)]
     table.press_row(ids[4], TOGGLE)
     table.press("action 0")
     assert told.opened == [tuple(ids[:4])]

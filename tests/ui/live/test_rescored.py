@@ -14,9 +14,9 @@ from workbench.authoring.problem import Problem
 from workbench.jobs.verdict import Verdict
 from workbench.session.live.timeline import TimelineView
 from workbench.session.rescore import verdict_text as words
-from workbench.session.rescore.background import JudgedView
-from workbench.session.rescore.past import JudgedCurve, PastRun
-from workbench.ui.live.rescored import JudgementPanel, chart_data, in_a_line
+from workbench.session.rescore.background import RescoreView
+from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.ui.live.rescored import PastRescorePanel, chart_data, in_a_line
 from workbench.ui.widgets.line_chart import LONGEST
 from workbench.ui.widgets.rescored import MOST_ROWS, status_html
 
@@ -33,10 +33,10 @@ def same(env: int = 0, **changes: Any) -> Verdict[PastRun]:
     return episode(env, **{**nothing, "returns": (1.0, 1.0), **changes})
 
 
-def done(*verdicts: Verdict[PastRun], **changes: Any) -> JudgedView:
+def done(*verdicts: Verdict[PastRun], **changes: Any) -> RescoreView:
     differing = frozenset(name for verdict in verdicts for name in verdict.differing)
     told = {"names": ("reward", "success"), "differing_names": differing, "task": "the new code", **changes}
-    return replace(JudgedView("done", 1, verdicts, 50, 50), **told)
+    return replace(RescoreView("done", 1, verdicts, 50, 50), **told)
 
 
 class RecordedSession:
@@ -45,12 +45,12 @@ class RecordedSession:
     def __init__(self) -> None:
         self.asked: list[tuple[object, ...]] = []
         self.shown = running(40, timeline=TimelineView(first=0, last=1000))
-        self.judge = self
+        self.rescorer = self
 
-    def curve(self, name: str, env: int) -> JudgedCurve | None:
+    def curve(self, name: str, env: int) -> RescoredCurve | None:
         tick = np.arange(20)
         old = np.full(20, env, np.float32)
-        return JudgedCurve(tick, tick, old, 2 * old) if name in ("reward", "success") else None
+        return RescoredCurve(tick, tick, old, 2 * old) if name in ("reward", "success") else None
 
     def view(self) -> object:
         return self.shown
@@ -66,39 +66,39 @@ class RecordedSession:
 
 
 @dataclass
-class Judging:
+class Rescoring:
     """The panel on a page, and the session that it asks."""
 
-    panel: JudgementPanel
+    panel: PastRescorePanel
     session: RecordedSession
     panels: Panels
     clock: Clock
 
-    def draw(self, judged: JudgedView, **changes: Any) -> None:
+    def draw(self, rescored: RescoreView, **changes: Any) -> None:
         self.clock.passes()
         timeline = TimelineView(first=0, last=1000)
-        self.panel.draw(running(40, judgement=judged, **{"timeline": timeline, **changes}))
+        self.panel.draw(running(40, rescored=rescored, **{"timeline": timeline, **changes}))
 
 
 @pytest.fixture
-def judging(panels: Panels, clock: Clock) -> Judging:
+def rescoring(panels: Panels, clock: Clock) -> Rescoring:
     session = RecordedSession()
-    return Judging(JudgementPanel(panels.server, cast(Any, session)), session, panels, clock)
+    return Rescoring(PastRescorePanel(panels.server, cast(Any, session)), session, panels, clock)
 
 
 @pytest.mark.parametrize(
-    ("judged", "says"),
+    ("rescored", "says"),
     [
-        (JudgedView("none"), ""),
-        (JudgedView("loading"), "loading the new code"),
-        (JudgedView("judging", done=26, total=50), "50 %"),
+        (RescoreView("none"), ""),
+        (RescoreView("loading"), "loading the new code"),
+        (RescoreView("rescoring", done=26, total=50), "50 %"),
         (done(episode(), same(1)), "1 of 2 episodes differs."),
         (done(same(1), differing_names={"new"}), "as they were. Other entries differ: new."),
-        (JudgedView("stopped", why="the file was saved again"), "the file was saved again"),
+        (RescoreView("stopped", why="the file was saved again"), "the file was saved again"),
     ],
 )
-def test_one_line_says_how_far_it_is_and_what_came_of_it(judged: JudgedView, says: str) -> None:
-    assert in_a_line(judged).endswith(says) and bool(in_a_line(judged)) == bool(says)
+def test_one_line_says_how_far_it_is_and_what_came_of_it(rescored: RescoreView, says: str) -> None:
+    assert in_a_line(rescored).endswith(says) and bool(in_a_line(rescored)) == bool(says)
 
 
 def test_outcomes_are_said_before_rewards() -> None:
@@ -143,21 +143,21 @@ def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     assert "<b>" not in html and "&lt;b&gt;" in html
 
 
-def test_nothing_is_shown_before_the_first_judgement(judging: Judging) -> None:
-    judging.draw(JudgedView())
-    assert not any(judging.panels.shows(name) for name in ("Stop judging", "Curve"))
-    assert judging.panels.html("wb-again") == "" and judging.panels.charts() == []
+def test_nothing_is_shown_before_the_first_judgement(rescoring: Rescoring) -> None:
+    rescoring.draw(RescoreView())
+    assert not any(rescoring.panels.shows(name) for name in ("Stop judging", "Curve"))
+    assert rescoring.panels.html("wb-again") == "" and rescoring.panels.charts() == []
 
 
-def test_only_what_runs_can_be_stopped(judging: Judging) -> None:
-    for state, stoppable in (("loading", True), ("judging", True), ("done", False), ("failed", False)):
-        judging.draw(done(state=state, serial=hash(state)))
-        assert judging.panels.shows("Stop judging") == stoppable and judging.panels.html("wb-again")
+def test_only_what_runs_can_be_stopped(rescoring: Rescoring) -> None:
+    for state, stoppable in (("loading", True), ("rescoring", True), ("done", False), ("failed", False)):
+        rescoring.draw(done(state=state, serial=hash(state)))
+        assert rescoring.panels.shows("Stop judging") == stoppable and rescoring.panels.html("wb-again")
 
 
-def test_the_new_line_lies_over_the_recorded_one(judging: Judging) -> None:
-    judging.draw(done(episode(3)), selected_env=3)
-    (chart,) = judging.panels.charts()
+def test_the_new_line_lies_over_the_recorded_one(rescoring: Rescoring) -> None:
+    rescoring.draw(done(episode(3)), selected_env=3)
+    (chart,) = rescoring.panels.charts()
     _, old, new = chart.data
     assert (old == 3).all() and (new == 6).all()
     assert [series.get("label") for series in chart.series] == [
@@ -165,42 +165,42 @@ def test_the_new_line_lies_over_the_recorded_one(judging: Judging) -> None:
         "as recorded",
         "judged again",
     ]
-    recorded, judged = ((series.get("width"), series.get("stroke")) for series in chart.series[1:])
-    assert recorded[0] is not None and judged[0] is not None and recorded[0] < judged[0]
-    assert recorded[1] != judged[1], "the record stands back"
-    judging.draw(done(same(3), serial=2), selected_env=3)
-    assert judging.panels.charts() == [] and not judging.panels.shows("Curve")
+    recorded, rescored = ((series.get("width"), series.get("stroke")) for series in chart.series[1:])
+    assert recorded[0] is not None and rescored[0] is not None and recorded[0] < rescored[0]
+    assert recorded[1] != rescored[1], "the record stands back"
+    rescoring.draw(done(same(3), serial=2), selected_env=3)
+    assert rescoring.panels.charts() == [] and not rescoring.panels.shows("Curve")
 
 
-def test_a_choice_that_is_none_draws_the_reward(judging: Judging) -> None:
-    judging.draw(done(episode(1)))
-    judging.panels.claim("Curve", "../../etc")
-    judging.draw(done(episode(1), serial=2))
-    assert [str(chart.title)[:13] for chart in judging.panels.charts()] == ["reward of env"]
+def test_a_choice_that_is_none_draws_the_reward(rescoring: Rescoring) -> None:
+    rescoring.draw(done(episode(1)))
+    rescoring.panels.claim("Curve", "../../etc")
+    rescoring.draw(done(episode(1), serial=2))
+    assert [str(chart.title)[:13] for chart in rescoring.panels.charts()] == ["reward of env"]
 
 
-def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(judging: Judging) -> None:
-    session = judging.session
-    judging.draw(done(same(30), *(episode(env) for env in range(MOST_ROWS + 3))))
-    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in judging.panels.html()
-    judging.panels.press("row 2")
-    judging.panels.press("on")
-    judging.panels.press("row 2")
-    judging.panels.claim("row 3", True, "button")  # there is no such row on the last part
+def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescoring: Rescoring) -> None:
+    session = rescoring.session
+    rescoring.draw(done(same(30), *(episode(env) for env in range(MOST_ROWS + 3))))
+    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in rescoring.panels.html()
+    rescoring.panels.press("row 2")
+    rescoring.panels.press("on")
+    rescoring.panels.press("row 2")
+    rescoring.panels.claim("row 3", True, "button")  # there is no such row on the last part
     assert session.asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
     session.shown = running(40, timeline=TimelineView(first=500, last=1000))
-    judging.panels.press("back")
-    judging.panels.press("row 0")
+    rescoring.panels.press("back")
+    rescoring.panels.press("row 0")
     assert session.asked[-1] == ("select", 0)
 
 
-def test_the_key_goes_round(judging: Judging) -> None:
-    session = judging.session
-    judging.panel.go_to_difference(1)
+def test_the_key_goes_round(rescoring: Rescoring) -> None:
+    session = rescoring.session
+    rescoring.panel.go_to_difference(1)
     assert session.asked == []
-    judging.draw(done(episode(0), episode(1)))
+    rescoring.draw(done(episode(0), episode(1)))
     for wanted in (("show", 0, 5), ("show", 1, 15), ("show", 0, 5)):
-        judging.panel.go_to_difference(1)
+        rescoring.panel.go_to_difference(1)
         assert session.asked[-1] == wanted
         session.shown = running(
             40, selected_env=wanted[1], timeline=TimelineView(first=0, last=1000, shown=wanted[2])
@@ -210,7 +210,7 @@ def test_the_key_goes_round(judging: Judging) -> None:
 def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
     count = 3 * LONGEST
     tick = np.arange(count)
-    curve = JudgedCurve(tick, tick + 7, np.zeros(count, np.float32), np.ones(count, np.float32))
+    curve = RescoredCurve(tick, tick + 7, np.zeros(count, np.float32), np.ones(count, np.float32))
     assert chart_data(curve, None)[0][-1] == count - 1
     x, _, _, cursor = chart_data(curve, 7 + LONGEST)
     assert len(x) == LONGEST

@@ -24,7 +24,7 @@ SLIDER = "step of the past"
 
 
 @dataclass
-class Lived:
+class EnvMoment:
     """A session with a past, and its page."""
 
     session: Session
@@ -60,12 +60,12 @@ class Lived:
 
 
 @pytest.fixture
-def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]) -> Lived:
+def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]) -> EnvMoment:
     session = scripted_session(3)
-    return Lived(session, Page(panels.server, session, clock=clock), panels, clock)
+    return EnvMoment(session, Page(panels.server, session, clock=clock), panels, clock)
 
 
-def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(lived: Lived) -> None:
+def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(lived: EnvMoment) -> None:
     assert not lived.panels.part("Timeline").seen, "the page was not drawn yet"
     lived.draw()
     assert lived.panels.part("Timeline").seen
@@ -76,7 +76,7 @@ def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(live
     assert "live" in lived.strip()
 
 
-def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Lived) -> None:
+def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: EnvMoment) -> None:
     lived.step(2)
     there = lived.hand()
     lived.step(2)
@@ -94,7 +94,7 @@ def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Liv
     assert "live" in lived.strip() and not lived.panels.shows("way to go on")
 
 
-def test_going_on_puts_the_envs_that_were_named_back(lived: Lived) -> None:
+def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
     lived.step(4)
     lived.panels.choose(panel.LAST_STEP)
     lived.panels.choose(panel.LAST_STEP)
@@ -110,7 +110,7 @@ def test_going_on_puts_the_envs_that_were_named_back(lived: Lived) -> None:
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
-def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: Lived) -> None:
+def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvMoment) -> None:
     lived.step(4)
     last = lived.past.last
     lived.panels.command("Reset all envs")
@@ -136,7 +136,7 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: Live
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
-def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived: Lived) -> None:
+def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived: EnvMoment) -> None:
     lived.step(4)
     last = lived.past.last
     lived.panels.command("Reset all envs")
@@ -164,7 +164,7 @@ def test_of_one_env_there_is_one_way_to_go_on() -> None:
     assert labels == ("Go on from here: env 2", "all envs", "env 2 into all envs")
 
 
-def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: Lived) -> None:
+def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: EnvMoment) -> None:
     lived.step(3)
     until(lambda: not Control.took_the_key(), "a moment in which nobody touches anything")
     lived.panels.command("A step back in time")
@@ -178,7 +178,7 @@ def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: Lived) -> None:
     assert lived.past.shown == 0
 
 
-def test_a_value_that_no_slider_has_is_refused(lived: Lived) -> None:
+def test_a_value_that_no_slider_has_is_refused(lived: EnvMoment) -> None:
     lived.step(3)
     lived.panels.claim(SLIDER, 1)
     lived.panels.claim(SLIDER, -4)
@@ -192,7 +192,7 @@ def test_a_value_that_no_slider_has_is_refused(lived: Lived) -> None:
     assert lived.past.shown == lived.past.first and lived.past.last == 3
 
 
-def test_one_moment_alone_has_nothing_to_slide_along(lived: Lived) -> None:
+def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
     lived.draw()
     assert not lived.panels.shows(SLIDER)
     assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
@@ -202,7 +202,7 @@ def test_one_moment_alone_has_nothing_to_slide_along(lived: Lived) -> None:
 
 
 def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
-    lived: Lived, monkeypatch: pytest.MonkeyPatch
+    lived: EnvMoment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lived.step(3)
     lived.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
@@ -222,7 +222,7 @@ def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
     assert asked == [2]
 
 
-def test_home_is_the_left_end_of_the_slider(lived: Lived) -> None:
+def test_home_is_the_left_end_of_the_slider(lived: EnvMoment) -> None:
     lived.step(3)
     lived.panels.command("The first moment")
     assert lived.past.shown == 0

@@ -19,7 +19,7 @@ from workbench.jobs.verdict import Verdict
 from workbench.recording.episode.source import Source
 from workbench.recording.library.library import Library
 from workbench.session.rescore import verdict_text as words
-from workbench.session.rescore.background import JudgedView
+from workbench.session.rescore.background import RescoreView
 from workbench.session.review.review import Review
 from workbench.ui.review.rescore import (
     IDLE,
@@ -90,10 +90,10 @@ def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
 
 def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
-    html = status_html(JudgedView("failed", total=3, why="the code raised", problem=problem))
+    html = status_html(RescoreView("failed", total=3, why="the code raised", problem=problem))
     assert "push.py:88" in html and "<b>" not in html and "&lt;b&gt;" in html
-    assert "Select recordings" in status_html(JudgedView(), idle=IDLE)
-    told = JudgedView("judging", 2, (verdict(),), 1, 3, "episodes", task="Push-v1")
+    assert "Select recordings" in status_html(RescoreView(), idle=IDLE)
+    told = RescoreView("rescoring", 2, (verdict(),), 1, 3, "episodes", task="Push-v1")
     assert "judging with Push-v1: 1 of 3 episodes" in status_html(told)
 
 
@@ -123,7 +123,7 @@ class Told:
     """Stands where what judges again stands for the panel: what it has told last."""
 
     def __init__(self) -> None:
-        self.view, self.judging = JudgedView(), self
+        self.view, self.rescoring = RescoreView(), self
 
     def stop(self) -> None:
         raise AssertionError("nobody asked for that")
@@ -140,7 +140,7 @@ class Rescoring:
     choices: RescoreChoices
     told: Told
 
-    def draw(self, told: JudgedView) -> None:
+    def draw(self, told: RescoreView) -> None:
         self.told.view = told
         self.clock.passes()
         self.panel.draw(self.review.view())
@@ -161,7 +161,7 @@ def test_a_row_opens_its_episode_at_the_first_difference(
         verdict(rows[seed].id, seed=seed, first_difference=seed + 1, returns=(0.0, float(seed)))
         for seed in (1, 2, 3)
     ]
-    rescoring.draw(JudgedView("done", 1, tuple(given), 3, 3))
+    rescoring.draw(RescoreView("done", 1, tuple(given), 3, 3))
     assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
     assert not any(rescoring.panels.shows(name) for name in ("Judge what is open", "Stop"))
     rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
@@ -180,10 +180,10 @@ def test_why_nothing_could_be_judged_is_said_once(rescoring: Rescoring) -> None:
         verdict("b", why_not=f"{why}: line 1"),
         verdict("c", why_not="it has no step"),
     )
-    rescoring.draw(JudgedView("failed", 1, lost, 3, 3, why=why))
+    rescoring.draw(RescoreView("failed", 1, lost, 3, 3, why=why))
     assert rescoring.panels.html().count("is not trusted") == 1
     assert "not judged: it has no step" in rescoring.panels.html()
-    rescoring.draw(JudgedView("done", 2, lost, 3, 3))
+    rescoring.draw(RescoreView("done", 2, lost, 3, 3))
     assert rescoring.panels.html().count(f"not judged: {why}") == 2, "nothing else says it"
 
 
@@ -194,7 +194,7 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
         verdict("lost", seed=6, why_not="it has no step"),
         verdict("other", seed=7, metres=0.032, **moved),
     )
-    rescoring.draw(JudgedView("done", 1, given, 3, 3))
+    rescoring.draw(RescoreView("done", 1, given, 3, 3))
     html = rescoring.panels.html("wb-again-table")
     rows = re.findall(r'<tr [^>]*class="([^"]*)" title="[^"]*">(.*?)</tr>', html)
     said = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
@@ -207,18 +207,18 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
 
 
 def test_before_anything_was_judged_the_page_says_how_and_shows_no_list(rescoring: Rescoring) -> None:
-    rescoring.draw(JudgedView())
+    rescoring.draw(RescoreView())
     assert "Select recordings in the Library" in rescoring.panels.html("wb-again")
     assert not rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
-    rescoring.draw(JudgedView("done", 1, (verdict(),), 1, 1))
+    rescoring.draw(RescoreView("done", 1, (verdict(),), 1, 1))
     assert rescoring.panels.html("wb-again-table")
-    rescoring.draw(JudgedView("judging", 2, (), 0, 1))
+    rescoring.draw(RescoreView("rescoring", 2, (), 0, 1))
     assert rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
 
 
 def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
-    rescoring.draw(JudgedView("done", 1, many, 23, 23))
+    rescoring.draw(RescoreView("done", 1, many, 23, 23))
     assert (
         rescoring.panels.html().count('data-press="') == MOST_ROWS + 2
         and "1 to 10 of 23" in rescoring.panels.html()
@@ -226,7 +226,7 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     rescoring.panels.press("on")
     rescoring.panels.press("on")
     rescoring.panels.press("on")
-    rescoring.draw(JudgedView("done", 2, many, 23, 23))
+    rescoring.draw(RescoreView("done", 2, many, 23, 23))
     assert "21 to 23 of 23" in rescoring.panels.html()
 
 

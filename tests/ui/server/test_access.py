@@ -8,12 +8,12 @@ from urllib.parse import quote
 import pytest
 
 from workbench.ui.server.access import (
+    AccessRules,
     Admitted,
-    Asked,
     Decision,
     Entered,
-    Gate,
     RefusedRequest,
+    RequestParts,
     Why,
     cookie_name,
     decide,
@@ -23,8 +23,8 @@ from workbench.ui.server.access import (
 )
 
 TOKEN = "right"
-GATE = Gate(TOKEN)
-KNOWN = Asked(path="/", host=["localhost:8080"], cookie=["workbench-token-8080=right"])
+GATE = AccessRules(TOKEN)
+KNOWN = RequestParts(path="/", host=["localhost:8080"], cookie=["workbench-token-8080=right"])
 
 
 def why(verdict: Decision) -> Why | None:
@@ -79,16 +79,16 @@ def test_loopback_is_localhost_and_its_addresses(host: str, loopback: bool) -> N
 def test_a_gate_takes_no_address_and_no_name_that_it_was_not_given() -> None:
     for host in ("192.168.1.5", "box", "evil.example"):
         assert not host_is_ours(GATE, host)
-        assert host_is_ours(Gate(TOKEN, names=frozenset({host})), host)
-    assert host_is_ours(Gate(TOKEN, any_address=True), "192.168.1.5")
-    assert not host_is_ours(Gate(TOKEN, any_address=True), "box")
+        assert host_is_ours(AccessRules(TOKEN, names=frozenset({host})), host)
+    assert host_is_ours(AccessRules(TOKEN, any_address=True), "192.168.1.5")
+    assert not host_is_ours(AccessRules(TOKEN, any_address=True), "box")
 
 
 def test_the_host_is_quoted_as_it_was_sent() -> None:
     for websocket in (False, True):
-        for gate in (GATE, Gate(None)):
+        for rules in (GATE, AccessRules(None)):
             asked = replace(KNOWN, host=["LocalHost:8080"], websocket=websocket)
-            assert decide(gate, asked) == Admitted("LocalHost:8080")
+            assert decide(rules, asked) == Admitted("LocalHost:8080")
 
 
 @pytest.mark.parametrize("host", [[], [""], ["evil.example"], ["localhost:8080", "localhost:8080"]])
@@ -122,7 +122,7 @@ def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list
     ],
 )
 def test_an_origin_is_ours_where_scheme_host_and_port_lead_here(host: str, origin: str, ours: bool) -> None:
-    assert decide(Gate(None), Asked("/", [host], origin=[origin])) == (
+    assert decide(AccessRules(None), RequestParts("/", [host], origin=[origin])) == (
         Admitted(host) if ours else RefusedRequest(Why.SITE, "It came from a page of another site.")
     )
 
@@ -159,12 +159,13 @@ def test_the_cookie_is_the_one_of_the_port_that_the_browser_sees() -> None:
     assert cookie_name(8080) == "workbench-token-8080"
     for host, port in (("localhost", 80), ("localhost:80", 80), ("localhost:9000", 9000)):
         name = cookie_name(port)
-        assert why(decide(GATE, Asked("/", [host], cookie=[f"{name}={TOKEN}"]))) is None
+        assert why(decide(GATE, RequestParts("/", [host], cookie=[f"{name}={TOKEN}"]))) is None
         assert (
-            why(decide(GATE, Asked("/", [host], cookie=[f"{cookie_name(port + 1)}={TOKEN}"]))) is Why.NO_TOKEN
+            why(decide(GATE, RequestParts("/", [host], cookie=[f"{cookie_name(port + 1)}={TOKEN}"])))
+            is Why.NO_TOKEN
         )
-        assert why(decide(GATE, Asked("/", [host], cookie=[f"{name}=wrong"]))) is Why.OTHER_TOKEN
-        entered = decide(GATE, Asked(f"/?token={TOKEN}", [host]))
+        assert why(decide(GATE, RequestParts("/", [host], cookie=[f"{name}=wrong"]))) is Why.OTHER_TOKEN
+        entered = decide(GATE, RequestParts(f"/?token={TOKEN}", [host]))
         assert isinstance(entered, Entered)
         assert entered.set_cookie == f"{name}={TOKEN}; Path=/; HttpOnly; SameSite=Strict"
 
@@ -178,7 +179,7 @@ def test_a_wrong_cookie_hides_no_right_one() -> None:
     ):
         assert why(decide(GATE, replace(KNOWN, cookie=cookies))) is None
     # A token may hold the sign that ends a cookie's name.
-    assert why(decide(Gate("a=b"), replace(KNOWN, cookie=[f"{name}=a=b"]))) is None
+    assert why(decide(AccessRules("a=b"), replace(KNOWN, cookie=[f"{name}=a=b"]))) is None
 
 
 @pytest.mark.parametrize(
@@ -233,7 +234,7 @@ def test_an_empty_token_in_the_address_is_none() -> None:
 
 
 def test_where_no_token_is_asked_for_one_in_the_address_is_a_word_like_others() -> None:
-    assert decide(Gate(None), replace(KNOWN, path="/?token=right")) == Admitted("localhost:8080")
+    assert decide(AccessRules(None), replace(KNOWN, path="/?token=right")) == Admitted("localhost:8080")
 
 
 @pytest.mark.parametrize("cookie", ["workbench-token-8080", f"workbench-token-8080=\udc80{TOKEN}"])

@@ -37,17 +37,17 @@ from tests.ui.knocking import (
 )
 from workbench.ui.server import responses, viser_private
 from workbench.ui.server.access import (
+    AccessRules,
     Admitted,
-    Asked,
     Entered,
-    Gate,
     RefusedRequest,
+    RequestParts,
     cookie_name,
     decide,
     host_is_ours,
 )
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.page_guard import PageGuard
 from workbench.ui.server.strangers import RareLog
 from workbench.ui.server.viser_private import element_id
@@ -59,10 +59,10 @@ LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
 
 
 @pytest.fixture
-def bystander(door: Door) -> Iterator[Callable[[], None]]:
+def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
     """An honest client that was there before; call it to see that it still works."""
-    checkbox = door.server.gui.add_checkbox("alive", False)
-    with client(door) as connection:
+    checkbox = gated_server.server.gui.add_checkbox("alive", False)
+    with client(gated_server) as connection:
 
         def works() -> None:
             wanted = not checkbox.value
@@ -77,10 +77,10 @@ def bystander(door: Door) -> Iterator[Callable[[], None]]:
 # The gate ----------------------------------------------------------------------------------------
 
 
-def test_an_honest_page_is_let_in(door):
-    assert both(door) == (200, 101)
-    assert both(door, Sec_Fetch_Site="same-origin") == (200, 101)
-    assert ask(door, Sec_Fetch_Site="none")[0] == 200
+def test_an_honest_page_is_let_in(gated_server):
+    assert both(gated_server) == (200, 101)
+    assert both(gated_server, Sec_Fetch_Site="same-origin") == (200, 101)
+    assert ask(gated_server, Sec_Fetch_Site="none")[0] == 200
 
 
 @pytest.mark.parametrize(
@@ -100,8 +100,8 @@ def test_an_honest_page_is_let_in(door):
         "chrome-extension://127.0.0.1:{port}",
     ],
 )
-def test_a_page_of_another_origin_is_refused_even_with_the_cookie(door, origin):
-    assert both(door, Origin=origin.format(port=door.port)) == (403, 403)
+def test_a_page_of_another_origin_is_refused_even_with_the_cookie(gated_server, origin):
+    assert both(gated_server, Origin=origin.format(port=gated_server.port)) == (403, 403)
 
 
 @pytest.mark.parametrize(
@@ -120,95 +120,102 @@ def test_a_page_of_another_origin_is_refused_even_with_the_cookie(door, origin):
         None,
     ],
 )
-def test_a_rebound_host_is_refused_even_with_the_token(door, host):
-    host = host and host.format(port=door.port)
+def test_a_rebound_host_is_refused_even_with_the_token(gated_server, host):
+    host = host and host.format(port=gated_server.port)
     origin = f"http://{host}"  # a rebound page is same-origin with its own name
-    assert both(door, Host=host, Origin=origin) == (403, 403)
-    assert ask(door, f"/?token={token_of(door)}", Host=host)[0] == 403
+    assert both(gated_server, Host=host, Origin=origin) == (403, 403)
+    assert ask(gated_server, f"/?token={token_of(gated_server)}", Host=host)[0] == 403
 
 
-def test_two_hosts_or_two_origins_are_refused(door):
+def test_two_hosts_or_two_origins_are_refused(gated_server):
     for name, first, second in (
-        ("Host", f"127.0.0.1:{door.port}", "evil.example"),
-        ("Origin", f"http://127.0.0.1:{door.port}", "https://evil.example"),
+        ("Host", f"127.0.0.1:{gated_server.port}", "evil.example"),
+        ("Origin", f"http://127.0.0.1:{gated_server.port}", "https://evil.example"),
     ):
-        request = f"GET / HTTP/1.1\r\n{name}: {first}\r\n{name}: {second}\r\nCookie: {cookie_of(door)}\r\n"
+        request = (
+            f"GET / HTTP/1.1\r\n{name}: {first}\r\n{name}: {second}\r\nCookie: {cookie_of(gated_server)}\r\n"
+        )
         if name == "Origin":
-            request += f"Host: 127.0.0.1:{door.port}\r\n"
-        with socket.create_connection(("127.0.0.1", door.port), timeout=20) as raw:
+            request += f"Host: 127.0.0.1:{gated_server.port}\r\n"
+        with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as raw:
             raw.sendall(request.encode() + b"\r\n")
             assert raw.recv(12) == b"HTTP/1.1 403"
 
 
-def test_without_the_token_nothing_is_served(door):
+def test_without_the_token_nothing_is_served(gated_server):
     for path in ("/", "/index.html", "/workbench/logo.svg", "/no-such-file", "/?token="):
-        assert ask(door, path, Cookie=None)[0] == 403, path
-    assert knock(door, Cookie=None) == 403
+        assert ask(gated_server, path, Cookie=None)[0] == 403, path
+    assert knock(gated_server, Cookie=None) == 403
 
 
 @pytest.mark.parametrize(
     "change", [str.lower, lambda t: t[:-1], lambda t: t + "A", lambda t: "", lambda t: "é" + t]
 )
-def test_a_wrong_token_is_refused_wherever_it_is_shown(door, change):
-    wrong = change(token_of(door))
-    status, headers, _ = ask(door, f"/?token={quote(wrong)}", Cookie=None)
+def test_a_wrong_token_is_refused_wherever_it_is_shown(gated_server, change):
+    wrong = change(token_of(gated_server))
+    status, headers, _ = ask(gated_server, f"/?token={quote(wrong)}", Cookie=None)
     assert status == 403
     assert "Set-Cookie" not in headers
-    assert both(door, Cookie=f"{cookie_name(door.port)}={wrong.replace('é', 'e')}") == (403, 403)
+    assert both(gated_server, Cookie=f"{cookie_name(gated_server.port)}={wrong.replace('é', 'e')}") == (
+        403,
+        403,
+    )
 
 
-def test_the_token_in_a_websockets_address_is_no_way_in(door):
+def test_the_token_in_a_websockets_address_is_no_way_in(gated_server):
     handshake: dict[str, str | None] = {"Upgrade": "websocket", "Connection": "Upgrade", "Cookie": None}
-    assert ask(door, f"/?token={token_of(door)}", **handshake)[0] == 403
+    assert ask(gated_server, f"/?token={token_of(gated_server)}", **handshake)[0] == 403
 
 
-def test_the_right_token_becomes_a_cookie_and_leaves_the_address(door):
-    status, headers, body = ask(door, f"/some/page?token={token_of(door)}&x=1", Cookie=None)
+def test_the_right_token_becomes_a_cookie_and_leaves_the_address(gated_server):
+    status, headers, body = ask(gated_server, f"/some/page?token={token_of(gated_server)}&x=1", Cookie=None)
     assert (status, headers["Location"], body) == (303, "/some/page?x=1", b"")
     assert headers["Cache-Control"] == "no-store"
     cookie = headers["Set-Cookie"]
     assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(cookie.split("; "))
-    assert both(door, Cookie=cookie.partition(";")[0]) == (200, 101)
+    assert both(gated_server, Cookie=cookie.partition(";")[0]) == (200, 101)
 
 
-def test_the_cookie_goes_by_the_port_that_the_browser_sees(door):
+def test_the_cookie_goes_by_the_port_that_the_browser_sees(gated_server):
     """ssh -L 9000:127.0.0.1:PORT."""
-    _, headers, _ = ask(door, f"/?token={token_of(door)}", Host="localhost:9000", Cookie=None)
+    _, headers, _ = ask(gated_server, f"/?token={token_of(gated_server)}", Host="localhost:9000", Cookie=None)
     cookie = headers["Set-Cookie"].partition(";")[0]
     assert cookie.startswith("workbench-token-9000=")
     tunnel = {"Host": "localhost:9000", "Origin": "http://localhost:9000"}
-    assert both(door, Cookie=cookie, **tunnel) == (200, 101)
+    assert both(gated_server, Cookie=cookie, **tunnel) == (200, 101)
 
 
-def test_the_cookie_of_another_ports_workbench_is_refused(door):
-    other = open_door(DoorOptions(port=0))
+def test_the_cookie_of_another_ports_workbench_is_refused(gated_server):
+    other = open_server(ServerOptions(port=0))
     try:
-        assert both(door, Cookie=cookie_of(other)) == (403, 403)
-        assert both(door, Cookie=f"{cookie_name(door.port)}={token_of(other)}") == (403, 403)
-        assert both(door, Cookie=f"{cookie_name(other.port)}={token_of(door)}") == (403, 403)
+        assert both(gated_server, Cookie=cookie_of(other)) == (403, 403)
+        assert both(gated_server, Cookie=f"{cookie_name(gated_server.port)}={token_of(other)}") == (403, 403)
+        assert both(gated_server, Cookie=f"{cookie_name(other.port)}={token_of(gated_server)}") == (403, 403)
         # And the browser that is in both shows both, in any order.
-        assert both(door, Cookie=f"{cookie_of(other)}; {cookie_of(door)}") == (200, 101)
-        assert both(other, Cookie=f"{cookie_of(other)}; {cookie_of(door)}") == (200, 101)
+        assert both(gated_server, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
+        assert both(other, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
     finally:
         other.close()
 
 
-def test_a_forged_cookie_beside_the_right_one_locks_nobody_out(door):
-    assert both(door, Cookie=f"{cookie_name(door.port)}=forged; {cookie_of(door)}") == (200, 101)
+def test_a_forged_cookie_beside_the_right_one_locks_nobody_out(gated_server):
+    assert both(
+        gated_server, Cookie=f"{cookie_name(gated_server.port)}=forged; {cookie_of(gated_server)}"
+    ) == (200, 101)
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site", "same-origin, none"])
-def test_a_foreign_pages_script_tag_gets_nothing(door, site):
+def test_a_foreign_pages_script_tag_gets_nothing(gated_server, site):
     """It carries no Origin, and from another port of this machine it carries the cookie."""
-    assert ask(door, "/workbench/logo.svg", Sec_Fetch_Site=site, **LOADED_BY)[0] == 403
-    assert ask(door, f"/?token={token_of(door)}", Sec_Fetch_Site=site, **LOADED_BY)[0] == 403
+    assert ask(gated_server, "/workbench/logo.svg", Sec_Fetch_Site=site, **LOADED_BY)[0] == 403
+    assert ask(gated_server, f"/?token={token_of(gated_server)}", Sec_Fetch_Site=site, **LOADED_BY)[0] == 403
 
 
 @pytest.mark.parametrize(
     "path", ["//evil.example", "/\\evil.example", "///evil.example/x", "/%2fevil.example", "/\\/evil.example"]
 )
-def test_the_right_token_redirects_to_no_other_host(door, path):
-    status, headers, _ = ask(door, f"{path}?token={token_of(door)}")
+def test_the_right_token_redirects_to_no_other_host(gated_server, path):
+    status, headers, _ = ask(gated_server, f"{path}?token={token_of(gated_server)}")
     assert status == 303
     location = headers["Location"]
     assert location.startswith("/")
@@ -237,8 +244,8 @@ def test_the_right_token_redirects_to_no_other_host(door, path):
         "//etc/passwd",
     ],
 )
-def test_no_path_leads_out_of_the_served_folders(door, path):
-    status, _, body = ask(door, path)
+def test_no_path_leads_out_of_the_served_folders(gated_server, path):
+    status, _, body = ask(gated_server, path)
     assert status == 404
     assert b"root:" not in body and b"[project]" not in body and b"version" not in body
 
@@ -253,8 +260,8 @@ def test_no_path_leads_out_of_the_served_folders(door, path):
         b"\x16\x03\x01\x02\x00\x01\x00",  # TLS
     ],
 )
-def test_garbage_instead_of_http_harms_nobody(door, bystander, raw, capfd):
-    with socket.create_connection(("127.0.0.1", door.port), timeout=20) as connection:
+def test_garbage_instead_of_http_harms_nobody(gated_server, bystander, raw, capfd):
+    with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as connection:
         connection.sendall(raw)
         connection.shutdown(socket.SHUT_WR)
         answer = connection.recv(64)
@@ -269,16 +276,18 @@ hosts = st.from_regex(r"[A-Za-z0-9.:@\[\]/\\_-]{0,30}", fullmatch=True)
 @unhurried
 @given(host=st.one_of(hosts, st.text(max_size=30)), path=st.text(max_size=40), cookie=st.text(max_size=40))
 def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, cookie):
-    gate = Gate(token="x" * 43, any_address=True)
+    rules = AccessRules(token="x" * 43, any_address=True)
     for websocket in (False, True):
-        asked = Asked(path=path, host=[host], origin=[f"http://{host}"], cookie=[cookie], websocket=websocket)
-        assert isinstance(decide(gate, asked), RefusedRequest)
+        asked = RequestParts(
+            path=path, host=[host], origin=[f"http://{host}"], cookie=[cookie], websocket=websocket
+        )
+        assert isinstance(decide(rules, asked), RefusedRequest)
 
 
 @unhurried
 @given(hosts)
 def test_without_a_token_only_loopback_hosts_are_let_in(host):
-    verdict = decide(Gate(token=None), Asked(path="/", host=[host]))
+    verdict = decide(AccessRules(token=None), RequestParts(path="/", host=[host]))
     name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
     loopback = name.lower() == "localhost" or name.startswith(("127.", "["))
     assert isinstance(verdict, RefusedRequest) or loopback
@@ -287,8 +296,8 @@ def test_without_a_token_only_loopback_hosts_are_let_in(host):
 @unhurried
 @given(st.text(max_size=60))
 def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
-    gate = Gate(token="right")
-    verdict = decide(gate, Asked(path=f"{path}?token=right", host=["localhost:8080"]))
+    rules = AccessRules(token="right")
+    verdict = decide(rules, RequestParts(path=f"{path}?token=right", host=["localhost:8080"]))
     if isinstance(verdict, Entered):
         assert verdict.location.startswith("/")
         assert verdict.location[1:2] not in ("/", "\\")
@@ -303,81 +312,92 @@ def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
     )
 )
 def test_a_wider_gate_takes_bare_addresses_and_its_own_names_but_no_foreign_name(name):
-    gate = Gate(token=None, names=frozenset({"our-box"}), any_address=True)
+    rules = AccessRules(token=None, names=frozenset({"our-box"}), any_address=True)
     for ours in ("192.168.1.5", "2001:db8::1", "our-box", "localhost", "::1"):
-        assert host_is_ours(gate, ours)
+        assert host_is_ours(rules, ours)
     for foreign in (f"{name}.example", f"our-box.{name}.example", f"{name}-our-box"):
-        assert not host_is_ours(gate, foreign)
+        assert not host_is_ours(rules, foreign)
 
 
 def test_a_link_from_another_site_with_the_token_goes_on_by_a_page():
-    gate = Gate(token="right")
-    link = Asked(
+    rules = AccessRules(token="right")
+    link = RequestParts(
         path="/?token=right&a=%22%3E",
         host=["127.0.0.1:8080"],
         fetch_site=["cross-site"],
         fetch_mode=["navigate"],
         fetch_dest=["document"],
     )
-    verdict = decide(gate, link)
+    verdict = decide(rules, link)
     assert isinstance(verdict, Entered) and verdict.by_page
     assert '"' not in verdict.location and ">" not in verdict.location
 
 
 def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
-    door = open_door(DoorOptions(port=0, token=False))
+    gated_server = open_server(ServerOptions(port=0, token=False))
     try:
-        assert both(door, Cookie=None) == (200, 101)
-        assert both(door, Cookie=None, Origin="https://evil.example") == (403, 403)
-        assert both(door, Cookie=None, Host="evil.example", Origin="http://evil.example") == (403, 403)
-        assert ask(door, Cookie=None, Sec_Fetch_Site="cross-site", **LOADED_BY)[0] == 403
-        assert isinstance(decide(Gate(token=None), Asked("/", [f"localhost:{door.port}"])), Admitted)
+        assert both(gated_server, Cookie=None) == (200, 101)
+        assert both(gated_server, Cookie=None, Origin="https://evil.example") == (403, 403)
+        assert both(gated_server, Cookie=None, Host="evil.example", Origin="http://evil.example") == (
+            403,
+            403,
+        )
+        assert ask(gated_server, Cookie=None, Sec_Fetch_Site="cross-site", **LOADED_BY)[0] == 403
+        assert isinstance(
+            decide(AccessRules(token=None), RequestParts("/", [f"localhost:{gated_server.port}"])), Admitted
+        )
     finally:
-        door.close()
+        gated_server.close()
 
 
 def test_a_wide_door_takes_its_addresses_and_no_foreign_name():
-    door = open_door(DoorOptions(host="0.0.0.0", port=0))
+    gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
     try:
         for host in ("192.168.1.5", socket.gethostname().lower(), "localhost"):
-            assert both(door, Host=f"{host}:{door.port}", Origin=f"http://{host}:{door.port}") == (
+            assert both(
+                gated_server, Host=f"{host}:{gated_server.port}", Origin=f"http://{host}:{gated_server.port}"
+            ) == (
                 200,
                 101,
             ), host
-            assert ask(door, Host=f"{host}:{door.port}", Cookie=None)[0] == 403
-        assert both(door, Host=f"evil.example:{door.port}", Origin=f"http://evil.example:{door.port}") == (
+            assert ask(gated_server, Host=f"{host}:{gated_server.port}", Cookie=None)[0] == 403
+        assert both(
+            gated_server,
+            Host=f"evil.example:{gated_server.port}",
+            Origin=f"http://evil.example:{gated_server.port}",
+        ) == (
             403,
             403,
         )
     finally:
-        door.close()
+        gated_server.close()
 
 
 # Past the gate: what an authenticated client may say ----------------------------------------------
 
 
-def test_no_client_can_open_the_share_tunnel(door, bystander, caplog):
+def test_no_client_can_open_the_share_tunnel(gated_server, bystander, caplog):
     process = psutil.Process()
     children = set(process.children())
     threads = {thread.name for thread in threading.enumerate() if "unnel" in thread.name}
     assert not set(viser_private.REFUSED_FROM_CLIENTS) & set(KINDS)
     for name in viser_private.REFUSED_FROM_CLIENTS:
-        assert getattr(viser._messages, name) not in door.server._websock_server._incoming_handlers
-    with client(door) as connection:
+        assert getattr(viser._messages, name) not in gated_server.server._websock_server._incoming_handlers
+    with client(gated_server) as connection:
         say(connection, {"type": "ShareUrlRequest"})
         say(connection, {"type": "ShareUrlDisconnect"})
-        text = door.server.gui.add_text("after", "")
+        text = gated_server.server.gui.add_text("after", "")
         say(connection, claim(text, "heard"))  # the same connection lives on, and has been read this far
         until(lambda: text.value == "heard", "what was said last")
         text.remove()
     bystander()
-    assert door.server._share_tunnel is None
+    assert gated_server.server._share_tunnel is None
     assert set(process.children()) <= children
     assert {thread.name for thread in threading.enumerate() if "unnel" in thread.name} == threads
     assert all(
         link.raddr.ip.startswith("127.")
         for link in process.net_connections(kind="inet")
-        if link.raddr and link.laddr.port == door.port
+        if link.raddr and link.laddr.port == gated_server.port
     )
     assert not [
         link
@@ -387,9 +407,9 @@ def test_no_client_can_open_the_share_tunnel(door, bystander, caplog):
     assert "ShareUrlRequest" in caplog.text
 
 
-def test_no_client_can_upload(door, bystander):
-    upload = door.server.gui.add_upload_button("upload")
-    with client(door) as connection:
+def test_no_client_can_upload(gated_server, bystander):
+    upload = gated_server.server.gui.add_upload_button("upload")
+    with client(gated_server) as connection:
         say(
             connection,
             {
@@ -413,18 +433,18 @@ def test_no_client_can_upload(door, bystander):
             },
         )
         say(connection, claim(upload, {"name": "x", "content": b"y"}, "not_a_value"))
-        box = door.server.gui.add_checkbox("after", False)
+        box = gated_server.server.gui.add_checkbox("after", False)
         say(connection, claim(box, True))
         until(lambda: box.value, "what was said last")
         box.remove()
-    assert door.server.gui._current_file_upload_states == {}
+    assert gated_server.server.gui._current_file_upload_states == {}
     upload.remove()
     bystander()
 
 
-def test_a_client_changes_nothing_of_a_control_but_its_value(door, bystander):
-    slider = door.server.gui.add_slider("x", 0.0, 10.0, 0.1, 5.0)
-    with client(door) as connection:
+def test_a_client_changes_nothing_of_a_control_but_its_value(gated_server, bystander):
+    slider = gated_server.server.gui.add_slider("x", 0.0, 10.0, 0.1, 5.0)
+    with client(gated_server) as connection:
         for prop in ("removed", "is_button", "update_cb", "uuid", "props", "__class__", "no_such"):
             say(connection, claim(slider, True, prop))
         say(connection, {**claim(slider, 1.0), "updates": {"value": 1.0, "removed": True}})
@@ -469,12 +489,12 @@ def without(message: dict, field: str) -> dict:
     ],
     ids=lambda value: repr(value)[:40],
 )
-def test_a_malformed_frame_closes_its_own_connection_only(door, bystander, capfd, frame, code):
-    with client(door) as connection:
+def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystander, capfd, frame, code):
+    with client(gated_server) as connection:
         connection.send(frame)
         assert close_code(connection) == code
     bystander()
-    with client(door):  # and the door still opens
+    with client(gated_server):  # and the door still opens
         pass
     # The author's terminal is no place for a stranger's tracebacks.
     assert "Traceback" not in capfd.readouterr().err
@@ -495,24 +515,24 @@ def test_a_malformed_frame_closes_its_own_connection_only(door, bystander, capfd
     st.sampled_from(sorted(KINDS)),
     st.data(),
 )
-def test_any_message_is_admitted_dropped_or_called_malformed(door, value, kind, data):
+def test_any_message_is_admitted_dropped_or_called_malformed(gated_server, value, kind, data):
     fields = list(KINDS[kind].__struct_fields__)
     message = {
         "type": kind,
         **dict.fromkeys(data.draw(st.lists(st.sampled_from(fields), max_size=9)), value),
     }
-    judged(door, msgspec.msgpack.encode(message))
+    rescored(gated_server, msgspec.msgpack.encode(message))
 
 
 @unhurried
 @given(st.binary(max_size=200))
-def test_any_bytes_are_admitted_dropped_or_called_malformed(door, raw):
-    judged(door, raw)
+def test_any_bytes_are_admitted_dropped_or_called_malformed(gated_server, raw):
+    rescored(gated_server, raw)
 
 
-def judged(door: Door, raw: bytes) -> None:
+def rescored(gated_server: GatedServer, raw: bytes) -> None:
     """Let the guard of a page that is on no connection check a frame; any other error fails the test."""
-    page = viser_private.ViserPage(None, [door.server])  # type: ignore[arg-type]
+    page = viser_private.ViserPage(None, [gated_server.server])  # type: ignore[arg-type]
 
     async def judge_it() -> None:
         guard = PageGuard(page, RareLog(lambda line: None))
@@ -525,20 +545,20 @@ def judged(door: Door, raw: bytes) -> None:
         thread.submit(asyncio.run, judge_it()).result()
 
 
-def test_what_only_the_server_says_is_dropped_from_a_client(door, bystander):
-    with client(door) as connection:
+def test_what_only_the_server_says_is_dropped_from_a_client(gated_server, bystander):
+    with client(gated_server) as connection:
         say(connection, {"type": "RunJavascriptMessage", "source": "alert(1)"})
-        box = door.server.gui.add_checkbox("after", False)
+        box = gated_server.server.gui.add_checkbox("after", False)
         say(connection, claim(box, True))
         until(lambda: box.value, "what was said last")
         box.remove()
     bystander()
 
 
-def test_viser_listens_to_nothing_that_the_seam_does_not_know(door, bystander):
+def test_viser_listens_to_nothing_that_the_seam_does_not_know(gated_server, bystander):
     """An upgrade that adds a kind of message must be looked at before clients may send it."""
-    handled = {kind.__name__ for kind in door.server._websock_server._incoming_handlers}
-    for one in door.server.get_clients().values():
+    handled = {kind.__name__ for kind in gated_server.server._websock_server._incoming_handlers}
+    for one in gated_server.server.get_clients().values():
         handled |= {kind.__name__ for kind in one._websock_connection._incoming_handlers}
     assert handled - set(viser_private.REFUSED_FROM_CLIENTS) <= set(KINDS)
     assert len(handled) > 5
@@ -576,7 +596,7 @@ def hostile_site(html: str, handshakes: list[str] | None = None) -> Iterator[int
 
 
 @pytest.mark.browser
-def test_a_link_cannot_send_our_page_to_another_server(door, browser, monkeypatch):
+def test_a_link_cannot_send_our_page_to_another_server(gated_server, browser, monkeypatch):
     """``?websocket=`` is viser's; what such a server sends would run as our page, with our cookie."""
     came: list[str] = []
     later: list[str] = []
@@ -586,8 +606,8 @@ def test_a_link_cannot_send_our_page_to_another_server(door, browser, monkeypatc
         hostile_site("", later) as second,
         page_at(browser, "about:blank", 640, 480) as (page, _),
     ):
-        page.goto(door.url, wait_until="domcontentloaded")
-        link = f"http://127.0.0.1:{door.port}/?websocket=ws://127.0.0.1:"
+        page.goto(gated_server.url, wait_until="domcontentloaded")
+        link = f"http://127.0.0.1:{gated_server.port}/?websocket=ws://127.0.0.1:"
         with monkeypatch.context() as without_policy:
             without_policy.setattr(responses, "page_policy", lambda authority: "frame-ancestors 'self'")
             page.goto(f"{link}{first}", wait_until="domcontentloaded")
@@ -600,10 +620,10 @@ def test_a_link_cannot_send_our_page_to_another_server(door, browser, monkeypatc
 
 
 @pytest.mark.browser
-def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door, browser):
+def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(gated_server, browser):
     """The browser holds the cookie. ``127.0.0.1`` on another port is the same *site* to it, so there the
     cookie is sent along; ``localhost`` is another site."""
-    target = f"127.0.0.1:{door.port}"
+    target = f"127.0.0.1:{gated_server.port}"
     attack = """
         <body><script>
         async function attack() {
@@ -624,8 +644,8 @@ def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door, bro
     attack = attack.replace("TARGET", target).replace("PROTOCOL", PROTOCOL)
     refused = {"socket": "refused", "fetch": "refused", "image": "refused"}
     with hostile_site(attack) as port, page_at(browser, "about:blank", 640, 480) as (page, _):
-        page.goto(door.url, wait_until="domcontentloaded")
-        until(door.server.get_clients, "the page")
+        page.goto(gated_server.url, wait_until="domcontentloaded")
+        until(gated_server.server.get_clients, "the page")
         # The attack itself works: from our own page it gets through.
         own = page.evaluate(
             "() => {" + attack.partition("<script>")[2].partition("</script>")[0] + "; return attack(); }"
@@ -641,7 +661,7 @@ def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door, bro
         page.evaluate(
             "address => { const a = document.createElement('a'); a.href = address; a.id = 'go'; a.text = 'go';"
             " document.body.append(a); }",
-            door.url,
+            gated_server.url,
         )
         page.click("#go")
         page.wait_for_url(f"http://{target}/", wait_until="domcontentloaded")

@@ -14,28 +14,30 @@ import pytest
 from tests.drive.waiting import until
 from tests.ui.knocking import ask, cookie_of
 from workbench.ui.server.file_response import BLOCK, FileReply
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 
 LARGE = 48 * 2**20
 """More bytes than the kernel takes of a connection whose other end does not read."""
 
 
 @pytest.fixture
-def file(door: Door, tmp_path: Path, request: pytest.FixtureRequest) -> tuple[str, Path]:
+def file(gated_server: GatedServer, tmp_path: Path, request: pytest.FixtureRequest) -> tuple[str, Path]:
     """An address, and the file that it answers with."""
     path = tmp_path / "recording.rerun.write"
     prefix = f"/{request.node.name.partition('[')[0]}-{tmp_path.name}/"
-    door.add_route(prefix, lambda _: FileReply(path, "application/x-rerun", download_as="Größe 1.rrd"))
+    gated_server.add_route(
+        prefix, lambda _: FileReply(path, "application/x-rerun", download_as="Größe 1.rrd")
+    )
     return f"{prefix}x", path
 
 
-def begun(door: Door, address: str) -> tuple[socket.socket, bytes]:
+def begun(gated_server: GatedServer, address: str) -> tuple[socket.socket, bytes]:
     """A connection on which the answer has begun and is not read on: its head and a few bytes."""
     raw = socket.socket()
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     raw.settimeout(30)
-    raw.connect(("127.0.0.1", door.port))
-    request = f"GET {address} HTTP/1.1\r\nHost: 127.0.0.1:{door.port}\r\nCookie: {cookie_of(door)}\r\n\r\n"
+    raw.connect(("127.0.0.1", gated_server.port))
+    request = f"GET {address} HTTP/1.1\r\nHost: 127.0.0.1:{gated_server.port}\r\nCookie: {cookie_of(gated_server)}\r\n\r\n"
     raw.sendall(request.encode())
     got = b""
     while b"\r\n\r\n" not in got:
@@ -70,10 +72,12 @@ def position(path: Path) -> int:
 
 
 @pytest.mark.parametrize("size", [0, 1, BLOCK - 1, BLOCK, 2 * BLOCK + 1])
-def test_a_file_comes_whole_and_under_its_name(door: Door, file: tuple[str, Path], size: int) -> None:
+def test_a_file_comes_whole_and_under_its_name(
+    gated_server: GatedServer, file: tuple[str, Path], size: int
+) -> None:
     address, path = file
     path.write_bytes(os.urandom(size))
-    status, headers, body = ask(door, address)
+    status, headers, body = ask(gated_server, address)
     assert (status, body) == (200, path.read_bytes())
     assert headers["Content-Type"] == "application/x-rerun"
     assert headers["Content-Length"] == str(size)
@@ -83,21 +87,25 @@ def test_a_file_comes_whole_and_under_its_name(door: Door, file: tuple[str, Path
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
-def test_of_a_file_that_grows_no_more_comes_than_was_announced(door: Door, file: tuple[str, Path]) -> None:
+def test_of_a_file_that_grows_no_more_comes_than_was_announced(
+    gated_server: GatedServer, file: tuple[str, Path]
+) -> None:
     address, path = file
     path.touch()
     os.truncate(path, LARGE + 100)
-    raw, got = begun(door, address)
+    raw, got = begun(gated_server, address)
     os.truncate(path, LARGE + 10 * BLOCK)
     assert rest(raw, got) == (LARGE + 100, LARGE + 100)
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
-def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(door: Door, file: tuple[str, Path]) -> None:
+def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(
+    gated_server: GatedServer, file: tuple[str, Path]
+) -> None:
     address, path = file
     path.touch()
     os.truncate(path, LARGE)
-    raw, got = begun(door, address)
+    raw, got = begun(gated_server, address)
     os.truncate(path, LARGE // 2)
     announced, count = rest(raw, got)
     assert announced == LARGE and count <= LARGE // 2
@@ -105,38 +113,40 @@ def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(door: Door, file: tupl
 
 
 def test_who_goes_away_in_the_middle_holds_nothing_and_is_no_news(
-    door: Door, file: tuple[str, Path], caplog: pytest.LogCaptureFixture
+    gated_server: GatedServer, file: tuple[str, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     address, path = file
     path.touch()
     os.truncate(path, LARGE)
-    raw, _ = begun(door, address)
+    raw, _ = begun(gated_server, address)
     assert open_files(path) == 1
     raw.close()
     until(lambda: open_files(path) == 0, "the end of the reading")
-    assert ask(door, "/")[0] == 200
+    assert ask(gated_server, "/")[0] == 200
     assert caplog.records == []
 
 
-def test_for_who_does_not_read_no_more_is_read(door: Door, file: tuple[str, Path]) -> None:
+def test_for_who_does_not_read_no_more_is_read(gated_server: GatedServer, file: tuple[str, Path]) -> None:
     address, path = file
     path.touch()
     os.truncate(path, LARGE)
-    raw, _ = begun(door, address)
+    raw, _ = begun(gated_server, address)
     with raw:
         still, at = 0, -1
         while still < 30:
-            assert ask(door, "/workbench/logo.svg")[0] == 200
+            assert ask(gated_server, "/workbench/logo.svg")[0] == 200
             before, at = at, position(path)
             still = still + 1 if at == before else 0
         assert 0 < at < LARGE, "all of it is in memory"
 
 
-def test_many_read_one_file_at_once(door: Door, file: tuple[str, Path]) -> None:
+def test_many_read_one_file_at_once(gated_server: GatedServer, file: tuple[str, Path]) -> None:
     address, path = file
     path.write_bytes(os.urandom(3 * BLOCK + 7))
     bodies: list[bytes] = []
-    threads = [threading.Thread(target=lambda: bodies.append(ask(door, address)[2])) for _ in range(4)]
+    threads = [
+        threading.Thread(target=lambda: bodies.append(ask(gated_server, address)[2])) for _ in range(4)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -145,24 +155,28 @@ def test_many_read_one_file_at_once(door: Door, file: tuple[str, Path]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder"])
-def test_a_file_that_is_gone_is_not_found(door: Door, file: tuple[str, Path], kind: str) -> None:
+def test_a_file_that_is_gone_is_not_found(
+    gated_server: GatedServer, file: tuple[str, Path], kind: str
+) -> None:
     address, path = file
     if kind == "folder":
         path.mkdir()
-    status, headers, body = ask(door, address)
+    status, headers, body = ask(gated_server, address)
     assert (status, body) == (404, b"There is no such file.")
     assert headers["X-Content-Type-Options"] == "nosniff" and "Content-Security-Policy" in headers
 
 
-def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(door: Door, tmp_path: Path) -> None:
+def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(
+    gated_server: GatedServer, tmp_path: Path
+) -> None:
     plain = b"wasm " * BLOCK
     path = tmp_path / "viewer.wasm.gz"
     path.write_bytes(gzip.compress(plain))
-    door.add_route("/packed/", lambda _: FileReply(path, "application/wasm", gzipped=True))
-    status, headers, body = ask(door, "/packed/x", Accept_Encoding="br, gzip")
+    gated_server.add_route("/packed/", lambda _: FileReply(path, "application/wasm", gzipped=True))
+    status, headers, body = ask(gated_server, "/packed/x", Accept_Encoding="br, gzip")
     assert (status, headers["Content-Encoding"], headers["Vary"]) == (200, "gzip", "Accept-Encoding")
     assert body == path.read_bytes() and "Content-Disposition" not in headers
-    status, headers, body = ask(door, "/packed/x", Accept_Encoding="identity")
+    status, headers, body = ask(gated_server, "/packed/x", Accept_Encoding="identity")
     assert (status, headers["Vary"], body) == (200, "Accept-Encoding", plain)
     assert headers["Content-Length"] == str(len(plain)) and "Content-Encoding" not in headers
     until(lambda: open_files(path) == 0, "the end of the reading")
@@ -170,7 +184,7 @@ def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(door: Door, tmp_p
 
 @pytest.mark.parametrize("damage", ["not packed at all", "torn off", "turned"])
 def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
-    door: Door, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+    gated_server: GatedServer, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     packed = bytearray(gzip.compress(os.urandom(6 * BLOCK)))
     if damage == "not packed at all":
@@ -182,8 +196,8 @@ def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
     path = tmp_path / "viewer.wasm.gz"
     path.write_bytes(packed)
     prefix = f"/damaged-{damage.replace(' ', '-')}/"
-    door.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
-    raw, got = begun(door, f"{prefix}x")
+    gated_server.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
+    raw, got = begun(gated_server, f"{prefix}x")
     announced, count = rest(raw, got)
     assert announced == 6 * BLOCK and count < announced
     until(lambda: open_files(path) == 0, "the end of the reading")

@@ -22,19 +22,19 @@ from workbench.machine.web_assets import web_assets_folder
 from workbench.ui.server import gated_server as door_module
 from workbench.ui.server import listening, viser_private
 from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
-from workbench.ui.server.listening import DEFAULT_PORT, DoorError
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.server.listening import DEFAULT_PORT, ServerError
 from workbench.ui.server.responses import SCRIPTS, STYLES, folder_handler
 
 
-def token_of(door: Door) -> str:
-    return door.url.partition("token=")[2]
+def token_of(gated_server: GatedServer) -> str:
+    return gated_server.url.partition("token=")[2]
 
 
-def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
+def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
     """GET ``path`` with the door's cookie, sent as it stands."""
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
-    cookie = {"Cookie": f"{cookie_name(door.port)}={token_of(door)}"}
+    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
+    cookie = {"Cookie": f"{cookie_name(gated_server.port)}={token_of(gated_server)}"}
     try:
         connection.request(
             "GET", path, headers={**cookie, **{k.replace("_", "-"): v for k, v in headers.items()}}
@@ -58,94 +58,99 @@ def a_taken_port() -> tuple[socket.socket, int]:
     return taken, taken.getsockname()[1]
 
 
-def test_it_listens_on_loopback_only_unless_told_otherwise(door):
-    assert DoorOptions().host == "127.0.0.1"
-    assert listening_addresses(door.port) == {"127.0.0.1"}
-    assert door.warning is None and door.addresses() == (door.url,)
+def test_it_listens_on_loopback_only_unless_told_otherwise(gated_server):
+    assert ServerOptions().host == "127.0.0.1"
+    assert listening_addresses(gated_server.port) == {"127.0.0.1"}
+    assert gated_server.warning is None and gated_server.addresses() == (gated_server.url,)
 
 
 def test_localhost_is_the_address_that_is_printed():
-    door = open_door(DoorOptions(host="localhost", port=0))
+    gated_server = open_server(ServerOptions(host="localhost", port=0))
     try:
-        assert door.url.startswith(f"http://127.0.0.1:{door.port}/?token=")
-        assert listening_addresses(door.port) == {"127.0.0.1"}
+        assert gated_server.url.startswith(f"http://127.0.0.1:{gated_server.port}/?token=")
+        assert listening_addresses(gated_server.port) == {"127.0.0.1"}
     finally:
-        door.close()
+        gated_server.close()
 
 
 def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys):
-    door = open_door(DoorOptions(host="0.0.0.0", port=0))
+    gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
     try:
-        assert listening_addresses(door.port) == {"0.0.0.0"}
-        assert door.warning is not None and "0.0.0.0" in door.warning
-        assert "0.0.0.0" not in door.url  # no browser can open that
-        assert len(token_of(door)) >= 43  # 256 bits
+        assert listening_addresses(gated_server.port) == {"0.0.0.0"}
+        assert gated_server.warning is not None and "0.0.0.0" in gated_server.warning
+        assert "0.0.0.0" not in gated_server.url  # no browser can open that
+        assert len(token_of(gated_server)) >= 43  # 256 bits
         # Where the machine has no way out, the page's own address is of no use to others.
         own = [address for host in psutil.net_if_addrs().values() for address in host]
         reach = [a.address for a in own if a.family == socket.AF_INET and not a.address.startswith("127.")]
-        hosts = {url.removeprefix("http://").partition(":")[0] for url in door.addresses()} - {"127.0.0.1"}
+        hosts = {url.removeprefix("http://").partition(":")[0] for url in gated_server.addresses()} - {
+            "127.0.0.1"
+        }
         assert {socket.gethostname(), *reach} - {"localhost"} >= hosts and hosts >= {*reach[:1]}
-        assert all(url.endswith(f":{door.port}/?token={token_of(door)}") for url in door.addresses())
+        assert all(
+            url.endswith(f":{gated_server.port}/?token={token_of(gated_server)}")
+            for url in gated_server.addresses()
+        )
         for host in hosts:
-            connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+            connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
             connection.request(
                 "GET",
-                f"/?token={token_of(door)}",
-                headers={"Host": f"{host}:{door.port}", "Connection": "close"},
+                f"/?token={token_of(gated_server)}",
+                headers={"Host": f"{host}:{gated_server.port}", "Connection": "close"},
             )
             assert connection.getresponse().status in (200, 303), host
             connection.close()
-        say_addresses(door.addresses())
+        say_addresses(gated_server.addresses())
         printed = capsys.readouterr().out.splitlines()
         assert [line.split() for line in printed] == [
-            ["or" if i else "page", url] for i, url in enumerate(dict.fromkeys(door.addresses()))
+            ["or" if i else "page", url] for i, url in enumerate(dict.fromkeys(gated_server.addresses()))
         ]
-        door.renew_token()
-        assert all(url.endswith(token_of(door)) for url in door.addresses())
+        gated_server.renew_token()
+        assert all(url.endswith(token_of(gated_server)) for url in gated_server.addresses())
     finally:
-        door.close()
+        gated_server.close()
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.7.7", "gpu-server"])
 def test_without_a_token_only_loopback_is_allowed(host):
     with pytest.raises(ValueError, match="token"):
-        DoorOptions(host=host, token=False)
+        ServerOptions(host=host, token=False)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "::1", "127.3.4.5"])
 def test_loopback_may_do_without_a_token(host):
-    assert DoorOptions(host=host, token=False).token is False
+    assert ServerOptions(host=host, token=False).token is False
 
 
 @pytest.mark.parametrize("options", [{"host": ""}, {"port": -1}, {"port": 70000}])
 def test_options_that_cannot_be_are_refused(options):
     with pytest.raises(ValueError):
-        DoorOptions(**options)
+        ServerOptions(**options)
 
 
 @pytest.mark.parametrize("port", [0, 1, 65535])
 def test_every_port_that_there_is_can_be_asked_for(port):
-    assert DoorOptions(port=port).port == port
+    assert ServerOptions(port=port).port == port
     with pytest.raises(ValueError, match="Port 65536 does not exist"):
-        DoorOptions(port=65536)
+        ServerOptions(port=65536)
 
 
 def test_a_page_without_a_token_opens_at_its_plain_address():
-    door = open_door(DoorOptions(port=0, token=False))
+    gated_server = open_server(ServerOptions(port=0, token=False))
     try:
-        assert door.url == f"http://127.0.0.1:{door.port}/"
-        connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+        assert gated_server.url == f"http://127.0.0.1:{gated_server.port}/"
+        connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
         connection.request("GET", "/")
         assert connection.getresponse().status == 200
         connection.close()
     finally:
-        door.close()
+        gated_server.close()
 
 
 def test_a_taken_port_that_was_asked_for_is_an_error_that_says_what_to_do():
     taken, port = a_taken_port()
-    with taken, pytest.raises(DoorError, match=f"Port {port} is taken.*--port"):
-        open_door(DoorOptions(port=port))
+    with taken, pytest.raises(ServerError, match=f"Port {port} is taken.*--port"):
+        open_server(ServerOptions(port=port))
 
 
 def test_the_default_port_makes_way_and_says_so(monkeypatch):
@@ -153,58 +158,64 @@ def test_the_default_port_makes_way_and_says_so(monkeypatch):
     # 8080 itself may be in use on the machine that runs this.
     monkeypatch.setattr(listening, "DEFAULT_PORT", port)
     with taken:
-        door = open_door(DoorOptions(port=port))
+        gated_server = open_server(ServerOptions(port=port))
         try:
-            assert door.port != port
-            assert listening_addresses(door.port) == {"127.0.0.1"}
-            assert f":{door.port}/" in door.url
-            assert door.notice is not None and str(port) in door.notice and str(door.port) in door.notice
+            assert gated_server.port != port
+            assert listening_addresses(gated_server.port) == {"127.0.0.1"}
+            assert f":{gated_server.port}/" in gated_server.url
+            assert (
+                gated_server.notice is not None
+                and str(port) in gated_server.notice
+                and str(gated_server.port) in gated_server.notice
+            )
         finally:
-            door.close()
+            gated_server.close()
 
 
 def test_a_port_in_visers_environment_changes_nothing(monkeypatch):
     monkeypatch.setenv("_VISER_PORT_OVERRIDE", "1")
-    door = open_door(DoorOptions(port=0))
+    gated_server = open_server(ServerOptions(port=0))
     try:
-        assert door.server.get_port() == door.port
-        assert door.notice is None, "any port was asked for"
-        assert get(door, "/")[0] == 200
+        assert gated_server.server.get_port() == gated_server.port
+        assert gated_server.notice is None, "any port was asked for"
+        assert get(gated_server, "/")[0] == 200
     finally:
-        door.close()
+        gated_server.close()
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
 def test_an_address_of_another_machine_is_an_error_that_says_so(host):
-    with pytest.raises(DoorError, match="address of this machine"):
-        open_door(DoorOptions(host=host, port=0))
+    with pytest.raises(ServerError, match="address of this machine"):
+        open_server(ServerOptions(host=host, port=0))
 
 
-def test_the_ssh_line_leads_to_this_port(door):
-    assert f"-L {door.port}:127.0.0.1:{door.port} " in door.ssh_hint
-    assert socket.gethostname() in door.ssh_hint
-    assert token_of(door) not in door.ssh_hint
+def test_the_ssh_line_leads_to_this_port(gated_server):
+    assert f"-L {gated_server.port}:127.0.0.1:{gated_server.port} " in gated_server.ssh_hint
+    assert socket.gethostname() in gated_server.ssh_hint
+    assert token_of(gated_server) not in gated_server.ssh_hint
 
 
-def test_two_doors_have_two_tokens(door):
-    other = open_door(DoorOptions(port=0))
+def test_two_doors_have_two_tokens(gated_server):
+    other = open_server(ServerOptions(port=0))
     try:
-        assert token_of(other) != token_of(door)
-        assert other.port != door.port
+        assert token_of(other) != token_of(gated_server)
+        assert other.port != gated_server.port
     finally:
         other.close()
 
 
-def test_closing_frees_the_port_and_ends_the_thread(door):
-    thread = door.server._websock_server._server_thread
-    idle = socket.create_connection(("127.0.0.1", door.port))  # as Chromium holds them: nothing asked yet
-    assert get(door, "/")[0] == 200
-    door.close()
-    door.close()
+def test_closing_frees_the_port_and_ends_the_thread(gated_server):
+    thread = gated_server.server._websock_server._server_thread
+    idle = socket.create_connection(
+        ("127.0.0.1", gated_server.port)
+    )  # as Chromium holds them: nothing asked yet
+    assert get(gated_server, "/")[0] == 200
+    gated_server.close()
+    gated_server.close()
     assert not thread.is_alive()
-    assert listening_addresses(door.port) == set()
+    assert listening_addresses(gated_server.port) == set()
     idle.close()
-    socket.create_server(("127.0.0.1", door.port)).close()
+    socket.create_server(("127.0.0.1", gated_server.port)).close()
 
 
 def test_nothing_is_printed_but_by_us(child_process: None):
@@ -223,11 +234,11 @@ def test_nothing_is_printed_but_by_us(child_process: None):
         assert (done.returncode, done.stdout, done.stderr) == (0, "ours\n", "")
 
 
-def test_viser_has_every_private_name_that_the_seam_relies_on(door):
+def test_viser_has_every_private_name_that_the_seam_relies_on(gated_server):
     assert viser.__version__ == viser_private.WRITTEN_FOR
     assert viser_private.missing_names() == []
     for name in viser_private.PRIVATE_ATTRIBUTES:
-        here = door.server
+        here = gated_server.server
         for part in name.split("."):
             here = getattr(here, part)
 
@@ -246,8 +257,8 @@ def test_a_name_that_viser_took_away_is_named(name, monkeypatch):
 def test_a_viser_that_moved_opens_no_door(monkeypatch):
     before = threading.active_count()
     monkeypatch.delattr(viser._messages, "ShareUrlRequest")
-    with pytest.raises(DoorError, match=r"ShareUrlRequest.*viser==1\.1\.1"):
-        open_door(DoorOptions(port=0))
+    with pytest.raises(ServerError, match=r"ShareUrlRequest.*viser==1\.1\.1"):
+        open_server(ServerOptions(port=0))
     assert threading.active_count() == before
 
 
@@ -262,80 +273,80 @@ def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):
         worker(self, ready)
 
     monkeypatch.setattr(viser.infra._infra.WebsockServer, "_background_worker", as_a_later_viser_might)
-    with pytest.raises(DoorError, match="known way"):
-        open_door(DoorOptions(port=0))
+    with pytest.raises(ServerError, match="known way"):
+        open_server(ServerOptions(port=0))
 
 
 def test_a_gate_that_hangs_loose_opens_no_door(monkeypatch):
     monkeypatch.setattr(
-        door_module.access, "decide", lambda gate, asked: door_module.access.Admitted(asked.host[0])
+        door_module.access, "decide", lambda rules, asked: door_module.access.Admitted(asked.host[0])
     )
-    with pytest.raises(DoorError, match="is not protected"):
-        open_door(DoorOptions(port=0))
+    with pytest.raises(ServerError, match="is not protected"):
+        open_server(ServerOptions(port=0))
 
 
-def test_every_reply_carries_the_security_headers(door):
+def test_every_reply_carries_the_security_headers(gated_server):
     for path in ("/", "/no-such-file", "/workbench/logo.svg", "/workbench/no-such-file", "/?token=wrong"):
-        headers = get(door, path)[1]
+        headers = get(gated_server, path)[1]
         assert headers["X-Content-Type-Options"] == "nosniff", path
         assert headers["Referrer-Policy"] == "no-referrer", path
         assert headers["X-Frame-Options"] == "SAMEORIGIN", path
         assert "frame-ancestors 'self'" in headers["Content-Security-Policy"], path
 
 
-def test_our_files_are_served_small_where_the_browser_can(door):
+def test_our_files_are_served_small_where_the_browser_can(gated_server):
     logo = (web_assets_folder() / "logo.svg").read_bytes()
-    status, headers, body = get(door, "/workbench/logo.svg")
+    status, headers, body = get(gated_server, "/workbench/logo.svg")
     assert (status, headers["Content-Type"], body) == (200, "image/svg+xml", logo)
     page = (web_assets_folder() / "refused.html").read_bytes()
-    status, headers, body = get(door, "/workbench/refused.html?v=1", Accept_Encoding="br, gzip")
+    status, headers, body = get(gated_server, "/workbench/refused.html?v=1", Accept_Encoding="br, gzip")
     assert (status, headers["Content-Encoding"], gzip.decompress(body)) == (200, "gzip", page)
     assert len(body) < len(page)
 
 
 @pytest.mark.parametrize("encoding", ["identity", "gzip"])
-def test_the_page_has_our_styles_and_scripts_and_they_are_served(door, encoding):
-    status, headers, body = get(door, "/", Accept_Encoding=encoding)
+def test_the_page_has_our_styles_and_scripts_and_they_are_served(gated_server, encoding):
+    status, headers, body = get(gated_server, "/", Accept_Encoding=encoding)
     page = gzip.decompress(body) if headers["Content-Encoding"] == "gzip" else body
     assert status == 200 and int(headers["Content-Length"]) == len(body)
     assert f'<link rel="stylesheet" href="/workbench/{STYLES}">'.encode() in page
-    assert get(door, f"/workbench/{STYLES}")[1]["Content-Type"].startswith("text/css")
+    assert get(gated_server, f"/workbench/{STYLES}")[1]["Content-Type"].startswith("text/css")
     for name in SCRIPTS:
         assert f'<script src="/workbench/{name}"></script>'.encode() in page
-        status, headers, _ = get(door, f"/workbench/{name}")
+        status, headers, _ = get(gated_server, f"/workbench/{name}")
         assert status == 200 and headers["Content-Type"].startswith("text/javascript")
 
 
-def test_a_route_gets_the_rest_of_its_path(door):
+def test_a_route_gets_the_rest_of_its_path(gated_server):
     asked: list[str] = []
 
     def handle(path: str) -> tuple[int, str, bytes]:
         asked.append(path)
         return 200, "application/octet-stream", b"x" * 5000
 
-    door.add_route("/recordings/", handle, headers={"Cache-Control": "max-age=60"})
-    door.add_route("/recordings/deep/", lambda path: (418, "text/plain", path.encode()))
-    status, headers, body = get(door, "/recordings/a%20b/c.rrd?x=1", Accept_Encoding="gzip")
+    gated_server.add_route("/recordings/", handle, headers={"Cache-Control": "max-age=60"})
+    gated_server.add_route("/recordings/deep/", lambda path: (418, "text/plain", path.encode()))
+    status, headers, body = get(gated_server, "/recordings/a%20b/c.rrd?x=1", Accept_Encoding="gzip")
     assert (status, body, asked) == (200, b"x" * 5000, ["a b/c.rrd"])
     assert headers.get_all("Cache-Control") == ["max-age=60"]
-    assert get(door, "/recordings/deep/x")[::2] == (418, b"x")
+    assert get(gated_server, "/recordings/deep/x")[::2] == (418, b"x")
     with pytest.raises(ValueError, match="already"):
-        door.add_route("/recordings/", handle)
+        gated_server.add_route("/recordings/", handle)
     for prefix in ("recordings/", "/recordings", "/", "//"):
         with pytest.raises(ValueError, match="slash"):
-            door.add_route(prefix, handle)
+            gated_server.add_route(prefix, handle)
 
 
-def test_a_route_that_fails_answers_500_and_the_door_stays(door, caplog):
+def test_a_route_that_fails_answers_500_and_the_door_stays(gated_server, caplog):
     def handle(path: str) -> tuple[int, str, bytes]:
         raise RuntimeError("secret of the inside")
 
-    door.add_route("/broken/", handle)
-    status, _, body = get(door, "/broken/x")
+    gated_server.add_route("/broken/", handle)
+    status, _, body = get(gated_server, "/broken/x")
     assert status == 500
     assert b"secret" not in body
     assert "secret of the inside" in caplog.text
-    assert get(door, "/")[0] == 200
+    assert get(gated_server, "/")[0] == 200
 
 
 def test_a_link_out_of_the_folder_is_not_followed(tmp_path):
@@ -351,29 +362,29 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path):
     assert handle("")[0] == 404
 
 
-def test_the_refusal_page_says_what_to_do_and_asks_nothing_of_the_network(door):
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+def test_the_refusal_page_says_what_to_do_and_asks_nothing_of_the_network(gated_server):
+    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
     connection.request("GET", "/")
     response = connection.getresponse()
     page = response.read().decode()
     connection.close()
     assert response.status == 403
-    assert f"http://127.0.0.1:{door.port}/?token=" in page
-    assert token_of(door) not in page
+    assert f"http://127.0.0.1:{gated_server.port}/?token=" in page
+    assert token_of(gated_server) not in page
     assert "{{" not in page
     for reference in ("src=", "href=", "url(", "@import", "<script"):
         assert reference not in page
 
 
 @pytest.mark.browser
-def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, browser):
+def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(gated_server, browser):
     """With one of each thing that the page's policy could break: blobs, data, workers, wasm, eval."""
     import numpy as np
     import trimesh
     import trimesh.visual
     import trimesh.visual.material
 
-    server = door.server
+    server = gated_server.server
     server.gui.add_markdown("**bold**")
     server.gui.add_html(
         "<div id='from-html' style='color: red'>html</div><img id='logo' src='/workbench/logo.svg'>"
@@ -407,11 +418,11 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, browser
             "requestfailed",
             lambda request: complaints.append(f"{request.url[:100]} {request.failure}"),
         )
-        page.goto(door.url, wait_until="domcontentloaded")
+        page.goto(gated_server.url, wait_until="domcontentloaded")
         page.wait_for_selector("#from-html", timeout=60_000)
         page.wait_for_function("() => document.getElementById('logo').naturalWidth > 0", timeout=60_000)
         assert connected.wait(60)
-        assert page.url == f"http://127.0.0.1:{door.port}/"  # the token has left the address bar
+        assert page.url == f"http://127.0.0.1:{gated_server.port}/"  # the token has left the address bar
         assert page.evaluate("document.cookie") == ""  # and no script can read it
         (cookie,) = page.context.cookies()
         assert (cookie.get("httpOnly"), cookie.get("sameSite")) == (True, "Strict")
@@ -429,4 +440,4 @@ def _small_picture():
 
 
 def test_the_usual_port_is_the_default():
-    assert DoorOptions().port == DEFAULT_PORT == 8080
+    assert ServerOptions().port == DEFAULT_PORT == 8080

@@ -23,12 +23,12 @@ from workbench.session.live.session import Session
 from workbench.ui.app.live_page import Page
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server import strangers
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
 
 @dataclass
 class House:
-    door: Door
+    gated_server: GatedServer
     session: Session
     stage: Stage
     tabs: Tabs
@@ -36,7 +36,7 @@ class House:
     """How many pages are open, each time that the session was told."""
 
     def clients(self) -> int:
-        return len(self.door.server.get_clients())
+        return len(self.gated_server.server.get_clients())
 
 
 class Told(Session):
@@ -56,18 +56,18 @@ class Told(Session):
 
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    door, told = open_door(DoorOptions(port=0)), [0]
-    session, stage = Told(told, tmp_path_factory.mktemp("author")), Stage(door.server)
-    page = Page(door.server, session, stage=stage)
+    gated_server, told = open_server(ServerOptions(port=0)), [0]
+    session, stage = Told(told, tmp_path_factory.mktemp("author")), Stage(gated_server.server)
+    page = Page(gated_server.server, session, stage=stage)
     page.start()
     try:
-        with tabs_of(door.url) as tabs:
+        with tabs_of(gated_server.url) as tabs:
             wait_until(session, lambda view: view.task is not None, "the first load")
-            yield House(door, session, stage, tabs, told)
+            yield House(gated_server, session, stage, tabs, told)
     finally:
         page.stop()
         session.close()
-        door.close()
+        gated_server.close()
 
 
 def test_the_session_knows_whether_any_tab_is_open(house: House) -> None:
@@ -86,7 +86,7 @@ def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     monkeypatch.setattr(strangers, "READ_WITHIN", 3.0)
     reads = house.tabs.open()
     until(lambda: reads.open, "the tab that reads")
-    deaf = open_deaf_tab(house.door.url)
+    deaf = open_deaf_tab(house.gated_server.url)
     until(lambda: house.clients() == 2, "the one that does not")
     house.session.play()
     with caplog.at_level(logging.WARNING, "workbench.door"):
@@ -103,7 +103,7 @@ def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
 
 
 def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
-    server = house.door.server
+    server = house.gated_server.server
 
     def come_and_go() -> None:
         tab = house.tabs.open(server.initial_camera.position.tolist())

@@ -17,14 +17,14 @@ from tests.drive.waiting import until
 from tests.ui.knocking import ask
 from workbench.machine.web_assets import web_assets_folder
 from workbench.ui.server import responses
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.responses import DIRECTIVES, HANDLERS
 
 
 @pytest.fixture
-def filled(door: Door) -> Door:
+def filled(gated_server: GatedServer) -> GatedServer:
     """With one of each thing that a policy could break: blobs, data, workers, wasm, frames, handlers."""
-    server = door.server
+    server = gated_server.server
     server.gui.add_html(
         "<div id='from-html' style='color: red'>html</div><img src='/workbench/logo.svg'>"
         '<div onpointerdown="wb.press(event)"><b id="press" data-press="none">x</b></div>'
@@ -41,7 +41,7 @@ def filled(door: Door) -> Door:
     server.scene.add_mesh_trimesh("/box", box)
     server.scene.add_camera_frustum("/frustum", fov=1.0, aspect=1.0, image=np.zeros((8, 8, 3), np.uint8))
     server.scene.configure_environment_map("city", background=True)
-    return door
+    return gated_server
 
 
 def complaints_of(page: Page) -> list[str]:
@@ -68,9 +68,9 @@ def test_code_comes_from_files_and_known_hashes_alone():
     assert DIRECTIVES["default-src"] == "'none'"
 
 
-def test_every_reply_isolates_the_page_and_gives_it_no_devices(door):
+def test_every_reply_isolates_the_page_and_gives_it_no_devices(gated_server):
     for path in ("/", "/none", "/workbench/logo.svg", "/?token=wrong"):
-        headers = ask(door, path)[1]
+        headers = ask(gated_server, path)[1]
         assert headers["Cross-Origin-Opener-Policy"] == "same-origin", path
         assert headers["Cross-Origin-Resource-Policy"] == "same-origin", path
         for device in ("camera", "microphone", "geolocation", "usb", "serial", "display-capture"):
@@ -82,7 +82,7 @@ def test_every_reply_isolates_the_page_and_gives_it_no_devices(door):
 
 
 @pytest.mark.browser
-def test_code_that_came_into_the_page_as_html_does_not_run(door, browser):
+def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser):
     attacks = (
         '<img src="/none" onerror="document.title=\'ran\'">',
         "<svg onload=\"document.title='ran'\"></svg>",
@@ -93,9 +93,9 @@ def test_code_that_came_into_the_page_as_html_does_not_run(door, browser):
         "<object data=\"javascript:document.title='ran'\"></object><embed src='data:text/html,x'>",
         "<style onload=\"document.title='ran'\"></style><base href='//evil.example/'>",
     )
-    handle = door.server.gui.add_html("".join(attacks) + "<p id='there'>x</p>")
+    handle = gated_server.server.gui.add_html("".join(attacks) + "<p id='there'>x</p>")
     refused = {"inline event handler": 4, "inline script": 2, "JavaScript URL": 1, "plugin": 1, "base URI": 1}
-    with page_at(browser, door.url) as (page, complaints):
+    with page_at(browser, gated_server.url) as (page, complaints):
         page.wait_for_selector("#there", timeout=60_000)
         page.evaluate("document.getElementById('link').click(); document.getElementById('click').click()")
         page.evaluate(
@@ -114,16 +114,16 @@ def test_code_that_came_into_the_page_as_html_does_not_run(door, browser):
 
 @pytest.mark.browser
 def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
-    door = open_door(DoorOptions(port=0))
+    gated_server = open_server(ServerOptions(port=0))
     try:
-        with page_at(browser, door.url) as (page, _):
-            until(door.server.get_clients, "the page")
-            door.renew_token()
+        with page_at(browser, gated_server.url) as (page, _):
+            until(gated_server.server.get_clients, "the page")
+            gated_server.renew_token()
             page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
-            page.goto(door.url, wait_until="domcontentloaded")
+            page.goto(gated_server.url, wait_until="domcontentloaded")
             page.wait_for_selector("canvas", timeout=60_000)
     finally:
-        door.close()
+        gated_server.close()
 
 
 @pytest.mark.browser

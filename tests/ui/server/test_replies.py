@@ -15,7 +15,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from workbench.ui.server.access import Asked, Entered
+from workbench.ui.server.access import Entered, RequestParts
 from workbench.ui.server.responses import (
     EVERY_REPLY,
     LONGEST_NAME,
@@ -25,13 +25,13 @@ from workbench.ui.server.responses import (
     STYLES,
     Handler,
     admitted_reply,
-    asked_of,
     content_type,
     entered_reply,
     folder_handler,
     page_policy,
     refusals,
     reply,
+    request_parts,
     with_our_head,
 )
 
@@ -64,8 +64,8 @@ def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, st
 def test_the_gate_is_told_every_value_of_what_it_judges() -> None:
     headers = Headers([("Host", "a"), ("Host", "b"), ("Origin", "c"), ("Cookie", "d"), ("Cookie", "e")])
     headers.update([("Sec-Fetch-Site", "f"), ("Sec-Fetch-Mode", "g"), ("Sec-Fetch-Dest", "h")])
-    asked = Asked("/x?y", ["a", "b"], ["c"], ["d", "e"], ["f"], ["g"], ["h"], websocket=False)
-    assert asked_of(Request("/x?y", headers)) == asked
+    asked = RequestParts("/x?y", ["a", "b"], ["c"], ["d", "e"], ["f"], ["g"], ["h"], websocket=False)
+    assert request_parts(Request("/x?y", headers)) == asked
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,9 @@ def test_the_gate_is_told_every_value_of_what_it_judges() -> None:
     [([], False), (["websocket"], True), (["WebSocket"], False), (["websocket", "websocket"], False)],
 )
 def test_a_handshake_is_what_viser_takes_for_one(upgrade: list[str], websocket: bool) -> None:
-    assert asked_of(Request("/", Headers([("Upgrade", value) for value in upgrade]))).websocket is websocket
+    assert (
+        request_parts(Request("/", Headers([("Upgrade", value) for value in upgrade]))).websocket is websocket
+    )
 
 
 def test_a_reply_says_its_length_and_how_it_is_packed() -> None:

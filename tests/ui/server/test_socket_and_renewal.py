@@ -26,8 +26,8 @@ from tests.ui.tabs import open_deaf_tab, tabs_of
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.ui.server import listening
 from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
-from workbench.ui.server.listening import DoorError
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.server.listening import ServerError
 from workbench.ui.server.viser_private import element_id
 
 
@@ -40,18 +40,18 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture
-def door(folder: Path) -> Iterator[Door]:
-    door = open_door(DoorOptions(socket=folder / "page.sock"))
-    yield door
-    door.close()
+def gated_server(folder: Path) -> Iterator[GatedServer]:
+    gated_server = open_server(ServerOptions(socket=folder / "page.sock"))
+    yield gated_server
+    gated_server.close()
 
 
-def get(door: Door, path: str = "/", host: str = "localhost:8080", **headers: str) -> int:
-    assert door.options.socket is not None
+def get(gated_server: GatedServer, path: str = "/", host: str = "localhost:8080", **headers: str) -> int:
+    assert gated_server.options.socket is not None
     connection = http.client.HTTPConnection(host, timeout=20)
     connection.sock = socket.socket(socket.AF_UNIX)
     connection.sock.settimeout(20)
-    connection.sock.connect(str(door.options.socket))
+    connection.sock.connect(str(gated_server.options.socket))
     try:
         connection.request("GET", path, headers=headers)
         return connection.getresponse().status
@@ -59,38 +59,41 @@ def get(door: Door, path: str = "/", host: str = "localhost:8080", **headers: st
         connection.close()
 
 
-def test_only_its_owner_can_connect_and_no_port_is_open(door, folder):
+def test_only_its_owner_can_connect_and_no_port_is_open(gated_server, folder):
     found = (folder / "page.sock").lstat()
     assert stat.S_ISSOCK(found.st_mode) and stat.S_IMODE(found.st_mode) == 0o600
     own = psutil.Process().net_connections(kind="tcp")
     assert not [one for one in own if one.status == psutil.CONN_LISTEN]
 
 
-def test_the_printed_line_and_address_lead_to_it(door, folder):
-    assert door.ssh_hint.startswith(f"ssh -L 8080:{folder / 'page.sock'} ")
-    assert door.url == f"http://localhost:8080/?token={token_of(door)}"
-    assert door.warning is None and door.notice is None
+def test_the_printed_line_and_address_lead_to_it(gated_server, folder):
+    assert gated_server.ssh_hint.startswith(f"ssh -L 8080:{folder / 'page.sock'} ")
+    assert gated_server.url == f"http://localhost:8080/?token={token_of(gated_server)}"
+    assert gated_server.warning is None and gated_server.notice is None
 
 
-def test_the_gate_is_the_same_as_on_a_port(door):
-    cookie = f"{cookie_name(8080)}={token_of(door)}"
-    assert get(door) == 403
-    assert get(door, f"/?token={token_of(door)}") == 303
-    assert get(door, Cookie=cookie) == 200
-    assert get(door, Cookie=cookie, Origin="https://evil.example") == 403
-    assert get(door, host="evil.example", Cookie=cookie) == 403
+def test_the_gate_is_the_same_as_on_a_port(gated_server):
+    cookie = f"{cookie_name(8080)}={token_of(gated_server)}"
+    assert get(gated_server) == 403
+    assert get(gated_server, f"/?token={token_of(gated_server)}") == 303
+    assert get(gated_server, Cookie=cookie) == 200
+    assert get(gated_server, Cookie=cookie, Origin="https://evil.example") == 403
+    assert get(gated_server, host="evil.example", Cookie=cookie) == 403
     # Another port at the other end of ssh -L.
-    assert get(door, host="localhost:9000", Cookie=f"{cookie_name(9000)}={token_of(door)}") == 200
+    assert (
+        get(gated_server, host="localhost:9000", Cookie=f"{cookie_name(9000)}={token_of(gated_server)}")
+        == 200
+    )
 
 
-def test_a_websocket_works_over_it(door):
-    box = door.server.gui.add_checkbox("x", False)
+def test_a_websocket_works_over_it(gated_server):
+    box = gated_server.server.gui.add_checkbox("x", False)
     with unix_connect(
-        str(door.options.socket),
+        str(gated_server.options.socket),
         uri="ws://localhost:8080/",
         subprotocols=[PROTOCOL],  # type: ignore[list-item]
         origin="http://localhost:8080",  # type: ignore[arg-type]
-        additional_headers={"Cookie": f"{cookie_name(8080)}={token_of(door)}"},
+        additional_headers={"Cookie": f"{cookie_name(8080)}={token_of(gated_server)}"},
         max_size=None,
         close_timeout=0.2,
     ) as connection:
@@ -105,9 +108,9 @@ def test_the_file_is_gone_at_the_end_and_one_that_was_left_is_taken_over(folder)
     left.bind(str(place))
     left.close()
     assert place.exists()
-    door = open_door(DoorOptions(socket=place))
-    assert get(door) == 403
-    door.close()
+    gated_server = open_server(ServerOptions(socket=place))
+    assert get(gated_server) == 403
+    gated_server.close()
     assert not place.exists()
 
 
@@ -121,42 +124,42 @@ def test_what_is_not_ours_is_left_alone(folder):
         lambda: os.mkfifo(place),
     ):
         make()
-        with pytest.raises(DoorError, match="not a socket of yours"):
-            open_door(DoorOptions(socket=place))
+        with pytest.raises(ServerError, match="not a socket of yours"):
+            open_server(ServerOptions(socket=place))
         assert os.path.lexists(place)
         place.rmdir() if place.is_dir() else place.unlink()
     assert (folder / "target").read_text() == "kept"
 
 
-def test_a_socket_that_another_program_listens_at_is_left_to_it(door, folder):
-    with pytest.raises(DoorError, match="Another program listens"):
-        open_door(DoorOptions(socket=folder / "page.sock"))
-    assert get(door) == 403
+def test_a_socket_that_another_program_listens_at_is_left_to_it(gated_server, folder):
+    with pytest.raises(ServerError, match="Another program listens"):
+        open_server(ServerOptions(socket=folder / "page.sock"))
+    assert get(gated_server) == 403
 
 
 def test_a_socket_that_was_replaced_is_not_removed(folder):
     place = folder / "page.sock"
-    door = open_door(DoorOptions(socket=place))
+    gated_server = open_server(ServerOptions(socket=place))
     place.unlink()
     place.write_text("somebody else's")
-    door.close()
+    gated_server.close()
     assert place.read_text() == "somebody else's"
 
 
 def test_a_folder_that_others_write_into_is_refused(folder):
     folder.chmod(0o777)
-    with pytest.raises(DoorError, match="Others can write into"):
-        open_door(DoorOptions(socket=folder / "page.sock"))
+    with pytest.raises(ServerError, match="Others can write into"):
+        open_server(ServerOptions(socket=folder / "page.sock"))
     folder.chmod(0o1777)  # as /tmp: what is there stays its owner's
-    open_door(DoorOptions(socket=folder / "page.sock")).close()
+    open_server(ServerOptions(socket=folder / "page.sock")).close()
 
 
 @pytest.mark.parametrize(
     ("path", "sentence"), [("none/page.sock", "There is no folder"), ("x" * 200, "at most 107 bytes")]
 )
 def test_a_path_that_cannot_be_is_an_error_that_says_so(folder, path, sentence):
-    with pytest.raises(DoorError, match=sentence):
-        open_door(DoorOptions(socket=folder / path))
+    with pytest.raises(ServerError, match=sentence):
+        open_server(ServerOptions(socket=folder / path))
 
 
 def test_many_that_start_at_once_are_one(folder):
@@ -165,7 +168,7 @@ def test_many_that_start_at_once_are_one(folder):
     def start() -> None:
         try:
             made.append(listening.listen_on_file(folder / "page.sock", 0))
-        except DoorError:
+        except ServerError:
             pass
 
     threads = [threading.Thread(target=start) for _ in range(8)]
@@ -181,17 +184,17 @@ def test_many_that_start_at_once_are_one(folder):
 @pytest.mark.parametrize("options", [{"token": False}, {"host": "0.0.0.0"}])
 def test_options_that_do_not_go_with_a_socket_are_refused(options):
     with pytest.raises(ValueError):
-        DoorOptions(socket=Path("x.sock"), **options)
+        ServerOptions(socket=Path("x.sock"), **options)
 
 
 # Renewal -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def on_port() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
+def on_port() -> Iterator[GatedServer]:
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
 
 
 def test_a_renewed_token_shuts_out_who_had_the_old_one(on_port):
@@ -243,12 +246,12 @@ def test_a_page_that_does_not_listen_is_closed_as_well(on_port):
 
 
 def test_without_a_token_there_is_none_to_renew():
-    door = open_door(DoorOptions(port=0, token=False))
+    gated_server = open_server(ServerOptions(port=0, token=False))
     try:
         with pytest.raises(ValueError, match="no token"):
-            door.renew_token()
+            gated_server.renew_token()
     finally:
-        door.close()
+        gated_server.close()
 
 
 def until_line(process: subprocess.Popen[str], wanted: Callable[[str], bool]) -> str:

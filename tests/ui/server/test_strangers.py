@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from tests.ui.knocking import ask, both, client, cookie_of, knock, token_of
 from workbench.ui.server import strangers
 from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import Door, DoorOptions, open_door
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.strangers import RareLog
 
 LONG = 300
 
 
-def connected(door: Door) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", door.port), timeout=30)
+def connected(gated_server: GatedServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", gated_server.port), timeout=30)
 
 
 def is_closed(sock: socket.socket) -> bool:
@@ -38,25 +38,25 @@ def is_closed(sock: socket.socket) -> bool:
 @pytest.mark.parametrize(
     "said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"]
 )
-def test_a_connection_that_asks_nothing_is_closed_after_a_while(door, monkeypatch, said):
+def test_a_connection_that_asks_nothing_is_closed_after_a_while(gated_server, monkeypatch, said):
     monkeypatch.setattr(strangers, "PATIENCE", 0.3)
-    with connected(door) as quiet:
+    with connected(gated_server) as quiet:
         quiet.sendall(said)
         assert is_closed(quiet)
-    assert both(door) == (200, 101)
+    assert both(gated_server) == (200, 101)
 
 
-def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(door, monkeypatch):
+def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "PATIENCE", 0.5)
-    with connected(door) as slow, pytest.raises(OSError):
+    with connected(gated_server) as slow, pytest.raises(OSError):
         for byte in b"GET / HTTP/1.1\r\nX: " + b"y" * 10_000:
             slow.sendall(bytes([byte]))
             time.sleep(0.02)  # what is tested: all the time a little comes
 
 
-def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(door, monkeypatch):
+def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "PATIENCE", 0.5)
-    with connected(door) as refused:
+    with connected(gated_server) as refused:
         refused.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         answer = b""
         while piece := refused.recv(1 << 16):
@@ -64,24 +64,24 @@ def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(door, monkey
     assert answer.startswith(b"HTTP/1.1 403")
 
 
-def test_a_page_that_has_shown_the_token_is_not_hurried(door, monkeypatch):
+def test_a_page_that_has_shown_the_token_is_not_hurried(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "PATIENCE", 0.3)
     slow = (200, "application/octet-stream", b"x" * 1000)
     # Both take longer than a stranger is given.
-    door.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
-    assert ask(door, "/slow/x")[2] == b"x" * 1000
-    with client(door) as page:
+    gated_server.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
+    assert ask(gated_server, "/slow/x")[2] == b"x" * 1000
+    with client(gated_server) as page:
         time.sleep(0.6)
         page.ping().wait(30)
 
 
-def test_too_many_that_say_nothing_lock_nobody_out(door, monkeypatch, caplog):
+def test_too_many_that_say_nothing_lock_nobody_out(gated_server, monkeypatch, caplog):
     monkeypatch.setattr(strangers, "MOST", 10)
     with contextlib.ExitStack() as stack, caplog.at_level(logging.WARNING):
-        idle = [stack.enter_context(connected(door)) for _ in range(30)]
+        idle = [stack.enter_context(connected(gated_server)) for _ in range(30)]
         for _ in range(5):
-            assert both(door) == (200, 101)
-            assert ask(door, "/", Cookie=None)[0] == 403
+            assert both(gated_server) == (200, 101)
+            assert ask(gated_server, "/", Cookie=None)[0] == 403
         # The first of them have gone, the last are still there.
         assert is_closed(idle[0])
         idle[-1].settimeout(0.2)
@@ -97,22 +97,22 @@ def test_too_many_that_say_nothing_lock_nobody_out(door, monkeypatch, caplog):
         b"GET /" + b"y" * 5000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" + b"more" * 50_000,
     ],
 )
-def test_a_head_is_not_taken_beyond_its_bound(door, head):
-    with connected(door) as large:
+def test_a_head_is_not_taken_beyond_its_bound(gated_server, head):
+    with connected(gated_server) as large:
         with contextlib.suppress(OSError):
             for _ in range(200):
                 large.sendall(head)
         with contextlib.suppress(ConnectionResetError):
             while piece := large.recv(1 << 16):
                 assert b" 200 " not in piece[:20]
-    assert both(door) == (200, 101)
+    assert both(gated_server) == (200, 101)
 
 
-def test_the_cookies_of_many_other_programs_come_with_it(door):
+def test_the_cookies_of_many_other_programs_come_with_it(gated_server):
     others = "; ".join(f"other-{number}={'x' * 3000}" for number in range(2))
-    assert both(door, Cookie=f"{others}; {cookie_of(door)}") == (200, 101)
+    assert both(gated_server, Cookie=f"{others}; {cookie_of(gated_server)}") == (200, 101)
     lines = "".join(f"X-{number}: {'y' * 4000}\r\n" for number in range(20))
-    with connected(door) as sock:
+    with connected(gated_server) as sock:
         sock.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n{lines}".encode())
         assert sock.recv(100).startswith(b"HTTP/1.1 431 Request Header Fields Too Large")
 
@@ -128,8 +128,8 @@ def test_the_cookies_of_many_other_programs_come_with_it(door):
         "/" + "x/" * 1800,
     ],
 )
-def test_a_path_that_no_file_can_have_is_not_found(door, path, caplog, capfd):
-    assert ask(door, path)[0] == 404
+def test_a_path_that_no_file_can_have_is_not_found(gated_server, path, caplog, capfd):
+    assert ask(gated_server, path)[0] == 404
     assert not caplog.records
     assert capfd.readouterr().err == ""
 
@@ -148,8 +148,8 @@ REQUESTS = st.lists(
 ).map(b"".join)
 
 
-def fuzz(door: Door, raw: bytes) -> None:
-    with connected(door) as sock, contextlib.suppress(ConnectionResetError, BrokenPipeError):
+def fuzz(gated_server: GatedServer, raw: bytes) -> None:
+    with connected(gated_server) as sock, contextlib.suppress(ConnectionResetError, BrokenPipeError):
         sock.sendall(raw)
         sock.shutdown(socket.SHUT_WR)
         answer = b""
@@ -159,10 +159,10 @@ def fuzz(door: Door, raw: bytes) -> None:
 
 
 @pytest.fixture
-def fuzzed(door: Door, capfd: pytest.CaptureFixture[str]) -> Iterator[Door]:
+def fuzzed(gated_server: GatedServer, capfd: pytest.CaptureFixture[str]) -> Iterator[GatedServer]:
     """After all that was sent to it, it still opens, and nothing was printed of it."""
-    yield door
-    assert both(door) == (200, 101)
+    yield gated_server
+    assert both(gated_server) == (200, 101)
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -185,22 +185,23 @@ def test_whatever_a_stranger_sends_for_long_is_refused(fuzzed, raw):
 # What is said ------------------------------------------------------------------------------------
 
 
-def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(door, caplog):
+def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(gated_server, caplog):
     hostile = "\x1b[31m\n<b>"
     with caplog.at_level(logging.WARNING):
-        assert door.turned_away == 0  # the door's own try is not one
+        assert gated_server.turned_away == 0  # the door's own try is not one
         for _ in range(3):
-            ask(door, "/", Cookie=None)
-            ask(door, f"/?token=wrong{'x' * 30}", Cookie=None)
-            ask(door, "/", Cookie=f"{cookie_name(door.port)}=old")
-            knock(door, Origin="https://evil.example")
-            ask(door, "/", Host="evil.example")
-        ask(door, "/" + hostile.encode().hex())
-    assert door.turned_away == 15
+            ask(gated_server, "/", Cookie=None)
+            ask(gated_server, f"/?token=wrong{'x' * 30}", Cookie=None)
+            ask(gated_server, "/", Cookie=f"{cookie_name(gated_server.port)}=old")
+            knock(gated_server, Origin="https://evil.example")
+            ask(gated_server, "/", Host="evil.example")
+        ask(gated_server, "/" + hostile.encode().hex())
+    assert gated_server.turned_away == 15
     lines = [record.getMessage() for record in caplog.records]
     assert len(lines) == 4
     assert all(
-        "from 127.0.0.1" in line and "evil" not in line and token_of(door) not in line for line in lines
+        "from 127.0.0.1" in line and "evil" not in line and token_of(gated_server) not in line
+        for line in lines
     )
 
 
@@ -225,7 +226,7 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
 
 
 def test_what_was_not_told_yet_is_told_at_the_end_with_the_total(caplog):
-    closing = open_door(DoorOptions(port=0))
+    closing = open_server(ServerOptions(port=0))
     with caplog.at_level(logging.WARNING):
         for _ in range(30):
             ask(closing, f"/?token=wrong{'x' * 30}", Cookie=None)
@@ -237,17 +238,17 @@ def test_what_was_not_told_yet_is_told_at_the_end_with_the_total(caplog):
     assert lines[2:] == ["In all 30 requests were turned away."]
 
 
-def test_no_program_is_named(door):
+def test_no_program_is_named(gated_server):
     for path, headers in (("/", {}), ("/none", {}), ("/", {"Cookie": None})):
-        assert ask(door, path, **headers)[1]["Server"] is None
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+        assert ask(gated_server, path, **headers)[1]["Server"] is None
+    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
     handshake = {
         "Upgrade": "websocket",
         "Connection": "Upgrade",
         "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
         "Sec-WebSocket-Version": "13",
-        "Origin": f"http://127.0.0.1:{door.port}",
-        "Cookie": cookie_of(door),
+        "Origin": f"http://127.0.0.1:{gated_server.port}",
+        "Cookie": cookie_of(gated_server),
     }
     connection.request("GET", "/", headers=handshake)
     response = connection.getresponse()

@@ -12,7 +12,7 @@ import viser
 from tests.drive.panels import Panels
 from workbench.recording.episode.source import Source
 from workbench.ui.server.file_response import Downloads
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView
 from workbench.ui.share.panel import (
     ALL_CAMERAS,
@@ -50,13 +50,13 @@ def making() -> Iterator[Noted]:
 
 
 @pytest.fixture
-def panels(door: Door) -> Panels:
-    return Panels(door.server)
+def panels(gated_server: GatedServer) -> Panels:
+    return Panels(gated_server.server)
 
 
 @pytest.fixture
-def panel(panels: Panels, door: Door, making: Noted, tmp_path: Path) -> SharePanel:
-    return SharePanel(door.server, Downloads(door), making, tmp_path)
+def panel(panels: Panels, gated_server: GatedServer, making: Noted, tmp_path: Path) -> SharePanel:
+    return SharePanel(gated_server.server, Downloads(gated_server), making, tmp_path)
 
 
 RECORDING = Source(Path("/recordings/Push_seed1.json"))
@@ -165,9 +165,11 @@ def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
     assert "/offered/" not in panels.html()
 
 
-def test_the_page_is_built_anew_without_a_trace(door: Door, making: Noted, tmp_path: Path) -> None:
-    offers = Downloads(door)
+def test_the_page_is_built_anew_without_a_trace(
+    gated_server: GatedServer, making: Noted, tmp_path: Path
+) -> None:
+    offers = Downloads(gated_server)
     for _ in range(3):
-        SharePanel(door.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
-        door.server.gui.reset()
-    assert isinstance(door.server, viser.ViserServer)
+        SharePanel(gated_server.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
+        gated_server.server.gui.reset()
+    assert isinstance(gated_server.server, viser.ViserServer)

@@ -21,7 +21,7 @@ from workbench.recording.rerun.chunks import static_chunk
 from workbench.recording.rerun.viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.file_response import Downloads
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.rerun_view import RerunPages, RerunView
 
 
@@ -38,13 +38,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def pages(child_process: None, door: Door) -> RerunPages:
-    return RerunPages(door, Downloads(door))
+def pages(child_process: None, gated_server: GatedServer) -> RerunPages:
+    return RerunPages(gated_server, Downloads(gated_server))
 
 
-def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
-    cookie = {"Cookie": f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"}
+def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=30)
+    cookie = {"Cookie": f"{cookie_name(gated_server.port)}={gated_server.url.partition('token=')[2]}"}
     try:
         connection.request("GET", path, headers={**cookie, **headers})
         answer = connection.getresponse()
@@ -53,31 +53,35 @@ def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMes
         connection.close()
 
 
-def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Door, tmp_path: Path) -> None:
-    offers = Downloads(door)
+def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(
+    gated_server: GatedServer, tmp_path: Path
+) -> None:
+    offers = Downloads(gated_server)
     big = tmp_path / "big one.rrd"
     big.write_bytes(bytes(range(256)) * 20_000)
     address = offers.address(big)
     assert address == offers.address(big)
-    status, headers, body = get(door, address)
+    status, headers, body = get(gated_server, address)
     assert (status, body == big.read_bytes()) == (200, True)
     assert headers["Content-Length"] == str(big.stat().st_size)
     assert "sandbox" in headers["Content-Security-Policy"]
-    assert get(door, f"/offered/{'x' * 22}/big%20one.rrd")[0] == 404
-    assert get(door, f"/offered/{urllib.parse.quote(str(big))}")[0] == 404
-    assert get(door, address, Cookie="")[0] == 403
-    saved = get(door, offers.address(big, download=True))[1]
+    assert get(gated_server, f"/offered/{'x' * 22}/big%20one.rrd")[0] == 404
+    assert get(gated_server, f"/offered/{urllib.parse.quote(str(big))}")[0] == 404
+    assert get(gated_server, address, Cookie="")[0] == 403
+    saved = get(gated_server, offers.address(big, download=True))[1]
     assert saved["Content-Disposition"] == "attachment; filename*=UTF-8''big%20one.rrd"
     big.unlink()
-    assert get(door, address)[0] == 404
+    assert get(gated_server, address)[0] == 404
 
 
-def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(door: Door, tmp_path: Path) -> None:
+def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(
+    gated_server: GatedServer, tmp_path: Path
+) -> None:
     big = tmp_path / "big.rrd"
     big.write_bytes(bytes(40_000_000))  # more than the sockets hold
-    address = Downloads(door).address(big)
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
-    cookie = f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"
+    address = Downloads(gated_server).address(big)
+    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=30)
+    cookie = f"{cookie_name(gated_server.port)}={gated_server.url.partition('token=')[2]}"
     connection.request("GET", address, headers={"Cookie": cookie})
     answer = connection.getresponse()
     answer.read(1000)
@@ -86,30 +90,30 @@ def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(door: D
     with pytest.raises((http.client.IncompleteRead, ConnectionError)):
         answer.read()
     connection.close()
-    assert get(door, "/")[0] == 200
+    assert get(gated_server, "/")[0] == 200
 
 
 def test_the_viewer_is_sent_packed_to_those_who_take_it(
-    door: Door, pages: RerunPages, recording: Path
+    gated_server: GatedServer, pages: RerunPages, recording: Path
 ) -> None:
-    viewer = get(door, pages.address([recording]))[2].decode().partition('location.replace("')[2]
+    viewer = get(gated_server, pages.address([recording]))[2].decode().partition('location.replace("')[2]
     root = viewer.partition('"')[0]
-    assert get(door, root + "index.html")[1]["Content-Type"] == VIEWER_FILES["index.html"]
+    assert get(gated_server, root + "index.html")[1]["Content-Type"] == VIEWER_FILES["index.html"]
     for name, kind in list(VIEWER_FILES.items())[1:]:
         packed = (web_viewer_folder() / f"{name}.gz").read_bytes()
-        status, headers, body = get(door, root + name, **{"Accept-Encoding": "gzip"})
+        status, headers, body = get(gated_server, root + name, **{"Accept-Encoding": "gzip"})
         assert (status, headers["Content-Type"], headers["Content-Encoding"]) == (200, kind, "gzip")
         assert body == packed
         assert "connect-src 'self'" in headers["Content-Security-Policy"]
-    status, headers, body = get(door, root + "re_viewer.js")
+    status, headers, body = get(gated_server, root + "re_viewer.js")
     assert "Content-Encoding" not in headers
     assert body == gzip.decompress((web_viewer_folder() / "re_viewer.js.gz").read_bytes())
     for name in ("", "../secret", "index.html.gz"):
-        assert get(door, root + name)[0] == 404
+        assert get(gated_server, root + name)[0] == 404
 
 
 def test_the_blueprint_of_a_recording_is_sent_before_it(
-    door: Door, pages: RerunPages, recording: Path, tmp_path: Path
+    gated_server: GatedServer, pages: RerunPages, recording: Path, tmp_path: Path
 ) -> None:
     ours = tmp_path / "ours.rrd"
     LazyChunkStream.from_iter([static_chunk("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]).write_rrd(
@@ -117,28 +121,30 @@ def test_the_blueprint_of_a_recording_is_sent_before_it(
     )
     add_blueprint(ours, encode_blueprint("workbench", rrb.Blueprint(rrb.Spatial3DView())))
     address = pages.address([recording, ours])
-    assert 'for (const name of ["1.rbl"])' in get(door, address)[2].decode()
-    status, _, body = get(door, address + "1.rbl")
+    assert 'for (const name of ["1.rbl"])' in get(gated_server, address)[2].decode()
+    status, _, body = get(gated_server, address + "1.rbl")
     assert (status, body) == (200, blueprint_stream(ours))
     for name in ("0.rbl", "2.rbl", "../1.rbl", "1.rbl/"):
-        assert not get(door, address + name)[2].startswith(b"RRF2")
+        assert not get(gated_server, address + name)[2].startswith(b"RRF2")
 
 
-def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, tmp_path: Path) -> None:
-    page = get(door, pages.address([tmp_path / "</script><b>.rrd"]))[2].decode()
+def test_a_recordings_name_is_text_and_no_script(
+    gated_server: GatedServer, pages: RerunPages, tmp_path: Path
+) -> None:
+    page = get(gated_server, pages.address([tmp_path / "</script><b>.rrd"]))[2].decode()
     assert page.count("</script>") == 1
     assert "<b>" not in page
 
 
 def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
-    door: Door, pages: RerunPages, recording: Path, browser: Browser
+    gated_server: GatedServer, pages: RerunPages, recording: Path, browser: Browser
 ) -> None:
-    library = door.server.gui.add_panel()
+    library = gated_server.server.gui.add_panel()
     with library.add_tab("Library"):
-        door.server.gui.add_html("...")
+        gated_server.server.gui.add_html("...")
     library.dock_left()
     library.minimize()
-    view = RerunView(door.server, pages, lambda fold: 850)
+    view = RerunView(gated_server.server, pages, lambda fold: 850)
     stopping = threading.Event()
 
     def draw() -> None:
@@ -151,7 +157,7 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
     with page_at(browser, "about:blank", 1280, 720, drawn=True) as (tab, _):
         tab.on("request", lambda request: asked.append(request))
         tab.on("requestfailed", lambda request: failed.update({request.url: request.failure}))
-        tab.goto(door.url)
+        tab.goto(gated_server.url)
         with tab.expect_response(lambda answer: "/offered/" in answer.url, timeout=120_000) as answer:
             tab.get_by_role("button", name="Open in rerun").click()
         assert answer.value.status == 200
@@ -170,9 +176,11 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         tab.get_by_role("button", name="Close rerun").click()
         tab.locator("iframe.wb-rerun").wait_for(state="detached")
     stopping.set()
-    ours = f"http://127.0.0.1:{door.port}/"
+    ours = f"http://127.0.0.1:{gated_server.port}/"
     foreign = {
-        r.url for r in asked if not r.url.startswith((ours, f"ws://127.0.0.1:{door.port}", "data:", "blob:"))
+        r.url
+        for r in asked
+        if not r.url.startswith((ours, f"ws://127.0.0.1:{gated_server.port}", "data:", "blob:"))
     }
     assert {url: failed.get(url) for url in foreign} == dict.fromkeys(foreign, "csp")
     assert foreign, "rerun's page has stopped asking others; the policy can be simpler"

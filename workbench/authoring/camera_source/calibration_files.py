@@ -270,7 +270,7 @@ def camera_pose(
     return pose_from_matrix(matrix, convention, direction)
 
 
-class _Loader(yaml.SafeLoader):
+class _CalibrationLoader(yaml.SafeLoader):
     """YAML's plain data and OpenCV's matrices, nothing that makes objects."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -286,7 +286,7 @@ def _opencv_map(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
     return loader.construct_mapping(node, deep=True)
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_map)
+_CalibrationLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_map)
 
 _WORDS = re.compile(r"\b(?:np|numpy|torch)\.|\b(?:array|tensor|matrix|asarray)\b|,?\s*dtype\s*=\s*[\w.]+")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -306,7 +306,7 @@ def _parsed(text: str) -> Any:
         raise ValueError(f"as YAML {len(text)} characters are too many; a calibration has some two thousand")
     # OpenCV's first line has a colon where YAML has a space.
     try:
-        tree = yaml.load(re.sub(r"\A%YAML.*\n", "", text), Loader=_Loader)
+        tree = yaml.load(re.sub(r"\A%YAML.*\n", "", text), Loader=_CalibrationLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"it is no YAML, and no matrix of bare numbers: {_one_line(str(error))}") from None
     if not isinstance(tree, (Mapping, list)):

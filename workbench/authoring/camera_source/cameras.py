@@ -49,7 +49,7 @@ class Ran:
 
 
 Run = Callable[[Mapping[str, str]], Ran]
-"""Runs the hooks with these texts in place of the author's files, by path. Raises Refused with the reason."""
+"""Runs the hooks with these texts in place of the author's files, by path. Raises RefusedEdit with the reason."""
 
 
 @dataclass(frozen=True, eq=False)

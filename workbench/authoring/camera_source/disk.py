@@ -18,7 +18,7 @@ from pathlib import Path, PurePath
 
 from workbench.authoring.loading.library_names import LIBRARY_FOLDERS
 from workbench.authoring.loading.modules import read_exactly
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraSettings
 from workbench.machine.files import replace_file
 
@@ -68,20 +68,20 @@ class SourceEdit(FileChange):
 
 
 def apply(edit: SourceEdit) -> None:
-    """Write the edit. Raises Refused where it cannot be done; the file is as it was then."""
+    """Write the edit. Raises RefusedEdit where it cannot be done; the file is as it was then."""
     _exchange_all(edit.changes, "since the change was shown")
 
 
 def revert(edit: SourceEdit) -> None:
-    """Take an applied edit back. Raises Refused where something else was changed in the file since, too."""
+    """Take an applied edit back. Raises RefusedEdit where something else was changed in the file since, too."""
     back = tuple(FileChange(change.file, change.new_text, change.old_text) for change in edit.changes)
     _exchange_all(back, "since the camera was written into it")
 
 
 def check_own(path: str) -> None:
-    """Raises `Refused` for a file of an installed package: the next installation would take the change away."""
+    """Raises `RefusedEdit` for a file of an installed package: the next installation would take the change away."""
     if LIBRARY_FOLDERS & {*PurePath(path).parts}:
-        raise Refused(
+        raise RefusedEdit(
             f"{path} belongs to an installed package; copy the task into a folder of your own first"
         )
 
@@ -92,7 +92,7 @@ def not_writable(path: str) -> str | None:
         real = Path(path).resolve(strict=True)
         check_own(str(real))
         mode = real.stat().st_mode
-    except Refused as refused:
+    except RefusedEdit as refused:
         return refused.reason
     except OSError as exc:
         return f"{path} cannot be read: {exc.strerror}"
@@ -112,16 +112,16 @@ def _exchange_all(changes: tuple[FileChange, ...], since: str) -> None:
     for done, change in enumerate(changes):
         try:
             _exchange(change.file, change.old_text, change.new_text, since)
-        except Refused as refused:
+        except RefusedEdit as refused:
             left = [made.name for made in changes[:done] if not _taken_back(made, since)]
             told = f"; {' and '.join(left)} could not be put back, and has the change without the other"
-            raise Refused(f"{refused.reason}{told if left else ''}") from refused
+            raise RefusedEdit(f"{refused.reason}{told if left else ''}") from refused
 
 
 def _taken_back(change: FileChange, since: str) -> bool:
     try:
         _exchange(change.file, change.new_text, change.old_text, since)
-    except Refused:
+    except RefusedEdit:
         return False
     return True
 
@@ -129,17 +129,17 @@ def _taken_back(change: FileChange, since: str) -> bool:
 def _exchange(path: str, expected: str, wanted: str | None, since: str) -> None:
     """Put `wanted` in place of the text that is expected there; None only looks whether it could be."""
     if (reason := not_writable(path)) is not None:
-        raise Refused(reason)
+        raise RefusedEdit(reason)
     real = Path(path).resolve()
     try:
         raw, text, encoding = read_exactly(real)
         if text != expected:
-            raise Refused(f"{real.name} was edited {since}, so it is left as it is; ask again")
+            raise RefusedEdit(f"{real.name} was edited {since}, so it is left as it is; ask again")
         if wanted is not None and not replace_file(real, wanted.encode(encoding), raw):
-            raise Refused(
+            raise RefusedEdit(
                 f"{real.name} was saved by somebody else just now, so it is left as it is; ask again"
             )
     except (UnicodeError, SyntaxError) as exc:
-        raise Refused(f"{real.name} cannot be written in its encoding: {exc}") from exc
+        raise RefusedEdit(f"{real.name} cannot be written in its encoding: {exc}") from exc
     except OSError as exc:
-        raise Refused(f"{real.name} cannot be written: {exc.strerror}") from exc
+        raise RefusedEdit(f"{real.name} cannot be written: {exc.strerror}") from exc

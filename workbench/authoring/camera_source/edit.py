@@ -12,12 +12,12 @@ from workbench.authoring.camera_source.disk import FileChange, SourceEdit, check
 from workbench.authoring.camera_source.hooks import snippet
 from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.names import Project
-from workbench.authoring.source.text import Refused, SourceFile, arguments
+from workbench.authoring.source.text import RefusedEdit, SourceFile, arguments
 from workbench.core.camera_data import CameraKey, CameraSettings, differences, why_no_camera
 
 
 class CameraEdit(Changes):
-    """Raises Refused for a file that is not Python, and for hooks that fail."""
+    """Raises RefusedEdit for a file that is not Python, and for hooks that fail."""
 
     def __init__(self, sources: Mapping[str, str], run: Run) -> None:
         super().__init__(Project(sources))
@@ -26,10 +26,10 @@ class CameraEdit(Changes):
         self._run, self.ran = run, run(sources)
 
     def call(self, key: CameraKey) -> CameraCall:
-        """What makes a camera. Raises Refused where that is not to be found in the author's files."""
+        """What makes a camera. Raises RefusedEdit where that is not to be found in the author's files."""
         uid = key[1]
         if key not in self.ran.cameras:
-            raise Refused(
+            raise RefusedEdit(
                 f"as the files stand they make no {key[0]} camera {uid!r}: another makes it, or they were edited since"
             )
         run = self.ran.cameras[key]
@@ -37,18 +37,18 @@ class CameraEdit(Changes):
             check_own(run.site.file)
         if run.trace is None:
             if run.site is None:
-                raise Refused(f"what makes the camera {uid!r} is no CameraConfig(...) in your files")
+                raise RefusedEdit(f"what makes the camera {uid!r} is no CameraConfig(...) in your files")
             if run.site.file not in self.project.texts:
-                raise Refused(
+                raise RefusedEdit(
                     f"the camera {uid!r} is made in {run.site.file}, line {run.site.line}, which is not one of your files"
                 )
-            raise Refused(
+            raise RefusedEdit(
                 f"line {run.site.line} of {PurePath(run.site.file).name} made the camera {uid!r}, but there is no "
                 "CameraConfig(...) for it: it is made in a function or class of its own"
             )
         file, node = self.find(run.trace.at)
         if not isinstance(node, ast.Call):
-            raise Refused(f"what makes the camera {uid!r} is no call")
+            raise RefusedEdit(f"what makes the camera {uid!r} is no call")
         return CameraCall(file, node, key, arguments(node, PARAMETERS), run, run.trace)
 
     def proven(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:
@@ -59,11 +59,11 @@ class CameraEdit(Changes):
             first: what the author thinks of, where several files change.
 
         Raises:
-            Refused: another camera is changed, or there is another one more or less.
+            RefusedEdit: another camera is changed, or there is another one more or less.
         """
         files = {file.path: file for file, _ in self.replacements}
         if not files:
-            raise Refused("the change is smaller than what is written (0.1 mm, 0.01 degree)")
+            raise RefusedEdit("the change is smaller than what is written (0.1 mm, 0.01 degree)")
         made: list[FileChange] = []
         for file in sorted(files.values(), key=lambda file: (file is not first, file.path)):
             check_own(file.path)
@@ -74,18 +74,18 @@ class CameraEdit(Changes):
         for other in before.keys() - {key}:
             old, new = before[other], after.get(other)
             if new is None or new.mount != old.mount or (old.settings is None) != (new.settings is None):
-                raise Refused(f"the change would be one of the camera {other[1]} as well")
+                raise RefusedEdit(f"the change would be one of the camera {other[1]} as well")
             if (
                 old.settings is not None
                 and new.settings is not None
                 and differences(old.settings, new.settings)
             ):
-                raise Refused(f"the change would be one of the camera {other[1]} as well")
+                raise RefusedEdit(f"the change would be one of the camera {other[1]} as well")
         if after.keys() != before.keys() - {key} | ({expected} if expected is not None else set()):
-            raise Refused("the file could not be changed without changing what else it does")
+            raise RefusedEdit("the file could not be changed without changing what else it does")
         found = None if expected is None else after[expected]
         if found is not None and key is not None and key in before and found.mount != before[key].mount:
-            raise Refused("the change would put the camera on another mount")
+            raise RefusedEdit("the change would put the camera on another mount")
         settings = None if found is None else found.settings
         return SourceEdit(**vars(made[0]), notes=tuple(self.notes), settings=settings, others=tuple(made[1:]))
 
@@ -101,13 +101,13 @@ def planning(
     """What is refused within it comes with the camera as text to copy, where there are `settings` for one."""
     try:
         yield CameraEdit(sources, run)
-    except Refused as refused:
+    except RefusedEdit as refused:
         refused.snippet = "" if settings is None else snippet(uid, settings, more=more)
         raise
 
 
 def check_camera(settings: CameraSettings) -> None:
-    """Raises Refused for what is no camera: it never reaches a file, nor a text to copy."""
+    """Raises RefusedEdit for what is no camera: it never reaches a file, nor a text to copy."""
     why = why_no_camera(settings)
     if why is not None:
-        raise Refused(why)
+        raise RefusedEdit(why)

@@ -14,7 +14,7 @@ from workbench.authoring.source.numbers import (
     number_text,
     quaternion_texts,
 )
-from workbench.authoring.source.text import Function, Refused, Replacement, SourceFile, walk
+from workbench.authoring.source.text import Function, RefusedEdit, Replacement, SourceFile, walk
 from workbench.core.camera_data import CameraKind, CameraSettings
 
 HOOK_OF: dict[CameraKind, str] = {kind: hook for hook, kind in HOOKS.items() if hook.startswith("_default")}
@@ -36,7 +36,7 @@ def returned(file: SourceFile, function: Function) -> ast.expr:
         node for node in walk(function) if isinstance(node, ast.Return) and file.scopes(node)[0] is function
     ]
     if len(found) != 1 or found[0].value is None:
-        raise Refused(
+        raise RefusedEdit(
             f"{function.name} (line {file.line(function)}) has {len(found)} returns; one is needed to add to"
         )
     value = found[0].value
@@ -74,7 +74,7 @@ def appended(file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], s
         inner = file.text[start:end].replace("\n", "\n    ")
         new = f"[\n{indent}    {inner},\n{indent}    {text(indent + '    ')},\n{indent}]"
         return [Replacement(start, end, new)]
-    raise Refused(
+    raise RefusedEdit(
         f"what is returned at line {file.line(value)} is neither a CameraConfig(...) nor a list or dict of them"
     )
 
@@ -85,11 +85,13 @@ def new_hook(
     """The hook, which returns the one camera that `text(indent)` is."""
     owner, where = ran.owners.get(hook, ("", ""))
     if where in project.texts:
-        raise Refused(
+        raise RefusedEdit(
             f"{cls.name} inherits {hook} from {owner} ({project.file(where).name}); add the camera there"
         )
     if owner:
-        raise Refused(f"{cls.name} inherits from {owner}, whose cameras a {hook} of its own would take away")
+        raise RefusedEdit(
+            f"{cls.name} inherits from {owner}, whose cameras a {hook} of its own would take away"
+        )
 
     def whole(indent: str) -> str:
         inner = indent + "    "
@@ -102,11 +104,11 @@ def new_hook(
 
 
 def class_named(file: SourceFile, name: str) -> ast.ClassDef:
-    """The class of that name at the top level of the file. Raises Refused."""
+    """The class of that name at the top level of the file. Raises RefusedEdit."""
     for node in file.module.body:
         if isinstance(node, ast.ClassDef) and node.name == name:
             return node
-    raise Refused(f"there is no class {name} in {file.name}")
+    raise RefusedEdit(f"there is no class {name} in {file.name}")
 
 
 def at_end_of_class(
@@ -115,7 +117,7 @@ def at_end_of_class(
     """`text(indent)`, the whole hook, as the last of the class."""
     first = file.inner_span(cls.body[0])[0]
     if file.line_at(first) == file.line(cls):
-        raise Refused(f"the class {cls.name} has no body to add {hook} to")
+        raise RefusedEdit(f"the class {cls.name} has no body to add {hook} to")
     indent = file.indent(first)
     at = file.line_start(file.line_at(file.inner_span(cls.body[-1])[1]) + 1)
     lead = "\n" if file.text[:at].endswith(("\n", "\r")) else "\n\n"

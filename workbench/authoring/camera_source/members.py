@@ -28,7 +28,7 @@ from workbench.authoring.camera_source.hooks import (
     snippet,
 )
 from workbench.authoring.camera_source.write_pose import look_at_text
-from workbench.authoring.source.text import FUNCTIONS, Refused, Replacement, SourceFile
+from workbench.authoring.source.text import FUNCTIONS, RefusedEdit, Replacement, SourceFile
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind, CameraSettings
 
 
@@ -81,7 +81,7 @@ def plan_duplicate(
             or call.key is not None
         )
         if alone:
-            raise Refused(
+            raise RefusedEdit(
                 f"the camera ({call.where}) stands alone, and where a second one belongs cannot be told"
             )
         text, indent = _renamed_text(call, new_uid), file.indent(file.inner_span(call.node)[0])
@@ -165,7 +165,7 @@ def plan_override(
         own = hook in edit.project.bindings(source, cls)
         owner, where = (class_name, file) if own else edit.ran.owners.get(hook, ("", ""))
         if where in sources:
-            raise Refused(
+            raise RefusedEdit(
                 f"{uid} is made by {parent}, and the {hook} of {owner} ({edit.project.file(where).name}) hands it on: put "
                 "the text below in its place there"
             )
@@ -188,15 +188,15 @@ def _one(edit: CameraEdit, key: CameraKey) -> CameraCall:
     call = edit.call(key)
     check_own(call.file.path)
     if call.loop is not None:
-        raise Refused(f"{key[1]!r} is made in a loop or comprehension ({call.where})")
+        raise RefusedEdit(f"{key[1]!r} is made in a loop or comprehension ({call.where})")
     return call
 
 
 def _check_new(ran: Ran, key: CameraKey) -> None:
     if not key[1].isidentifier():
-        raise Refused(f"{key[1]!r} is not a name; use letters, digits and _")
+        raise RefusedEdit(f"{key[1]!r} is not a name; use letters, digits and _")
     if key in ran.cameras:
-        raise Refused(f"there is a camera {key[1]!r} already")
+        raise RefusedEdit(f"there is a camera {key[1]!r} already")
 
 
 def _is_hooks_own(call: CameraCall) -> bool:
@@ -233,7 +233,7 @@ def _renaming(call: CameraCall, new_uid: str) -> list[Replacement]:
     if key is not None and not (isinstance(uid, ast.Constant) and uid.value == call.camera[1]):
         return found
     if uid is None:
-        raise Refused(f"the name is not written in the call ({call.where})")
+        raise RefusedEdit(f"the name is not written in the call ({call.where})")
     single = isinstance(uid, ast.Constant) and file.text[file.inner_span(uid)[0]] == "'"
     return [*found, Replacement(*file.span(uid), f"'{new_uid}'" if single else repr_text(new_uid))]
 
@@ -257,11 +257,11 @@ def _removal(call: CameraCall) -> Replacement:
     if isinstance(outer, ast.Return) and _is_hooks_own(call):
         return Replacement(*file.span(call.node), "[]")
     if not (isinstance(outer, (ast.List, ast.Tuple, ast.Dict)) or call.key is not None):
-        raise Refused(
+        raise RefusedEdit(
             f"the camera is made at {call.where} and used elsewhere under a name; take it out by hand"
         )
     items = file.items(container)
     if isinstance(container, ast.Tuple) and len(items) <= 2:
-        raise Refused("a tuple of one or none is easily misread; take the camera out by hand")
+        raise RefusedEdit("a tuple of one or none is easily misread; take the camera out by hand")
     place = file.inner_span(call.node)[0]
     return file.without_item(container, next(i for i, item in enumerate(items) if item[0] <= place < item[1]))

@@ -17,7 +17,7 @@ from workbench.authoring.camera_source.edit import CameraEdit, check_camera, pla
 from workbench.authoring.camera_source.write_pose import ANGLE_STEP, POSITION_STEP, why_not_a_pose, write_pose
 from workbench.authoring.source.changes import Changes
 from workbench.authoring.source.numbers import matrix_text, number_text
-from workbench.authoring.source.text import Refused, Replacement
+from workbench.authoring.source.text import RefusedEdit, Replacement
 from workbench.core.camera_data import CameraKey, CameraSettings, setting_text
 from workbench.core.cameras.conventions import angle_between
 
@@ -31,14 +31,14 @@ def plan_edit(
 ) -> SourceEdit:
     """The edit that turns a camera from `before`, which the running env has, into `after`.
 
-    `sources` are the author's files by path, as they are on disk. Nothing is written. Raises Refused.
+    `sources` are the author's files by path, as they are on disk. Nothing is written. Raises RefusedEdit.
     """
     check_camera(after)
     mount: list[str] = []
     with planning(sources, run, key[1], after, mount) as edit:
         fields = changed_fields(before, after)
         if not fields:
-            raise Refused("nothing of this camera was changed")
+            raise RefusedEdit("nothing of this camera was changed")
         call = edit.call(key)
         # Without its mount the pose of a copy is one of another frame.
         names = [name for name in ("entity_uid", "mount") if name in call.arguments]
@@ -50,20 +50,20 @@ def _plan(
     edit: CameraEdit, call: CameraCall, fields: list[str], before: CameraSettings, after: CameraSettings
 ) -> SourceEdit:
     if call.loop is not None:
-        raise Refused(
+        raise RefusedEdit(
             f"the camera is made in a loop or comprehension (line {call.file.line(call.loop)} of {call.file.name}), "
             "and a change there would be one of all its cameras"
         )
     made = call.run.made
     if made is None:
-        raise Refused(f"what {call.where} makes cannot be said in numbers")
+        raise RefusedEdit(f"what {call.where} makes cannot be said in numbers")
     apart = changed_fields(made, before)
     for name in fields:
         why = call.trace.unknown.get(name) or _why_not(edit, call, name)
         if name in apart and not why:
             why = _differs(name, made, before)
         if why:
-            raise Refused(f"{why} ({call.where})")
+            raise RefusedEdit(f"{why} ({call.where})")
     if call.hook is None:
         edit.note(f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along")
     _write_fields(edit, call, fields, after)
@@ -118,7 +118,7 @@ def _write_fields(changes: Changes, call: CameraCall, fields: list[str], after: 
         elif part is not None:
             changes.number(part, getattr(after, name), 0 if name in ("width", "height") else 4)
         elif name in ("width", "height"):
-            raise Refused(f"{call.where} gives no {name}")
+            raise RefusedEdit(f"{call.where} gives no {name}")
         else:
             added.append(f"{name}={number_text(getattr(after, name), 4)}")
     if "fov" in fields or "intrinsic" in fields:
@@ -164,7 +164,7 @@ def _check_asked(
 ) -> CameraSettings:
     """The proof's other half: the camera came out as asked, and in all else as it was."""
     if found is None:
-        raise Refused("what was to be written is no camera whose settings can be said in numbers")
+        raise RefusedEdit("what was to be written is no camera whose settings can be said in numbers")
     right = not set(changed_fields(made, found)) - set(fields)
     for name in fields:
         was, wanted = getattr(found, name, None), getattr(after, name, None)
@@ -180,7 +180,7 @@ def _check_asked(
         else:
             right = right and was == wanted
     if not right:
-        raise Refused("what was to be written does not come out as what was asked for")
+        raise RefusedEdit("what was to be written does not come out as what was asked for")
     return found
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.authoring.loading.modules import module_name, read_exactly
-from workbench.authoring.source.text import Refused, Replacement, SourceFile
+from workbench.authoring.source.text import RefusedEdit, Replacement, SourceFile
 from workbench.machine.files import create_file
 
 MOST_COPIES = 99
@@ -72,7 +72,7 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
     """
     try:
         file = SourceFile(str(source), text)
-    except Refused as refused:
+    except RefusedEdit as refused:
         raise NoCopy(refused.reason) from refused
     package = module_name(source).name.split(".") if (source.parent / "__init__.py").is_file() else []
     changes = [

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedClass:
     """A class of the file that could not be opened."""
 
     name: str
@@ -82,7 +82,7 @@ class LoadedTask:
     """Further task classes of the file, and robots if it has no task, to be had as ``file.py:Name``."""
     alternatives: tuple[str, ...] = ()
     """Those that may be opened in its place if it fails, in the order of trying; none where a class was named."""
-    in_place_of: Refused | None = None
+    in_place_of: RefusedClass | None = None
     """What was tried first, and failed."""
     robot: Robot | None = None
     """Of a file that has no task: the one that is shown in a scene of ManiSkill's."""

@@ -37,7 +37,7 @@ Level = Literal["same", "patched", "cameras", "rebuilt"]
 RESET_HOOKS = frozenset(hooks_of("reset"))
 STEP_HOOKS = frozenset(hooks_of("step"))
 REWARD_HOOKS = frozenset(hooks_of("reward"))
-JUDGING_HOOKS = REWARD_HOOKS.union(hooks_of("evaluate"), hooks_of("observation"))
+SCORING_HOOKS = REWARD_HOOKS.union(hooks_of("evaluate"), hooks_of("observation"))
 """They run at every step and only look; `BaseEnv.__init__` calls some of them in its first reset."""
 CAMERA_HOOKS = frozenset(
     {
@@ -45,7 +45,7 @@ CAMERA_HOOKS = frozenset(
         "_default_viewer_camera_configs",
     }
 )
-_RUNS_LATER = RESET_HOOKS | STEP_HOOKS | JUDGING_HOOKS
+_RUNS_LATER = RESET_HOOKS | STEP_HOOKS | SCORING_HOOKS
 _CAMERAS_THEMSELVES = frozenset(
     (
         "_sensors _human_render_cameras _sensor_configs _human_render_camera_configs sensors "
@@ -103,7 +103,7 @@ def find_change(
     if dict(old) == dict(new):
         return Change("same", "nothing changed")
     try:
-        return _Comparison(old, new, (file, class_name), inherited).judge()
+        return _Comparison(old, new, (file, class_name), inherited).classify()
     except _Heavier as heavier:
         return Change("rebuilt", str(heavier))
     except (SyntaxError, ValueError):  # ValueError: a null byte
@@ -119,7 +119,7 @@ class _Comparison:
         self._both = TwoVersions(old, new)
         self._task, self._inherited = task, inherited
 
-    def judge(self) -> Change:
+    def classify(self) -> Change:
         family = self._family()
         self._refuse_another_order(family)
         if self._both.changed:

@@ -13,13 +13,13 @@ from collections.abc import Mapping
 
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.numbers import number_text
-from workbench.authoring.source.text import Refused, Replacement, SourceFile, arguments
+from workbench.authoring.source.text import RefusedEdit, Replacement, SourceFile, arguments
 from workbench.authoring.source.trace import DEGREE, Part, Place
 
 
 class Changes:
     """Places come from the process that runs the author's code: one that is no expression of a text that is here raises
-    Refused."""
+    RefusedEdit."""
 
     def __init__(self, project: Project) -> None:
         self.project = project
@@ -60,13 +60,13 @@ class Changes:
             lines: by the name that each brings.
 
         Raises:
-            Refused: a name means something else there.
+            RefusedEdit: a name means something else there.
         """
         bindings = self.project.bindings(file, file.module)
         for name in lines:
             if name in bindings and not bindings[name][-1].dotted:
                 line = file.line(bindings[name][-1].node)
-                raise Refused(f"`{name}` means something else in this file (line {line})")
+                raise RefusedEdit(f"`{name}` means something else in this file (line {line})")
         missing = [line for name, line in lines.items() if name not in bindings]
         for line in missing:
             self.note(f"`{line}` is added at the top of the file")

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from workbench.authoring.source.text import FUNCTIONS, LOOPS, Refused, Scope, SourceFile, parsed, walk
+from workbench.authoring.source.text import FUNCTIONS, LOOPS, RefusedEdit, Scope, SourceFile, parsed, walk
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,9 @@ class Project:
         return self._files[path]
 
     def given(self, path: str) -> SourceFile:
-        """Raises Refused for what is none of them."""
+        """Raises RefusedEdit for what is none of them."""
         if path not in self.texts:
-            raise Refused(f"{path} is not one of your files")
+            raise RefusedEdit(f"{path} is not one of your files")
         return self.file(path)
 
     def mentioning(self, word: str) -> Iterator[SourceFile]:

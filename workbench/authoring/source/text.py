@@ -32,7 +32,7 @@ _BLANK = {
 }
 
 
-class Refused(Exception):
+class RefusedEdit(Exception):
     """Ends a plan from anywhere inside, with the reason; its callers make a sentence for the author of it."""
 
     def __init__(self, reason: str, snippet: str = "") -> None:
@@ -49,7 +49,7 @@ class Replacement:
 
 
 class SourceFile:
-    """A parsed file. Raises `Refused` for a text that is not Python."""
+    """A parsed file. Raises `RefusedEdit` for a text that is not Python."""
 
     def __init__(self, path: str, text: str) -> None:
         self.path = path
@@ -58,7 +58,7 @@ class SourceFile:
             self.module = ast.parse(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as exc:
             said = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
-            raise Refused(f"{self.name} is not valid Python as it stands: {said}") from exc
+            raise RefusedEdit(f"{self.name} is not valid Python as it stands: {said}") from exc
         self._starts = [0, *(m.end() for m in _LINE_END.finditer(text))]
         self.nodes = list(walk(self.module))
         """All, nearly in the order of the text."""
@@ -163,9 +163,9 @@ class SourceFile:
         return found
 
     def expression(self, span: Span) -> ast.expr:
-        """The one that is exactly there. Raises Refused where none is."""
+        """The one that is exactly there. Raises RefusedEdit where none is."""
         if span not in self._expressions:
-            raise Refused(
+            raise RefusedEdit(
                 f"{self.name} is another text than the one that ran; save it, let it load and ask again"
             )
         return self._expressions[span]
@@ -252,7 +252,7 @@ class SourceFile:
         at = 0
         for change in sorted(replacements, key=lambda change: (change.start, change.end)):
             if change.start < at:
-                raise Refused("two changes fall on the same place of the file")
+                raise RefusedEdit("two changes fall on the same place of the file")
             # The file's own line ends, whatever was composed here.
             parts += [self.text[at : change.start], plain_line_ends(change.text).replace("\n", newline)]
             at = change.end

@@ -108,11 +108,11 @@ class H5Group:
         return found
 
     def get(self, path: str) -> H5Group | H5Dataset | None:
-        """None where there is nothing. Raises RefusedH5."""
+        """None where there is nothing. Raises RefusedEditH5."""
         return self._follow(path, 0)
 
     def group(self, path: str) -> H5Group | None:
-        """None where there is none. Raises RefusedH5."""
+        """None where there is none. Raises RefusedEditH5."""
         found = self.get(path)
         return found if isinstance(found, H5Group) else None
 
@@ -160,7 +160,7 @@ class H5Dataset:
     """A dataset of this file. Nothing of it is read until it is asked for."""
 
     def __init__(self, dataset: h5py.Dataset, budget: _Budget) -> None:
-        """Raises RefusedH5."""
+        """Raises RefusedEditH5."""
         self.name = str(dataset.name)
         creation = dataset.id.get_create_plist()
         # Before its shape is asked for: HDF5 opens the files of a virtual dataset to say one.
@@ -195,13 +195,13 @@ class H5Dataset:
         return self.shape[0] if self.shape else 0
 
     def read(self) -> NDArray:
-        """All of it. Raises RefusedH5."""
+        """All of it. Raises RefusedEditH5."""
         self._check_numbers()
         self._budget.take_bytes(self._short, self._size(self.shape))
         return _native(self._dataset[()])
 
     def row(self, number: int) -> NDArray:
-        """One of its rows. Raises RefusedH5, and IndexError where there is none."""
+        """One of its rows. Raises RefusedEditH5, and IndexError where there is none."""
         self._check_numbers()
         if not self.shape:
             raise RefusedH5(f"has one number where rows are looked for (at {self._short})")

@@ -29,13 +29,13 @@ from workbench.recording.reader.requests import (
     Answer,
     Ended,
     EpisodeRead,
-    Failed,
     Forget,
     ForRerun,
     NewReader,
     Open,
     PictureAt,
     PictureRead,
+    ReadFailed,
     Recover,
     Recovered,
     Request,
@@ -185,7 +185,7 @@ class _Reader:
         self._opened[self._number] = episode.cameras
         return packed(episode, source_path, self._number, shapes)
 
-    def _picture(self, wanted: PictureAt) -> PictureRead | Failed:
+    def _picture(self, wanted: PictureAt) -> PictureRead | ReadFailed:
         cameras = self._opened.get(wanted.opened, [])
         if not 0 <= wanted.camera < len(cameras):
             return _failed("gone", "That recording is not open.")
@@ -219,8 +219,8 @@ def _told_rerun(wanted: ForRerun) -> ToldRerun:
     return ToldRerun(found[0], found[1])
 
 
-def _failed(why: Literal["unreadable", "system", "gone"], words: str) -> Failed:
-    return Failed(why, text(words, LONGEST_WORDS))
+def _failed(why: Literal["unreadable", "system", "gone"], words: str) -> ReadFailed:
+    return ReadFailed(why, text(words, LONGEST_WORDS))
 
 
 if __name__ == "__main__":

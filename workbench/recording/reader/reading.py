@@ -26,11 +26,11 @@ from workbench.recording.reader.episode_wire import Garbled, KnownShapes, unpack
 from workbench.recording.reader.processes import Answered, NotThere, Reader, ReaderEnded, nursery
 from workbench.recording.reader.requests import (
     EpisodeRead,
-    Failed,
     ForRerun,
     Open,
     PictureAt,
     PictureRead,
+    ReadFailed,
     Recover,
     Recovered,
     Rows,
@@ -177,7 +177,11 @@ def mend(folder: Path) -> tuple[Path, ...]:
     if isinstance(answer, Recovered):
         # Names alone: the process that says them has read what came from elsewhere.
         return tuple(folder / Path(name).name for name in answer.made)
-    why = answer if isinstance(answer, Failed) else Failed("unreadable", f"it gave {type(answer).__name__}.")
+    why = (
+        answer
+        if isinstance(answer, ReadFailed)
+        else ReadFailed("unreadable", f"it gave {type(answer).__name__}.")
+    )
     raise RecordingError(why.words if why.why == "system" else f"{failed}{why.words}")
 
 
@@ -226,7 +230,7 @@ def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
     if isinstance(answer, RowsRead):
         return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
     why = "gave something that is no row"
-    if isinstance(answer, Failed):
+    if isinstance(answer, ReadFailed):
         why = answer.words
     elif isinstance(answer, ReaderEnded):
         # It is read again when it has changed, or by who opens it.
@@ -248,7 +252,7 @@ def _asked(reader: Reader, request: Open | Sources | ForRerun, kind: type[T], na
     except ReaderEnded as error:
         raise UnreadableRecording(f"{name} {error}.") from error
     answer = answered.answer
-    if isinstance(answer, Failed):
+    if isinstance(answer, ReadFailed):
         if answer.why == "system":
             raise OSError(answer.words)
         raise UnreadableRecording(answer.words)
@@ -279,7 +283,7 @@ class _Opened:
                 raise self._failed from error
         if isinstance(answer, PictureRead):
             return answer
-        raise OSError(answer.words if isinstance(answer, Failed) else "the reader gave no picture")
+        raise OSError(answer.words if isinstance(answer, ReadFailed) else "the reader gave no picture")
 
     def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
         for _ in range(2):

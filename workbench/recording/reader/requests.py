@@ -149,7 +149,7 @@ class Recovered(msgspec.Struct, frozen=True):
     """Names of their ``.rrd``."""
 
 
-class Failed(msgspec.Struct, frozen=True):
+class ReadFailed(msgspec.Struct, frozen=True):
     """It cannot be had."""
 
     why: Literal["unreadable", "system", "gone"]
@@ -157,4 +157,4 @@ class Failed(msgspec.Struct, frozen=True):
     words: str
 
 
-Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | ToldRerun | Recovered | Failed
+Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | ToldRerun | Recovered | ReadFailed

@@ -30,7 +30,7 @@ _Pictures = Sequence[tuple[str, int, Modality, NDArray]]
 class Soon(Future[list[Entry]]):
     """Entries that will be there; to ask for them is to have them made."""
 
-    def __init__(self, pool: _Pool, pictures: _Pictures) -> None:
+    def __init__(self, pool: _EncoderPool, pictures: _Pictures) -> None:
         super().__init__()
         self._pool, self._pictures = pool, pictures
         self.size = sum(picture.nbytes for *_, picture in pictures)
@@ -50,7 +50,7 @@ class Soon(Future[list[Entry]]):
             self.set_exception(error)
 
 
-class _Pool:
+class _EncoderPool:
     """The threads of this process."""
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class _Pool:
                 self._bytes -= soon.size
 
 
-_pool: _Pool | None = None
+_pool: _EncoderPool | None = None
 _making = threading.Lock()
 
 
@@ -104,7 +104,7 @@ def encode_soon(pictures: _Pictures) -> Soon:
     global _pool
     with _making:
         if _pool is None:
-            _pool = _Pool()
+            _pool = _EncoderPool()
         pool = _pool
     return pool.take(pictures)
 

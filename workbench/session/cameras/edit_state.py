@@ -20,7 +20,7 @@ from workbench.authoring.camera_source.hooks import HOOK_OF, snippet
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.loading.copy_task import NoCopy, copy_task
 from workbench.authoring.loading.modules import read_exactly
-from workbench.authoring.source.text import Refused
+from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraSettings, differences, setting_text
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.view import Change, Wish, Writing
@@ -65,7 +65,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
             edit = _made_of_a_parents(task, texts, info, wish, elsewhere, run)
         elif not task.source_files:
             where = "" if task.file is None else f" ({task.file})"
-            raise Refused(
+            raise RefusedEdit(
                 f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
                 "folder of your own",
                 text,
@@ -74,8 +74,8 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
             edit = _made(task, texts, info, wish, run)
         blocked = next(filter(None, (not_writable(change.file) for change in edit.changes)), None)
         if blocked is not None:
-            raise Refused(blocked, text)
-    except Refused as refused:
+            raise RefusedEdit(blocked, text)
+    except RefusedEdit as refused:
         can_copy = not elsewhere and _could_be_copied(task)
         ways = (
             " You can copy the text below into the file yourself." if refused.snippet and not can_copy else ""
@@ -107,22 +107,22 @@ def _made_of_a_parents(
 ) -> SourceEdit:
     """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
     if wish.settings is None or wish.what == "remove":
-        raise Refused(elsewhere)
+        raise RefusedEdit(elsewhere)
     (kind, _), (_, uid), site = wish.key, wish.result, info.site
     assert site is not None
     link = (info.mount or "").partition("/")[2]
     robot = "self.robot" if _is_a_robots(info) else "self.agent.robot"
     more = [f'mount={robot}.links_map["{link}"]'] if link else []
     if site.function.rpartition(".")[2] not in HOOK_OF.values():
-        raise Refused(elsewhere, snippet(uid, wish.settings, more=more))
+        raise RefusedEdit(elsewhere, snippet(uid, wish.settings, more=more))
     whole = members.override_text(kind, uid, wish.settings, more)
     if wish.what != "edit" or task.file is None or task.file not in texts:
-        raise Refused(elsewhere, whole)
+        raise RefusedEdit(elsewhere, whole)
     if info.varies:
         reason = (
             f"{elsewhere}; the task's own code moves it besides, so one pose in the file would not place it"
         )
-        raise Refused(reason, whole)
+        raise RefusedEdit(reason, whole)
     return members.plan_override(texts, task.file, task.class_name, kind, uid, wish.settings, site, run, more)
 
 
@@ -155,7 +155,7 @@ def _made(
         file = task.file or task.source_files[0]
         return members.plan_add(texts, file, task.class_name, wish.key, wish.settings, run)
     if info is None or info.settings is None:
-        raise Refused(f"there is no {kind} camera {uid!r} whose settings are known")
+        raise RefusedEdit(f"there is no {kind} camera {uid!r} whose settings are known")
     if wish.what == "remove":
         return members.plan_remove(texts, wish.key, run)
     if wish.what == "rename":
@@ -164,7 +164,7 @@ def _made(
         return members.plan_duplicate(texts, wish.key, wish.name, info.settings, run)
     assert wish.settings is not None
     if info.varies:
-        raise Refused(
+        raise RefusedEdit(
             f"the task's own code moves {uid!r} (it is randomised, or moved after it was made), so one pose in the "
             "file would not place it",
             snippet(uid, wish.settings),
@@ -173,14 +173,14 @@ def _made(
 
 
 def _texts(task: TaskDescription) -> dict[str, str]:
-    """The author's files as they are on disk, with the line ends that they have. Raises Refused."""
+    """The author's files as they are on disk, with the line ends that they have. Raises RefusedEditEdit."""
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
             texts[path] = read_exactly(path)[1]
         except (OSError, SyntaxError) as error:
             said = error.msg if isinstance(error, SyntaxError) else error.strerror
-            raise Refused(f"{path} cannot be read: {said}") from error
+            raise RefusedEdit(f"{path} cannot be read: {said}") from error
     return texts
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.camera_source.disk import SourceEdit, apply, revert
-from workbench.authoring.source.text import Refused, plain_line_ends
+from workbench.authoring.source.text import RefusedEdit, plain_line_ends
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.edit_state import DONE, LEFT, copy, mismatch, plan, said, was_before
@@ -127,7 +127,7 @@ class StudioFile:
         stopped = self._stopped = threading.Event()
         load, deadline = self._load(), time.monotonic() + self._patience
         if load is None or self._closing:
-            raise Refused("no task is loaded")
+            raise RefusedEdit("no task is loaded")
 
         def check() -> None:
             if stopped.is_set() or time.monotonic() > deadline:
@@ -136,9 +136,11 @@ class StudioFile:
         try:
             return self._asker.ask(check, RunCameras(load.task, texts))
         except Stopped:
-            raise Refused("the task did not answer, or another version came meanwhile; ask again") from None
+            raise RefusedEdit(
+                "the task did not answer, or another version came meanwhile; ask again"
+            ) from None
         except JobFailed as failure:
-            raise Refused(str(failure)) from failure
+            raise RefusedEdit(str(failure)) from failure
 
     def stop(self) -> None:
         """The worker is gone, or another version comes: what is under way is not answered any more."""
@@ -167,7 +169,7 @@ class StudioFile:
                 return
             try:
                 do(view.edit)
-            except Refused as refused:
+            except RefusedEdit as refused:
                 kept = "refused" if stage == "written" else view.stage
                 self.view = replace(view, stage=kept, message=f"Not done: {refused.reason}.")
             else:

@@ -19,12 +19,12 @@ from workbench.core.camera_data import CameraInfo, CameraSettings, Picture, why_
 from workbench.core.cameras.conventions import compose
 from workbench.core.cameras.report import CameraReport, OfferedPlacement, SearchSpace, join_reports
 from workbench.session.cameras.selection import StudioCameras
-from workbench.session.cameras.view import JudgedMoment, Looked, Picked, StudioCamera
+from workbench.session.cameras.view import Looked, MeasuredMoment, Picked, StudioCamera
 from workbench.session.history.history import Shown, ShownMoment
 from workbench.session.process.askers import Asker, Background
-from workbench.session.process.job_lane import Job, JobFailed, Lane, Progress
+from workbench.session.process.job_lane import Job, JobFailed, JobLane, JobProgress
 from workbench.session.protocol.messages import Load, Reset
-from workbench.session.protocol.questions import DrawCamera, JudgeCamera, SuggestCameras
+from workbench.session.protocol.questions import DrawCamera, MeasureCamera, SuggestCameras
 
 FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
@@ -37,11 +37,11 @@ _TELL_EVERY = 8
 
 
 Triple = tuple[float, float, float]
-Case = tuple[int, NDArray[np.float32] | None, JudgedMoment | None]
+Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
 """Where a camera is judged: the env; (B, 7) its bodies, None for now; which moment of the past that is."""
 
 
-class CameraJudging:
+class CameraReports:
     """Thread-safe; every method returns at once."""
 
     def __init__(
@@ -64,8 +64,8 @@ class CameraJudging:
         self._lock = threading.Lock()
         self._looked = Looked()
         self._live, self._background = asker, background
-        self._live_lane = Lane("studio-live", on_change, self._failed)
-        self._background_lane = Lane("studio-background", on_change, self._failed)
+        self._live_lane = JobLane("studio-live", on_change, self._failed)
+        self._background_lane = JobLane("studio-background", on_change, self._failed)
 
     # --- what is known -------------------------------------------------------------------------------
 
@@ -75,12 +75,12 @@ class CameraJudging:
             return self._looked
 
     @property
-    def progress(self) -> Progress | None:
+    def progress(self) -> JobProgress | None:
         return self._background_lane.progress or self._live_lane.progress
 
     # --- jobs ------------------------------------------------------------------------------------------
 
-    def judge(self, seeds: int = 0) -> None:
+    def measure(self, seeds: int = 0) -> None:
         """Judge the selected camera as it is placed over all envs.
 
         Args:
@@ -91,11 +91,11 @@ class CameraJudging:
         if camera is not None and seeds <= 0:
             moment = self._past.shown_moment()
             cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
-            self._judge_live("in all envs", camera, cases, len(cases))
+            self._measure_live("in all envs", camera, cases, len(cases))
         elif camera is not None and (load := self._load()) is not None:
-            self._judge_seeds(camera, load, min(seeds, MOST_SEEDS))
+            self._measure_seeds(camera, load, min(seeds, MOST_SEEDS))
 
-    def judge_steps(self, most: int = MOST_STEPS) -> None:
+    def measure_steps(self, most: int = MOST_STEPS) -> None:
         """Judge the selected camera as it is placed over the steps of the episode that the selected env is in; what is
         known so far can be seen all the while.
 
@@ -106,29 +106,29 @@ class CameraJudging:
         moments = self._past.episode_moments(min(max(1, most), MOST_STEPS))
         if camera is not None and moments:
             cases: list[Case] = [
-                (env, step.poses[env], JudgedMoment(moment.serial, env, int(step.elapsed_steps[env])))
+                (env, step.poses[env], MeasuredMoment(moment.serial, env, int(step.elapsed_steps[env])))
                 for moment, env in moments
                 for step in [moment.step]
             ]
-            self._judge_live(f"over {len(moments)} steps", camera, cases, _TELL_EVERY)
+            self._measure_live(f"over {len(moments)} steps", camera, cases, _TELL_EVERY)
 
-    def _judge_live(self, over: str, camera: StudioCamera, cases: Sequence[Case], every: int) -> None:
+    def _measure_live(self, over: str, camera: StudioCamera, cases: Sequence[Case], every: int) -> None:
         def work(job: Job) -> None:
-            with self._judging_anew():
-                question = JudgeCamera(camera.key, None, 0)
-                self._judge(job, self._live, question, camera.now, [], cases, len(cases), every)
+            with self._measuring():
+                question = MeasureCamera(camera.key, None, 0)
+                self._measure(job, self._live, question, camera.now, [], cases, len(cases), every)
 
         self._live_lane.start(f"judging {camera.key[1]} {over}", work)
 
-    def _judge_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
-        question = JudgeCamera(camera.key, camera.now if camera.moved else None, 0)
+    def _measure_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
+        question = MeasureCamera(camera.key, camera.now if camera.moved else None, 0)
 
         def work(job: Job) -> None:
             reports: list[CameraReport] = []
 
-            def judge() -> None:
+            def measure() -> None:
                 """From where it gave way."""
-                num_envs = self._background.ensure(job, _for_judging(load))
+                num_envs = self._background.ensure(job, _for_measuring(load))
 
                 def cases() -> Iterator[Case]:
                     for seed in range(begun := len(reports), seeds):
@@ -136,20 +136,20 @@ class CameraJudging:
                             self._background.ask(job.check, Reset(None, FIRST_SEED + seed - env))
                         yield env, None, None
 
-                self._judge(
+                self._measure(
                     job, self._background, question, camera.now, reports, cases(), seeds, num_envs, fresh=True
                 )
 
-            with self._judging_anew():
-                self._background.in_turns(job, judge)
+            with self._measuring():
+                self._background.in_turns(job, measure)
 
         self._background_lane.start(f"judging {camera.key[1]} over {seeds} seeds", work)
 
-    def _judge(
+    def _measure(
         self,
         job: Job,
         asker: Asker,
-        question: JudgeCamera,
+        question: MeasureCamera,
         now: CameraSettings | None,
         reports: list[CameraReport],
         cases: Iterable[Case],
@@ -165,7 +165,7 @@ class CameraJudging:
             every: cases after which what is known so far is shown.
             fresh: the cases are fresh episodes.
         """
-        moments: list[JudgedMoment] = []
+        moments: list[MeasuredMoment] = []
         for env, poses, moment in cases:
             job.tell(len(reports), total)
             reports.append(asker.ask(job.check, replace(question, env=env, poses=poses)))
@@ -178,7 +178,7 @@ class CameraJudging:
                     report_seeds=len(reports) if fresh else 0,
                     report_moments=tuple(moments),
                     outdated=False,
-                    judging=False,
+                    measuring=False,
                 )
 
     def suggest(self, objects: Sequence[str], low: Triple, high: Triple, seeds: int) -> None:
@@ -200,7 +200,7 @@ class CameraJudging:
 
         def work(job: Job) -> None:
             def search() -> tuple[OfferedPlacement, ...]:
-                num_envs = self._background.ensure(job, _for_judging(load))
+                num_envs = self._background.ensure(job, _for_measuring(load))
                 self._background.ask(job.check, Reset(None, FIRST_SEED))
                 envs = tuple(range(min(max(1, seeds), num_envs)))
                 job.tell(0, 0, what)
@@ -244,8 +244,8 @@ class CameraJudging:
         moment, report = self._past.shown_moment(), self.looked.report_over_envs(key)
         order = list(range(moment.num_envs))
         if report is not None:
-            judged = [report.envs[i] for i in report.worst_first()]
-            order = judged if sorted(judged) == order else order
+            measured = [report.envs[i] for i in report.worst_first()]
+            order = measured if sorted(measured) == order else order
 
         def work(job: Job) -> None:
             self._know(sheet=())
@@ -304,13 +304,13 @@ class CameraJudging:
         return self._live.ask(job.check, replace(question, poses=moment.of(question.env)))
 
     @contextmanager
-    def _judging_anew(self) -> Iterator[None]:
+    def _measuring(self) -> Iterator[None]:
         """What is known from before is said to be that, until there is something new or the work ends."""
-        self._know(judging=True)
+        self._know(measuring=True)
         try:
             yield
         finally:
-            self._know(judging=False)
+            self._know(measuring=False)
 
     def _know(self, **values: object) -> None:
         with self._lock:
@@ -322,7 +322,7 @@ class CameraJudging:
         self._know(problem=f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else "."))
 
 
-def _for_judging(load: Load) -> Load:
+def _for_measuring(load: Load) -> Load:
     options = load.options
     kwargs = dict(options.env_kwargs)
     if kwargs.get("obs_mode", "state") not in ("state", "state_dict", "none"):

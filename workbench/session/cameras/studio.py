@@ -11,7 +11,7 @@ A camera's picture may also be taken for a look only, by a camera beside the env
 little, and giving the env's camera another size would change the observation that the task and a policy get. And one that
 is about to be added is not there yet, while whether it stands well is seen in its picture alone.
 
-Here is how a camera comes to stand somewhere; what is asked about it there is `judging`, the way into the file `file`.
+Here is how a camera comes to stand somewhere; what is asked about it there is `reports`, the way into the file `file`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from workbench.core.cameras.conventions import Convention, Direction, relative_t
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.file_edits import StudioFile
-from workbench.session.cameras.reports import CameraJudging
+from workbench.session.cameras.reports import CameraReports
 from workbench.session.cameras.selection import Step, StudioCameras
 from workbench.session.cameras.view import StudioView
 from workbench.session.history.history import Shown
 from workbench.session.process.askers import Asker, Background
-from workbench.session.process.job_lane import Job, JobFailed, Lane
+from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load, PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.protocol.questions import DrawCamera
 
@@ -74,8 +74,8 @@ class CameraStudio:
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
-        self.judging = CameraJudging(self._cameras, asker, background, self._note, past, load)
-        self._looking = Lane("studio-quick-look", self._note, self._look_failed)
+        self.reports = CameraReports(self._cameras, asker, background, self._note, past, load)
+        self._looking = JobLane("studio-quick-look", self._note, self._look_failed)
         self._quick_scale = 1.0
         self._quick: Picture | None = None
         self._quick_problem = ""
@@ -132,7 +132,7 @@ class CameraStudio:
 
     def take_suggestion(self, index: int) -> None:
         """Place the camera as suggested."""
-        looked = self.judging.looked
+        looked = self.reports.looked
         key = looked.suggestions_of
         if key is None or not 0 <= index < len(looked.suggestions):
             return
@@ -234,14 +234,14 @@ class CameraStudio:
             step: of the shown moment.
             env: the selected one.
         """
-        looked, progress = self.judging.looked, self.judging.progress
+        looked, progress = self.reports.looked, self.reports.progress
         with self._lock:
             self._cameras.drawn = step, env
             quick = self._quick
-            judged = None if looked.report_of is None else self._cameras.placements.now(looked.report_of)
+            measured = None if looked.report_of is None else self._cameras.placements.now(looked.report_of)
             was = looked.report_settings
             # Not what is rounded away when it is written.
-            moved = judged is None or was is None or bool(differences(judged, was, close=3e-4))
+            moved = measured is None or was is None or bool(differences(measured, was, close=3e-4))
             return StudioView(
                 cameras=self._cameras.all_as_shown(),
                 looked=looked,
@@ -286,7 +286,7 @@ class CameraStudio:
                 self._cameras.selected = None
             self._serial += 1
             if level not in ("same", "cameras"):
-                self.judging.outdate()
+                self.reports.outdate()
             # The dropped ones too: their placement may have been on its way while the version came in. And those that
             # were changed here: taken back, one stands as the file says, which a version that is the same does not tell.
             asked = (*self._cameras.placements.placed, *dropped, *(own & said.keys()))
@@ -294,7 +294,7 @@ class CameraStudio:
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
-        self.judging.stop()
+        self.reports.stop()
         self._looking.stop()
         self._looked = None
         self.file.stop()
@@ -330,7 +330,7 @@ class CameraStudio:
 
     def close(self) -> None:
         """Wait for what is being written."""
-        self.judging.close()
+        self.reports.close()
         self._looking.close()
         self.file.close()
 

@@ -16,7 +16,7 @@ from workbench.core.cameras.report import CameraReport, OfferedPlacement
 
 if TYPE_CHECKING:
     from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.session.process.job_lane import Progress
+from workbench.session.process.job_lane import JobProgress
 
 WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
 """``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what
@@ -109,7 +109,7 @@ class Picked:
 
 
 @dataclass(frozen=True)
-class JudgedMoment:
+class MeasuredMoment:
     """Which moment of which env's episode an entry of a report over steps is of."""
 
     serial: int
@@ -129,11 +129,11 @@ class Looked:
     """How the camera stood when it was judged."""
     report_seeds: int = 0
     """Fresh episodes that it is of; 0 for the envs at the moment that was shown."""
-    report_moments: tuple[JudgedMoment, ...] = ()
+    report_moments: tuple[MeasuredMoment, ...] = ()
     """Where it is of an episode's steps: which one each of ``report.envs`` is; empty for all others."""
     outdated: bool = False
     """The report is of a version that was."""
-    judging: bool = False
+    measuring: bool = False
     """Another judgement is under way, of which nothing is known yet."""
     suggestions: tuple[OfferedPlacement, ...] = ()
     """Best first."""
@@ -169,7 +169,7 @@ class StudioView:
     """Other than 1: the chosen camera is looked through in a picture of so much of its own size."""
     quick: Picture | None = None
     """That picture, while there is one."""
-    progress: Progress | None = None
+    progress: JobProgress | None = None
     """None while nothing runs in the background."""
     problem: str = ""
     """What went wrong last, or was decided over the author's head, as a sentence."""

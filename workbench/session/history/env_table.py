@@ -65,7 +65,7 @@ class Outlier:
 
 
 @dataclass(frozen=True)
-class Sight:
+class OutlierSighting:
     """The envs that show something of a kind in one control step."""
 
     kind: Kind
@@ -102,28 +102,32 @@ class OutlierWatch:
             self._before[envs] = step.poses[envs, :, :3]
             self._start[envs] = step.poses[envs, :, 2]
 
-    def look(self, step: StepResult) -> list[Sight]:
+    def look(self, step: StepResult) -> list[OutlierSighting]:
         """What a control step shows; only kinds that some env shows."""
         # With `reconfiguration_freq` a reset may change which bodies there are, which nobody tells us.
         sights = self._odd_poses(step) if step.poses.shape[:2] == self._there.shape else []
         for name, values in _numbers(step):
             wrong: Any = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
             sights.append(
-                Sight(
+                OutlierSighting(
                     Kind.NOT_A_NUMBER, wrong, lambda env, of=values, name=name: f"{name} {_is_lost(of[env])}"
                 )
             )
         if step.sound_obs is not None:
             sights.append(
-                Sight(Kind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is NaN or infinite")
+                OutlierSighting(
+                    Kind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is NaN or infinite"
+                )
             )
         with np.errstate(invalid="ignore"):
             out = (step.reward < self._low - ROUNDING) | (step.reward > self._high + ROUNDING)
         out &= np.isfinite(step.reward)
-        sights.append(Sight(Kind.REWARD, out, lambda env: self._say_reward(float(step.reward[env]))))
+        sights.append(
+            OutlierSighting(Kind.REWARD, out, lambda env: self._say_reward(float(step.reward[env])))
+        )
         return [sight for sight in sights if sight.envs.any()]
 
-    def _odd_poses(self, step: StepResult) -> list[Sight]:
+    def _odd_poses(self, step: StepResult) -> list[OutlierSighting]:
         place = step.poses[..., :3]
         # An env that blew up has NaN and 1e30 in its poses: that is what is looked for, not a mishap.
         with np.errstate(invalid="ignore", over="ignore"):
@@ -143,14 +147,20 @@ class OutlierWatch:
             return self._names[body], float(amounts[env, body])
 
         return [
-            Sight(
+            OutlierSighting(
                 Kind.NOT_A_NUMBER,
                 lost.any(axis=1),
                 lambda e: f"the pose of {first(lost, e)} {_is_lost(step.poses[e, int(lost[e].argmax())])}",
             ),
-            Sight(Kind.FAST, fast.any(axis=1), lambda e: "{} moved at {:.3g} m/s".format(*worst(speed, e))),
-            Sight(Kind.UNDER_FLOOR, under.any(axis=1), lambda e: f"{first(under, e)} is under the floor"),
-            Sight(Kind.DROPPED, dropped.any(axis=1), lambda e: "{} dropped {:.2f} m".format(*worst(drop, e))),
+            OutlierSighting(
+                Kind.FAST, fast.any(axis=1), lambda e: "{} moved at {:.3g} m/s".format(*worst(speed, e))
+            ),
+            OutlierSighting(
+                Kind.UNDER_FLOOR, under.any(axis=1), lambda e: f"{first(under, e)} is under the floor"
+            ),
+            OutlierSighting(
+                Kind.DROPPED, dropped.any(axis=1), lambda e: "{} dropped {:.2f} m".format(*worst(drop, e))
+            ),
         ]
 
     def _say_reward(self, reward: float) -> str:

@@ -135,7 +135,7 @@ class Moment:
         return self.step if self.first_said is None else self.first_said
 
 
-Lived = tuple[Moment, int]
+EnvMoment = tuple[Moment, int]
 """A moment of an episode, with the number that the env had then: another than now where it was given another env's."""
 
 
@@ -161,7 +161,7 @@ class Shown(Protocol):
         """That of the selected env."""
         ...
 
-    def episode_moments(self, most: int) -> tuple[Lived, ...]:
+    def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
         """Of the selected env's episode round the one that is shown, at the most so many."""
         ...
 
@@ -350,18 +350,18 @@ class History:
         """The one of these that this moment is in."""
         return next(stretch for stretch in reversed(self.stretches(env)) if stretch[0] <= serial)
 
-    def episode(self, env: int, serial: int, most: int | None = None) -> tuple[Lived, ...]:
-        """The episode that this env is in at a moment, as far as it went; oldest first, see `lived`.
+    def episode(self, env: int, serial: int, most: int | None = None) -> tuple[EnvMoment, ...]:
+        """The episode that this env is in at a moment, as far as it went; oldest first, see `episode_backwards`.
 
         Args:
             most: so many moments at most, evenly spread, the first and the last among them; None for all.
         """
-        lived = [*self.lived(env, self.stretch_at(env, serial)[1])][::-1]
-        count = len(lived) if most is None else min(most, len(lived))
-        chosen = np.unique(np.linspace(0, len(lived) - 1, count).round().astype(int))
-        return tuple(lived[k] for k in chosen)
+        episode_backwards = [*self.episode_backwards(env, self.stretch_at(env, serial)[1])][::-1]
+        count = len(episode_backwards) if most is None else min(most, len(episode_backwards))
+        chosen = np.unique(np.linspace(0, len(episode_backwards) - 1, count).round().astype(int))
+        return tuple(episode_backwards[k] for k in chosen)
 
-    def lived(self, env: int, serial: int) -> Iterator[Lived]:
+    def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
         """The episode of this env up to a moment, newest first, through the moments that it was put back to.
 
         Each control step and, at the end, the reset that it began with, as far as they are kept.
@@ -385,13 +385,13 @@ class History:
                 if moment.step.action is None or len(rows) == most:
                     return None
                 rows.append(moment.step.action[at])
-            elif jump is None or (at not in jump.lived_through and jump.origin != NO_MOMENT):
+            elif jump is None or (at not in jump.replayed and jump.origin != NO_MOMENT):
                 if moment.snapshot is None or not rows:
                     return None
                 return WayBack(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
         return None
 
-    def _back(self, env: int, serial: int) -> Iterator[Lived]:
+    def _back(self, env: int, serial: int) -> Iterator[EnvMoment]:
         """The moments that led this env to one, newest first: its control steps and its own jumps, whose origin is
         gone on from; as far as they are kept."""
         while (moment := self.at(serial)) is not None:
@@ -452,8 +452,8 @@ class History:
 
     def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
         """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""
-        lived = () if moment is None else self.lived(env, moment.serial)
-        rewards = (one.step.reward[of] for one, of in lived if not one.jumped.any())
+        episode_backwards = () if moment is None else self.episode_backwards(env, moment.serial)
+        rewards = (one.step.reward[of] for one, of in episode_backwards if not one.jumped.any())
         return np.array(list(islice(rewards, most))[::-1], np.float32)
 
     def _with_rewards(self, stepped: Stepped, origin: Moment | None) -> StepResult:

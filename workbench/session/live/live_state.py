@@ -33,9 +33,9 @@ from workbench.session.process.supervisor import Death
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
     Event,
-    Failed,
     Load,
     Loaded,
+    LoadFailed,
     Loading,
     LoadLevel,
     PastPictures,
@@ -162,7 +162,7 @@ class LiveState:
         now = self.now
         if isinstance(event, Loading):
             self.set(state="loading", activity=event.activity)
-        elif isinstance(event, Failed):
+        elif isinstance(event, LoadFailed):
             self.set_problem(event.problem)
             self.problem_at_run = now.state != "loading"
             self.set(

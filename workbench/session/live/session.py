@@ -2,7 +2,7 @@
 
 The page's controls call methods here; each only notes the wish and sends a message, so none waits for
 the env. The worker's events come one by one on one thread and change the `LiveState`, of which
-`Session.view` makes a snapshot. When the worker dies, `KeptWorker` starts another, which is greeted with
+`Session.view` makes a snapshot. When the worker dies, `Supervisor` starts another, which is greeted with
 the last version that ran, and the page never goes away.
 
 What is done here is to bring those together: who is asked, and who is told of what. What an event means is in
@@ -35,25 +35,25 @@ from workbench.session.live.view import SessionView
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, KeptWorker, WorkerOptions
+from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import (
+    EnterRecording,
     Event,
-    Failed,
     Inspect,
     Loaded,
+    LoadFailed,
     Placed,
     Play,
     Request,
     Reset,
     SetCapture,
     SingleStep,
-    StepBack,
     WarmUp,
 )
 from workbench.session.record.keep_past import PastKeeper
 from workbench.session.record.live import LiveRecorder
 from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import Judge, Judgement, what_a_load_means
+from workbench.session.rescore.past import PastRescorer, RescoredPast, what_a_load_means
 
 HISTORY_BYTES = 256 * 1024**2
 """What the past may take unless somebody says otherwise."""
@@ -70,7 +70,7 @@ class Session:
         recordings: Path,
         history_bytes: int = HISTORY_BYTES,
         worker: WorkerOptions | None = None,
-        make_worker: Callable[..., KeptWorker] = KeptWorker,
+        make_worker: Callable[..., Supervisor] = Supervisor,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[PrintedLine], None] = lambda line: None,
         on_notice: Callable[[str], None] = lambda words: None,
@@ -94,7 +94,7 @@ class Session:
         self._lock, self._note = self._shared.lock, self._shared.note
         self._sending_settings = threading.Lock()
         """Taken before `_lock`."""
-        self._step_in: tuple[Callable[[tuple[int, ...]], StepBack], bool] | None = None
+        self._to_enter: tuple[Callable[[tuple[int, ...]], EnterRecording], bool] | None = None
         """What is to be gone into, and whether by all envs, as soon as a task is there."""
         self._step_backs = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
@@ -118,7 +118,7 @@ class Session:
         self._background = Background()
         """The process that does all that is done beside playing."""
         self.keeper = PastKeeper(recordings, self._recorder.finisher, self._note, self._background)
-        self.judge = Judge(self._note, self._background)
+        self.rescorer = PastRescorer(self._note, self._background)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """What the batch lived through."""
@@ -145,7 +145,7 @@ class Session:
             "recording": replace(self._recorder.status(), keeping=self.keeper.status()),
             "printed": self._printed.view(),
             "vitals": self._worker.vitals,
-            "judgement": self.judge.judging.view,
+            "rescored": self.rescorer.rescoring.view,
         }
         with self._lock:
             view = self._state.view(**known)
@@ -278,7 +278,7 @@ class Session:
         else:
             self.keeper.keep(what)
 
-    def step_back(
+    def enter_recording(
         self,
         run: RecordedRun,
         everywhere: bool = False,
@@ -295,16 +295,18 @@ class Session:
             What `TimelineView.entered` is when it is done.
         """
         number = next(self._step_backs)
-        self._go_into(lambda env_idx: StepBack(run, env_idx, source_file, dict(source), number), everywhere)
+        self._go_into(
+            lambda env_idx: EnterRecording(run, env_idx, source_file, dict(source), number), everywhere
+        )
         return number
 
-    def _go_into(self, request: Callable[[tuple[int, ...]], StepBack], everywhere: bool) -> None:
+    def _go_into(self, request: Callable[[tuple[int, ...]], EnterRecording], everywhere: bool) -> None:
         self.past.seek(None)
         self.pause()
         with self._lock:
             task, env = self._state.now.task, self._state.now.settings.selected_env
             if task is None:
-                self._step_in = request, everywhere
+                self._to_enter = request, everywhere
                 return
         self._send(request(tuple(range(task.num_envs)) if everywhere else (env,)))
         self._note()
@@ -321,7 +323,7 @@ class Session:
         self.versions.close()
         self._policy_file.close()
         self._worker.stop()
-        self.judge.judging.close()
+        self.rescorer.rescoring.close()
         self.studio.close()
         self.keeper.close()
         self._background.end()
@@ -335,7 +337,7 @@ class Session:
         problem, kept = self.versions.died(death, self._printed.tail(20))
         self._note()
         if problem is not None:
-            self._on_event(Failed(problem, kept))
+            self._on_event(LoadFailed(problem, kept))
 
     def _on_busy(self, busy: Busy | None) -> None:
         with self._lock:
@@ -345,7 +347,7 @@ class Session:
         self._note()
 
     def _handle(self, event: Event) -> None:
-        if isinstance(event, Failed) and self._worker.load_waits and event.problem.interrupted:
+        if isinstance(event, LoadFailed) and self._worker.load_waits and event.problem.interrupted:
             return  # left for the sake of a newer version, which waits: nobody need hear of it
         if isinstance(event, Loaded):
             self._on_loaded(event)
@@ -358,7 +360,7 @@ class Session:
                 self._state.take(event)
             if isinstance(event, Placed):
                 self.studio.placed(event, self._state.now.task)
-            if isinstance(event, Failed):
+            if isinstance(event, LoadFailed):
                 self.versions.failed(event)
                 if not self._state.problem_at_run:
                     self.studio.failed_to_load()
@@ -374,28 +376,28 @@ class Session:
         with self._lock:
             s = self._state
             restored, stale = self.versions.came_in(event.task)
-            meaning = what_a_load_means(s.now.task, event, self.judge.judging.view)
-            judgement = None
-            if meaning == "judge" and s.timeline is not None:
-                judgement = Judgement(s.timeline.history)
+            meaning = what_a_load_means(s.now.task, event, self.rescorer.rescoring.view)
+            rescored = None
+            if meaning == "rescore" and s.timeline is not None:
+                rescored = RescoredPast(s.timeline.history)
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)
-        if judgement is not None:
+        if rescored is not None:
             load = self.versions.same_again()
             assert load is not None
-            self.judge.judge(load, judgement)
+            self.rescorer.rescore(load, rescored)
         elif meaning == "forget":
-            self.judge.forget()
+            self.rescorer.forget()
         self.versions.follow(event.task, stale)
         self._send_settings()
         self.studio.ask_for(placed)
         if recording:
             self._record_on(event, recording, one_each)
         with self._lock:
-            step_in, self._step_in = self._step_in, None
-        if step_in is not None:
-            self._go_into(*step_in)
+            to_enter, self._to_enter = self._to_enter, None
+        if to_enter is not None:
+            self._go_into(*to_enter)
 
     def _record_on(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
         """A version came in while these envs were recorded."""
@@ -414,7 +416,7 @@ class Session:
         self._recorder.take(event)
 
     def _on_save(self) -> None:
-        self.judge.stop(StoppedBy.SAVE)
+        self.rescorer.stop(StoppedBy.SAVE)
         self.studio.interrupted()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:

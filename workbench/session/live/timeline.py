@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_data import CameraKind, Picture
 from workbench.jobs.task import Restored, Stepped
 from workbench.session.history.env_table import EnvTable
-from workbench.session.history.history import History, Lived, Moment, ShownMoment
+from workbench.session.history.history import EnvMoment, History, Moment, ShownMoment
 from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class TimelineView:
     arrived: str = ""
     """Where the last jump came from, and how, if that was a recording."""
     entered: int = 0
-    """Number of the last `Session.step_back` that has arrived; 0 for none."""
+    """Number of the last `Session.enter_recording` that has arrived; 0 for none."""
     wants_pictures: bool = False
     """The shown moment has no pictures of the cameras that are looked through."""
 
@@ -127,8 +127,8 @@ class Timeline:
 
     def seek_step(self, env: int, step: int) -> None:
         """To that control step of the present episode of this env, through its goings back; or the nearest kept."""
-        lived = self.history.lived(env, self.history.last)
-        serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in lived}
+        episode_backwards = self.history.episode_backwards(env, self.history.last)
+        serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if serials:
             self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
@@ -347,7 +347,7 @@ class TimeTravel:
             count = 0 if s.now.task is None else s.now.task.num_envs
             return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
 
-    def episode_moments(self, most: int) -> tuple[Lived, ...]:
+    def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
         """Moments, at the most so many, of the selected env's episode round the one that is shown."""
         with self._lock:
             s = self._state

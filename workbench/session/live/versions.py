@@ -16,12 +16,12 @@ from workbench.authoring.problem import Problem
 from workbench.jobs.task import TaskDescription
 from workbench.session.live.live_state import SharedState
 from workbench.session.process.supervisor import Death
-from workbench.session.protocol.messages import Failed, Load, LoadLevel, Play, Request
+from workbench.session.protocol.messages import Load, LoadFailed, LoadLevel, Play, Request
 
 Rung = Literal["file", "moment", "version", "nothing"]
 
 
-class Wanted(NamedTuple):
+class LoadInputs(NamedTuple):
     """What a load is to name besides the task."""
 
     source: dict[str, str] | None
@@ -69,18 +69,18 @@ class Recovery:
         """Whether the load under way brings back what there was."""
         return self.loading and self._rung in ("moment", "version")
 
-    def wanted(self) -> Wanted | None:
+    def wanted(self) -> LoadInputs | None:
         """What a fresh worker is to load; None to load nothing."""
         if self._rung == "nothing":
             return None
         self.loading = True
         good = self._good.source if self._good is not None and self._rung != "file" else None
-        return Wanted(good or None, self._newest() if self._rung in ("file", "moment") else None)
+        return LoadInputs(good or None, self._newest() if self._rung in ("file", "moment") else None)
 
-    def file_asked(self) -> Wanted:
+    def file_asked(self) -> LoadInputs:
         """The file is to be loaded as it is on disk, by the worker that there is."""
         self._rung, self.loading = "file", True
-        return Wanted(None, None if self._has_env else self._newest())
+        return LoadInputs(None, None if self._has_env else self._newest())
 
     def loaded(self, task: TaskDescription) -> None:
         """`task` runs, and is the last good version from now on."""
@@ -230,7 +230,7 @@ class Versions:
         """The files of a version that runs."""
         self._follow(task.source_files, {} if stale else task.source)
 
-    def failed(self, failed: Failed) -> None:
+    def failed(self, failed: LoadFailed) -> None:
         """If it was a load of a fresh worker, that is to have the last good version."""
         with self._shared.lock:
             wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None

@@ -22,7 +22,7 @@ from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken, Settings
 from workbench.session.record.status import RecordingStatus
-from workbench.session.rescore.background import JudgedView
+from workbench.session.rescore.background import RescoreView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 """``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
@@ -101,7 +101,7 @@ class SessionView:
     """The last lines that the author's code printed."""
     vitals: Vitals = Vitals()
     """What the processes hold."""
-    judgement: JudgedView = JudgedView()
+    rescored: RescoreView = RescoreView()
     """What the new code says of the episodes that were run with the old."""
     studio: StudioView = StudioView()
     """Cameras, as they are placed by hand."""

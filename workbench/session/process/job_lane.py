@@ -16,7 +16,7 @@ from workbench.machine.processes.watched_thread import report_failure, watched_t
 
 
 @dataclass(frozen=True)
-class Progress:
+class JobProgress:
     """Of work in the background."""
 
     what: str
@@ -41,17 +41,17 @@ class Job:
 
     _numbers = count(1)
 
-    def __init__(self, lane: Lane, what: str, work: Callable[[Job], None]) -> None:
-        self._lane, self._what, self.work = lane, what, work
+    def __init__(self, lane: JobLane, what: str, work: Callable[[Job], None]) -> None:
+        self._job_lane, self._what, self.work = lane, what, work
         self.number = next(self._numbers)
         """One that is begun later has a higher one, whatever lane it is on."""
         self.stopped = False
-        self.progress = Progress(what, 0, 0)
+        self.progress = JobProgress(what, 0, 0)
 
     @property
     def closing(self) -> bool:
         """There is to be no job after it."""
-        return self._lane.closing
+        return self._job_lane.closing
 
     def check(self) -> None:
         """Raises Stopped where it is to stop."""
@@ -60,11 +60,11 @@ class Job:
 
     def tell(self, done: int, total: int, what: str = "") -> None:
         """How far it is."""
-        self.progress = Progress(what or self._what, done, total)
-        self._lane.changed()
+        self.progress = JobProgress(what or self._what, done, total)
+        self._job_lane.changed()
 
 
-class Lane:
+class JobLane:
     """See the module's text."""
 
     def __init__(
@@ -83,7 +83,7 @@ class Lane:
         self._thread: threading.Thread | None = None
 
     @property
-    def progress(self) -> Progress | None:
+    def progress(self) -> JobProgress | None:
         """Of the job that is done, or waits to be; None for neither."""
         with self._wake:
             job = self._waiting or self._job

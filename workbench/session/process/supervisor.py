@@ -88,7 +88,7 @@ class Death:
     stack: str
     """Where it was, as faulthandler writes it; may be empty."""
     gives_up: bool
-    """Too many died: the next is started only when `KeptWorker.replace` is called."""
+    """Too many died: the next is started only when `Supervisor.replace` is called."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class SpareWorker:
             process.stop(grace=0.0)
 
 
-class KeptWorker:
+class Supervisor:
     """Requests go to whichever worker there is; `greet` tells each new one what the last one knew."""
 
     def __init__(

@@ -169,7 +169,7 @@ class Restore:
 
 
 @dataclass(frozen=True)
-class StepBack:
+class EnterRecording:
     """Put envs into a state of a recorded episode; the answer is a `Stepped` with `Stepped.restored`."""
 
     run: RecordedRun
@@ -239,7 +239,7 @@ Request = (
     | PlaceCamera
     | SetCapture
     | Restore
-    | StepBack
+    | EnterRecording
     | DrawPast
     | ListenForDebugger
     | Inspect
@@ -289,7 +289,7 @@ class Loaded:
 
 
 @dataclass(frozen=True)
-class Failed:
+class LoadFailed:
     """Something of the author's raised. `kept` says that the version before still runs."""
 
     problem: Problem
@@ -356,7 +356,7 @@ class RulesBroken:
 Event = (
     Loading
     | Loaded
-    | Failed
+    | LoadFailed
     | Stepped
     | Pictures
     | Placed

@@ -48,7 +48,7 @@ class DrawCamera(Question[Picture]):
 
 
 @dataclass(frozen=True)
-class JudgeCamera(Question[CameraReport]):
+class MeasureCamera(Question[CameraReport]):
     """Measure what one camera sees in one env."""
 
     key: CameraKey
@@ -77,14 +77,14 @@ class RunCameras(Question[Ran]):
     """By path."""
 
 
-CameraQuestion = DrawCamera | JudgeCamera | SuggestCameras | RunCameras
+CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras
 
 
 # --- moments of the past -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class MomentToJudge:
+class MomentToRescore:
     """A moment of the past to be lived through again: a control step, or a jump if it has a snapshot."""
 
     action: NDArray[np.float32] | None
@@ -96,7 +96,7 @@ class MomentToJudge:
 
 
 @dataclass(frozen=True)
-class Judged:
+class RescoredMoments:
     """What the task says of some moments now."""
 
     steps: tuple[StepResult, ...]
@@ -108,10 +108,10 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class JudgeMoments(Question[Judged]):
+class RescoreMoments(Question[RescoredMoments]):
     """Live through these moments, in order. Only for a worker that does not play."""
 
-    moments: tuple[MomentToJudge, ...]
+    moments: tuple[MomentToRescore, ...]
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,6 @@ class MakeScene(Question[SceneMade]):
 
 
 QUESTIONS = (
-    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), JudgeMoments, CaptureMoment, Rescore, MakeScene
+    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), RescoreMoments, CaptureMoment, Rescore, MakeScene
 )  # fmt: skip
 """All that come in a `Call`."""

@@ -29,9 +29,9 @@ from workbench.jobs.gather import EpisodeFinisher, GatheredEpisode
 from workbench.jobs.task import TaskDescription
 from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.writing.publish import RecordingError
-from workbench.session.history.history import History, Lived, Moment
+from workbench.session.history.history import EnvMoment, History, Moment
 from workbench.session.process.askers import WAITING, Background
-from workbench.session.process.job_lane import Job, JobFailed, Lane
+from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset
 from workbench.session.protocol.questions import CaptureMoment
 from workbench.session.record.status import KeepStatus
@@ -42,7 +42,7 @@ class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset."""
 
     env: int
-    moments: tuple[Lived, ...]
+    moments: tuple[EnvMoment, ...]
     seed: int
     """Below 0 where it is not known."""
 
@@ -96,21 +96,21 @@ def _before(history: History, env: int, episode: PastEpisode) -> PastEpisode | s
 
 
 def _of(history: History, env: int, serial: int) -> PastEpisode | str:
-    lived = history.episode(env, serial)
-    if not lived:
+    moments = history.episode(env, serial)
+    if not moments:
         return "nothing was seen yet"
-    first, of = lived[0]
+    first, of = moments[0]
     if not first.jumped[of] or first.step.elapsed_steps[of] != 0:
         return "its beginning is no longer in memory"
-    if any(moment.snapshot is None for moment, _ in lived):
+    if any(moment.snapshot is None for moment, _ in moments):
         return "the state of this task cannot be kept, so what was seen cannot be put back"
-    for count, (moment, at) in enumerate(lived):
+    for count, (moment, at) in enumerate(moments):
         step = moment.as_recorded
         if count > 0 and (step.terminated[at] or step.truncated[at]):
-            lived = lived[: count + 1]
+            moments = moments[: count + 1]
             break
     seed = -1 if first.seeds is None else int(first.seeds[of])
-    return PastEpisode(env, lived, seed)
+    return PastEpisode(env, moments, seed)
 
 
 def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, list[PastEpisode]]]]:
@@ -135,16 +135,16 @@ class PastKeeper:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
         self._status = KeepStatus()
         self._process = process
-        self._lane = Lane("keep-past", on_change, self._failed)
+        self._job_lane = JobLane("keep-past", on_change, self._failed)
 
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""
         self._say("")
-        self._lane.start(WAITING, lambda job: self._keep(job, what))
+        self._job_lane.start(WAITING, lambda job: self._keep(job, what))
 
     def stop(self) -> None:
         """Give up; nothing of it is kept."""
-        self._lane.stop()
+        self._job_lane.stop()
         self._say("stopped; nothing was kept")
 
     def refuse(self, why: str) -> None:
@@ -152,10 +152,10 @@ class PastKeeper:
         self._say(why, failed=True)
 
     def status(self) -> KeepStatus:
-        return replace(self._status, progress=self._lane.progress)
+        return replace(self._status, progress=self._job_lane.progress)
 
     def close(self) -> None:
-        self._lane.close()
+        self._job_lane.close()
 
     # --- on the lane's thread --------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from workbench.session.process.job_lane import Progress
+from workbench.session.process.job_lane import JobProgress
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,7 @@ class KeepStatus:
     """What came of the last one, once it has ended."""
     failed: bool = False
     """`said` is why it did not go well."""
-    progress: Progress | None = None
+    progress: JobProgress | None = None
     """In moments; None while nothing is kept."""
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.jobs.verdict import Verdict
-from workbench.session.process.job_lane import Job, JobFailed, Lane
+from workbench.session.process.job_lane import Job, JobFailed, JobLane
 
 
 class StoppedBy(Enum):
@@ -23,13 +23,13 @@ class StoppedBy(Enum):
     CLOSING = "closing"
 
 
-JudgedState = Literal["none", "asking", "loading", "judging", "done", "stopped", "failed"]
-RUNNING: tuple[JudgedState, ...] = ("asking", "loading", "judging")
+RescoreState = Literal["none", "asking", "loading", "rescoring", "done", "stopped", "failed"]
+RUNNING: tuple[RescoreState, ...] = ("asking", "loading", "rescoring")
 
 
 @dataclass(frozen=True)
-class JudgedView:
-    state: JudgedState = "none"
+class RescoreView:
+    state: RescoreState = "none"
     """``asking`` whether the code may run; ``loading``: it is being loaded by the process that judges."""
     serial: int = 0
     """Grows with every change."""
@@ -63,7 +63,7 @@ class JudgedView:
         return self.steps / self.seconds if self.seconds > 0.5 else 0.0
 
 
-class Judging:
+class Rescoring:
     """One job at a time; a new one takes the place of the one before. All methods but `close` return at once."""
 
     def __init__(self, name: str, on_change: Callable[[], None] = lambda: None) -> None:
@@ -75,14 +75,14 @@ class Judging:
         self._on_change = on_change
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
-        self._view = JudgedView()
-        self._lane = Lane(name, on_change, self._failed)
+        self._view = RescoreView()
+        self._job_lane = JobLane(name, on_change, self._failed)
 
     @property
-    def view(self) -> JudgedView:
+    def view(self) -> RescoreView:
         return self._view
 
-    def begin(self, view: JudgedView, work: Callable[[Job], None]) -> None:
+    def begin(self, view: RescoreView, work: Callable[[Job], None]) -> None:
         """Do this in place of what was done before; `view` is what is to be seen first."""
 
         def whole(job: Job) -> None:
@@ -91,7 +91,7 @@ class Judging:
 
         with self._lock:
             # Under the lock, or the job might tell how far it is before it is said that it begins.
-            self._lane.start("judging", whole)
+            self._job_lane.start("rescoring", whole)
             self._view = replace(view, serial=self._view.serial + 1)
         self._on_change()
 
@@ -106,7 +106,7 @@ class Judging:
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """Go no further with what is under way; what is known by now stays to be seen."""
         with self._lock:
-            self._lane.stop()
+            self._job_lane.stop()
             if self._view.state not in RUNNING:
                 return
             stopped = replace(self._view, state="stopped", stopped_by=why, why=why.value)
@@ -117,13 +117,13 @@ class Judging:
         """Stop, and have nothing to show."""
         self.stop(StoppedBy.LOSS)
         with self._lock:
-            self._view = JudgedView(serial=self._view.serial + 1)
+            self._view = RescoreView(serial=self._view.serial + 1)
         self._on_change()
 
     def close(self) -> None:
         """End it all; returns when the thread has ended."""
         self.stop(StoppedBy.CLOSING)
-        self._lane.close()
+        self._job_lane.close()
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
         self.tell(job, state="failed", why=str(failure), problem=failure.problem)

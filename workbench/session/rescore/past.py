@@ -5,7 +5,7 @@ are all in the history: a snapshot for every beginning, and every action. So the
 moments are sent, the answer is compared, and the next are sent: so one stops it by not sending more, and a process that
 does not answer (the new code may loop for ever) is ended.
 
-A `Judgement` is begun from a history and filled as the moments come back from the worker. Each is a row: the reward, every
+A `RescoredPast` is begun from a history and filled as the moments come back from the worker. Each is a row: the reward, every
 number that ``evaluate`` returned, and how far the bodies are from where they were, since what is judged is the run anew
 and not the record itself. That drift is what makes a comparison good or bad, so it is kept for every moment and every
 env. Where an episode begins at a kept reset it is mostly zero to the last bit, because the envs get the same physics without a past there (measured: PushCube,
@@ -32,13 +32,13 @@ from numpy.typing import NDArray
 from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
-from workbench.jobs.verdict import Said, Verdict, compare, single_numbers
+from workbench.jobs.verdict import Scores, Verdict, compare, single_numbers
 from workbench.session.history.history import History, Moment
 from workbench.session.process.askers import Background
 from workbench.session.process.job_lane import Job, JobFailed
 from workbench.session.protocol.messages import Load, Loaded
-from workbench.session.protocol.questions import Judged, JudgeMoments, MomentToJudge
-from workbench.session.rescore.background import JudgedView, Judging, StoppedBy
+from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
+from workbench.session.rescore.background import RescoreView, Rescoring, StoppedBy
 
 MOST_ENTRIES = 24
 """Entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
@@ -64,7 +64,7 @@ class PastRun:
 
 
 @dataclass(frozen=True)
-class JudgedCurve:
+class RescoredCurve:
     """One number of one env at the control steps of the record, oldest first."""
 
     tick: NDArray[np.int64]
@@ -77,7 +77,7 @@ class JudgedCurve:
     """(T,) NaN where it is not judged (yet)."""
 
 
-class Judgement:
+class RescoredPast:
     """The record and what is said of it now, side by side. Not thread-safe: its owner locks."""
 
     def __init__(self, history: History) -> None:
@@ -98,7 +98,7 @@ class Judgement:
         self._serial = np.array([m.serial for m in self._moments], np.int64)
         self._tick = np.array([m.tick for m in self._moments], np.int64)
         self._elapsed = np.array([m.step.elapsed_steps for m in self._moments]).reshape(count, envs)
-        self._judged = np.zeros(count, bool)
+        self._rescored = np.zeros(count, bool)
         self._old: dict[str, NDArray[np.float32]] = {}
         self._new: dict[str, NDArray[np.float32]] = {}
         for row, moment in enumerate(self._moments):
@@ -118,8 +118,8 @@ class Judgement:
         return int(self._is_step.sum())
 
     @property
-    def judged_steps(self) -> int:
-        return int((self._is_step & self._judged).sum())
+    def rescored_steps(self) -> int:
+        return int((self._is_step & self._rescored).sum())
 
     def runs(self) -> list[range]:
         """Rows to be lived through in order, each run beginning with a jump of all envs; the newest run first.
@@ -134,12 +134,12 @@ class Judgement:
     def num_envs(self) -> int:
         return self._jumped.shape[1]
 
-    def to_judge(self, row: int) -> MomentToJudge:
+    def to_rescore(self, row: int) -> MomentToRescore:
         """This row, for whoever lives through it again."""
         if self._is_step[row]:
-            return MomentToJudge(self._moments[row].step.action)
+            return MomentToRescore(self._moments[row].step.action)
         envs = tuple(int(env) for env in np.flatnonzero(self._jumped[row]))
-        return MomentToJudge(None, pickle.dumps(self._moments[row].snapshot), envs)
+        return MomentToRescore(None, pickle.dumps(self._moments[row].snapshot), envs)
 
     def add(self, row: int, step: StepResult) -> None:
         """What the new code says of this row.
@@ -153,20 +153,20 @@ class Judgement:
         far = pose_distances(step.poses, was)
         self._drift[row] = np.stack([each.max(axis=1, initial=0.0) for each in far], axis=1)
         self._write(self._new, row, step)
-        self._judged[row] = True
+        self._rescored[row] = True
         self._changed.update(self._run[row].tolist())
 
     def let_go(self) -> None:
         """Forget the moments and their snapshots, when no more rows will come."""
         self._moments = []
 
-    def curve(self, name: str, env: int) -> JudgedCurve | None:
+    def curve(self, name: str, env: int) -> RescoredCurve | None:
         """One number of one env; None if neither version has one of this name."""
         old, new = self._old.get(name), self._new.get(name)
         if (old is None and new is None) or not 0 <= env < self.num_envs:
             return None
         steps, missing = self._is_step, np.full(self.steps, np.nan, np.float32)
-        return JudgedCurve(
+        return RescoredCurve(
             self._tick[steps],
             self._serial[steps],
             missing if old is None else old[steps, env],
@@ -197,15 +197,15 @@ class Judgement:
         """A run by the rows of it that are judged, its jump and its control steps; None before there are two."""
         env = int(self._run[0].searchsorted(number, side="right")) - 1
         first, end = self._run[:, env].searchsorted([number, number + 1])
-        counts = self._judged[first:end] & self._is_step[first:end]
-        counts[0] = self._judged[first]
+        counts = self._rescored[first:end] & self._is_step[first:end]
+        counts[0] = self._rescored[first]
         # A run that nobody else's jump is in is a slice, which is ten times as quick.
         rows = slice(first, end) if counts.all() else first + counts.nonzero()[0]
         serials = self._serial[rows]
         if len(serials) < 2:
             return None
         old, new = (
-            Said(
+            Scores(
                 table["reward"][rows, env][1:],
                 {name: column[rows, env] for name, column in table.items() if name != "reward"},
             )
@@ -231,113 +231,113 @@ _SUMMARY_EVERY = 0.5
 
 
 def what_a_load_means(
-    before: TaskDescription | None, loaded: Loaded, view: JudgedView
-) -> Literal["judge", "keep", "forget"]:
+    before: TaskDescription | None, loaded: Loaded, view: RescoreView
+) -> Literal["rescore", "keep", "forget"]:
     """Whether the episodes of the version before are to be judged with the one that was loaded.
 
     If not, what the last judgement said is kept to be seen, or forgotten with the episodes.
     """
     level = None if before is None or loaded.reload is None else loaded.reload.level
     if level == "patched":
-        return "judge"
+        return "rescore"
     if level in ("same", "cameras"):
         # Saved again without a change that matters: what that stopped is to be had all the same.
-        return "judge" if view.stopped_by is StoppedBy.SAVE else "keep"
+        return "rescore" if view.stopped_by is StoppedBy.SAVE else "keep"
     return "forget"
 
 
-class Judge:
+class PastRescorer:
     """Judges the past."""
 
     def __init__(self, on_change: Callable[[], None], process: Background) -> None:
         """
         Args:
-            on_change: called when `judging` has something new.
+            on_change: called when `rescoring` has something new.
             process: in which it is judged. Whoever else wants it need not wait.
         """
-        self.judging = Judging("judge", on_change)
+        self.rescoring = Rescoring("rescore", on_change)
         self._process, self._lock = process, threading.Lock()
-        self._judgement: Judgement | None = None
+        self._rescored: RescoredPast | None = None
         """What is shown: what is being judged, or was last."""
 
-    def curve(self, name: str, env: int) -> JudgedCurve | None:
-        """See `Judgement.curve`; None also while nothing is judged."""
+    def curve(self, name: str, env: int) -> RescoredCurve | None:
+        """See `RescoredPast.curve`; None also while nothing is judged."""
         with self._lock:
-            return None if self._judgement is None else self._judgement.curve(name, env)
+            return None if self._rescored is None else self._rescored.curve(name, env)
 
-    def judge(self, load: Load, judgement: Judgement) -> None:
+    def rescore(self, load: Load, rescored: RescoredPast) -> None:
         """Begin, in place of whatever was judged before.
 
         Args:
             load: the new code.
             judgement: of the record; it is this object's from now on.
         """
-        if judgement.steps == 0:
+        if rescored.steps == 0:
             return
         self.stop(StoppedBy.LOAD)
         with self._lock:
-            self._judgement = judgement
-        view = JudgedView("loading", total=judgement.steps, task="the new code")
-        self.judging.begin(view, lambda job: self._judge(job, load, judgement))
+            self._rescored = rescored
+        view = RescoreView("loading", total=rescored.steps, task="the new code")
+        self.rescoring.begin(view, lambda job: self._rescore(job, load, rescored))
 
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
-        """As `Judging.stop`."""
-        self.judging.stop(why)
+        """As `Rescoring.stop`."""
+        self.rescoring.stop(why)
         with self._lock:
-            if self._judgement is not None:
-                self._judgement.let_go()  # a job that still waited does not come to it
+            if self._rescored is not None:
+                self._rescored.let_go()  # a job that still waited does not come to it
 
     def forget(self) -> None:
         """Stop, and have nothing to show: the record is gone."""
-        self.judging.forget()
+        self.rescoring.forget()
         with self._lock:
-            self._judgement = None
+            self._rescored = None
 
     # --- on the lane ---------------------------------------------------------------------------------
 
-    def _judge(self, job: Job, load: Load, judgement: Judgement) -> None:
+    def _rescore(self, job: Job, load: Load, rescored: RescoredPast) -> None:
         looked, missed = 0.0, dict[str, str]()
 
-        def tell(answer: Judged, seconds: float) -> None:
+        def tell(answer: RescoredMoments, seconds: float) -> None:
             nonlocal looked
             missed.update(answer.not_carried)
-            now, done = time.monotonic(), judgement.judged_steps
-            if answer.problem is not None or done == judgement.steps or now - looked > _SUMMARY_EVERY:
+            now, done = time.monotonic(), rescored.rescored_steps
+            if answer.problem is not None or done == rescored.steps or now - looked > _SUMMARY_EVERY:
                 looked = now
                 with self._lock:
-                    names, differing = judgement.names()
-                    verdicts = tuple(judgement.verdicts())
-                self.judging.tell(job, verdicts=verdicts, names=names, differing_names=differing)
-            self.judging.tell(
+                    names, differing = rescored.names()
+                    verdicts = tuple(rescored.verdicts())
+                self.rescoring.tell(job, verdicts=verdicts, names=names, differing_names=differing)
+            self.rescoring.tell(
                 job,
-                state="judging",
+                state="rescoring",
                 done=done,
                 steps=done,
-                seconds=self.judging.view.seconds + seconds,
+                seconds=self.rescoring.view.seconds + seconds,
                 warnings=tuple(f"not put back: {what}: {why}" for what, why in missed.items()),
             )
             if answer.problem is not None:
                 raise JobFailed("the new code raised", answer.problem)
 
-        def judge_run(rows: range) -> None:
-            self._load(job, load, judgement)
-            self._live_through(job, judgement, rows, tell)
+        def rescore_rows(rows: range) -> None:
+            self._load(job, load, rescored)
+            self._replay_steps(job, rescored, rows, tell)
 
         try:
-            for rows in judgement.runs():
-                self._process.in_turns(job, partial(judge_run, rows), aside=True)
+            for rows in rescored.runs():
+                self._process.in_turns(job, partial(rescore_rows, rows), aside=True)
         finally:
             with self._lock:
-                judgement.let_go()
+                rescored.let_go()
 
-    def _load(self, job: Job, load: Load, judgement: Judgement) -> None:
+    def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
         if self._process.has(load):
             return
-        self.judging.tell(job, state="loading")
-        if self._process.num_envs == judgement.num_envs:
+        self.rescoring.tell(job, state="loading")
+        if self._process.num_envs == rescored.num_envs:
             # A version is tried at the moment at which the env stands, which is where the judgement before
             # ended: there the new code may raise or loop though it runs from the beginnings in the record.
-            self._ask(job, judgement, judgement.runs()[0][:1])
+            self._ask(job, rescored, rescored.runs()[0][:1])
         try:
             self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
         except JobFailed as failure:
@@ -345,20 +345,20 @@ class Judge:
                 raise
             raise JobFailed("the new code could not be loaded to judge with", failure.problem) from failure
 
-    def _live_through(
-        self, job: Job, judgement: Judgement, rows: range, tell: Callable[[Judged, float], None]
+    def _replay_steps(
+        self, job: Job, rescored: RescoredPast, rows: range, tell: Callable[[RescoredMoments, float], None]
     ) -> None:
         at, count = rows.start, 2
         while at < rows.stop:
             chunk = range(at, min(at + count, rows.stop))
             began = time.monotonic()
-            answer = self._ask(job, judgement, chunk)
+            answer = self._ask(job, rescored, chunk)
             took = time.monotonic() - began
             with self._lock:
                 job.check()
                 for row, step in zip(chunk, answer.steps, strict=False):
                     try:
-                        judgement.add(row, step)
+                        rescored.add(row, step)
                     except ValueError as error:
                         raise JobFailed(f"the episodes cannot be compared: {error}") from error
             tell(answer, took)
@@ -366,8 +366,8 @@ class Judge:
             count = max(1, min(int(wanted), 2 * count, _MOST_AT_ONCE))
             at = chunk.stop
 
-    def _ask(self, job: Job, judgement: Judgement, rows: range) -> Judged:
+    def _ask(self, job: Job, rescored: RescoredPast, rows: range) -> RescoredMoments:
         with self._lock:
             job.check()
-            moments = tuple(judgement.to_judge(row) for row in rows)
-        return self._process.ask(job.check, JudgeMoments(moments))
+            moments = tuple(rescored.to_rescore(row) for row in rows)
+        return self._process.ask(job.check, RescoreMoments(moments))

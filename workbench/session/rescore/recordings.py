@@ -20,7 +20,7 @@ from workbench.authoring.loading.modules import hidden_by_libraries
 from workbench.authoring.loading.reference import TaskName, named_file
 from workbench.authoring.problem import TaskError
 from workbench.jobs.from_recording import (
-    CannotStepIn,
+    CannotEnterRecording,
     NoText,
     class_in,
     options_of,
@@ -35,11 +35,11 @@ from workbench.recording.episode.made_here import made_here
 from workbench.recording.episode.side_files import side_files_in_words
 from workbench.recording.episode.source import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_source
-from workbench.session.clearance import Clearances, NotCleared, Wanted, recorded_content
+from workbench.session.clearance import Clearances, CodeToRun, NotCleared, recorded_content
 from workbench.session.process.askers import Background
 from workbench.session.process.job_lane import Job, JobFailed
 from workbench.session.protocol.messages import Load
-from workbench.session.rescore.background import JudgedView, Judging
+from workbench.session.rescore.background import RescoreView, Rescoring
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Group:
     recorded_source: bool = False
 
     @property
-    def wanted(self) -> Wanted:
+    def wanted(self) -> CodeToRun:
         """What has to be cleared before it is judged."""
-        return Wanted(self.reference, self.info, self.recorded_source)
+        return CodeToRun(self.reference, self.info, self.recorded_source)
 
 
 def group_episodes(
@@ -92,7 +92,7 @@ def group_episodes(
         except NoText as error:
             unread.append(Verdict(episode, task=info.task, why_not=str(error)))
             continue
-        options, note = judging_options(options_of(info, 1, base))
+        options, note = rescore_options(options_of(info, 1, base))
         if recorded_source and (besides := side_files_in_words(info.source_file, info.side_files)):
             note = f"{note}. {besides}" if note else besides
         reference = task or (file and class_in(file, info.task)) or reference_of(info)
@@ -115,12 +115,12 @@ def hidden_in_words(reference: TaskName) -> list[str]:
     )
 
 
-def judge_each(
+def rescore_each(
     groups: Sequence[Group],
     cleared: Sequence[TaskName | NotCleared],
-    judge: Callable[[Group, TaskName], None],
+    rescore: Callable[[Group, TaskName], None],
     known: Callable[[], Iterable[Verdict[Source]]],
-    not_judged: Callable[[list[Verdict[Source]]], None],
+    not_rescored: Callable[[list[Verdict[Source]]], None],
 ) -> None:
     """Judge each of these with what was cleared for it, or with its recorded text; one that fails leaves the others.
 
@@ -132,27 +132,27 @@ def judge_each(
     Raises:
         JobFailed, TaskError, CannotStepIn: of the first, where all fail.
     """
-    failures: list[JobFailed | TaskError | CannotStepIn] = []
+    failures: list[JobFailed | TaskError | CannotEnterRecording] = []
     for group, reference in zip(groups, cleared, strict=True):
         try:
             if isinstance(reference, NotCleared):
-                raise CannotStepIn(str(reference)) from reference
+                raise CannotEnterRecording(str(reference)) from reference
             text = recorded_source(group.info) if group.recorded_source else nullcontext(reference)
             with text as opened:
-                judge(group, opened)
-        except (JobFailed, TaskError, CannotStepIn) as error:
+                rescore(group, opened)
+        except (JobFailed, TaskError, CannotEnterRecording) as error:
             failures.append(error)
             why = str(error)
             if isinstance(error, JobFailed) and error.problem is not None:
                 why += f": {error.problem.message}"
-            judged = {verdict.of.id for verdict in known()}
-            missing = [file for file in group.files if file.id not in judged]
-            not_judged([Verdict(file, task=group.info.task, why_not=why) for file in missing])
+            rescored = {verdict.of.id for verdict in known()}
+            missing = [file for file in group.files if file.id not in rescored]
+            not_rescored([Verdict(file, task=group.info.task, why_not=why) for file in missing])
     if failures and len(failures) == len(groups):
         raise failures[0]
 
 
-def judging_options(options: TaskOptions) -> tuple[TaskOptions, str]:
+def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
     """The same env without pictures, which cost most of the time and which no reward looks at; and what was changed."""
     kwargs, note = dict(options.env_kwargs), ""
     mode = kwargs.get("obs_mode")
@@ -191,7 +191,7 @@ class Rescorer:
             clearances: says what of the code that recordings name may run; None asks nobody.
             base: what is the same for all that is opened.
         """
-        self.judging = Judging("rescore")
+        self.rescoring = Rescoring("rescore")
         self._process = Background()
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()
@@ -212,37 +212,37 @@ class Rescorer:
             groups, unread = group_episodes(
                 files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
             )
-            notes = [f"with {_judged_with(group)}" for group in groups[:MOST_NAMED]]
+            notes = [f"with {_rescored_with(group)}" for group in groups[:MOST_NAMED]]
             notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
             self._tell(job, unread, state="asking", notes=tuple(notes))
             try:
-                self._judge_all(job, groups, use_env_states)
-            except CannotStepIn as error:
+                self._rescore_all(job, groups, use_env_states)
+            except CannotEnterRecording as error:
                 raise JobFailed(str(error)) from error
             finally:
                 self._process.end()  # with the code that the recordings named
 
-        self.judging.begin(JudgedView("loading", total=len(files), unit="episodes"), work)
+        self.rescoring.begin(RescoreView("loading", total=len(files), unit="episodes"), work)
 
     # --- on the lane ---------------------------------------------------------------------------------
 
-    def _judge_all(self, job: Job, groups: list[Group], use_env_states: bool) -> None:
+    def _rescore_all(self, job: Job, groups: list[Group], use_env_states: bool) -> None:
         cleared = self._clearances.clear_all([group.wanted for group in groups], lambda: job.stopped)
         job.check()
 
-        judge_each(
+        rescore_each(
             groups,
             cleared,
-            lambda group, task: self._judge(job, group, task, use_env_states),
-            lambda: self.judging.view.verdicts,
+            lambda group, task: self._rescore(job, group, task, use_env_states),
+            lambda: self.rescoring.view.verdicts,
             lambda verdicts: self._tell(job, verdicts),
         )
 
-    def _judge(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
+    def _rescore(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
         process = self._process
-        warnings = tuple(dict.fromkeys((*self.judging.view.warnings, *hidden_in_words(reference))))
-        self._tell(job, state="loading", task=_judged_with(group), warnings=warnings)
+        warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden_in_words(reference))))
+        self._tell(job, state="loading", task=_rescored_with(group), warnings=warnings)
         # Never patched into what the last episodes were judged in.
         load = Load(reference, group.options, level="rebuilt")
         try:
@@ -253,8 +253,8 @@ class Rescorer:
             raise JobFailed(
                 f"{group.info.task} could not be opened to judge with", failure.problem
             ) from failure
-        self._tell(job, state="judging")
-        began, before, steps = time.monotonic(), self.judging.view.seconds, self.judging.view.steps
+        self._tell(job, state="rescoring")
+        began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps
 
         def told(now: Rescored) -> None:
             seconds = before + time.monotonic() - began
@@ -268,11 +268,11 @@ class Rescorer:
 
     def _tell(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
         """What is new, and these verdicts besides those that are known."""
-        known = (*self.judging.view.verdicts, *verdicts)
-        self.judging.tell(job, verdicts=known, done=len(known), **values)
+        known = (*self.rescoring.view.verdicts, *verdicts)
+        self.rescoring.tell(job, verdicts=known, done=len(known), **values)
 
 
-def _judged_with(group: Group) -> str:
+def _rescored_with(group: Group) -> str:
     """What is opened, in words."""
     if group.recorded_source:
         return f"{group.info.task} as it was recorded"

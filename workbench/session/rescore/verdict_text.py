@@ -77,29 +77,29 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     Args:
         others: further entries that differ, such as those that one version has not.
     """
-    judged = [verdict for verdict in verdicts if not verdict.why_not]
-    if not judged:
+    rescored = [verdict for verdict in verdicts if not verdict.why_not]
+    if not rescored:
         return "No episode could be judged." if verdicts else ""
-    differing, yet = sum(verdict.differs for verdict in judged), " so far" * so_far
+    differing, yet = sum(verdict.differs for verdict in rescored), " so far" * so_far
     if differing:
-        return f"{differing} of {counted(len(judged), 'episode')} {'differs' if differing == 1 else 'differ'}{yet}."
-    sentence = f"Nothing differs in {counted(len(judged), 'episode')}{yet}: reward, success and fail are as they were."
-    named = sorted({*others, *(name for verdict in judged for name in verdict.differing)})[:_MOST_NAMED]
+        return f"{differing} of {counted(len(rescored), 'episode')} {'differs' if differing == 1 else 'differ'}{yet}."
+    sentence = f"Nothing differs in {counted(len(rescored), 'episode')}{yet}: reward, success and fail are as they were."
+    named = sorted({*others, *(name for verdict in rescored for name in verdict.differing)})[:_MOST_NAMED]
     return sentence + (f" Other entries differ: {', '.join(named)}." if named else "")
 
 
 def numbers(verdicts: Sequence[Verdict[Any]]) -> list[str]:
     """Success and return over all of them, then and now; and how many were not judged."""
-    judged = [verdict for verdict in verdicts if not verdict.why_not]
+    rescored = [verdict for verdict in verdicts if not verdict.why_not]
     told: list[str] = []
-    if any(verdict.has_success for verdict in judged):
-        successes = (sum(verdict.success[k] is not None for verdict in judged) for k in (0, 1))
+    if any(verdict.has_success for verdict in rescored):
+        successes = (sum(verdict.success[k] is not None for verdict in rescored) for k in (0, 1))
         told.append(f"episodes with success: {_was_now(*map(str, successes))}")
-    if judged:
-        means = (mean_text([verdict.returns[k] for verdict in judged]) for k in (0, 1))
+    if rescored:
+        means = (mean_text([verdict.returns[k] for verdict in rescored]) for k in (0, 1))
         told.append(f"mean return: {_was_now(*means)}")
-    skipped = len(verdicts) - len(judged)
-    return told + ([f"{counted(skipped, 'episode')} not judged"] if judged and skipped else [])
+    skipped = len(verdicts) - len(rescored)
+    return told + ([f"{counted(skipped, 'episode')} not judged"] if rescored and skipped else [])
 
 
 def summary(verdicts: Sequence[Verdict[Any]]) -> str:
@@ -161,7 +161,7 @@ def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
             "other_entries": ", ".join(verdict.others),
             "drift_metres": verdict.metres,
             "drift_at": verdict.drift_at,
-            "first_state_put_in": verdict.begins_otherwise,
+            "first_state_put_in": verdict.start_differs,
             "not_carried": "; ".join(f"{what}: {why}" for what, why in verdict.missed.items()),
             "not_judged": verdict.why_not,
         }

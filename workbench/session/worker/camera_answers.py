@@ -31,10 +31,10 @@ from workbench.core.cameras.visibility import (
 )
 from workbench.core.env.hot_swap import put_class, undone
 from workbench.jobs.open_task import OpenedTask, blamed
-from workbench.session.protocol.questions import CameraQuestion, DrawCamera, JudgeCamera, RunCameras
+from workbench.session.protocol.questions import CameraQuestion, DrawCamera, MeasureCamera, RunCameras
 from workbench.session.worker.pacing import now_and_then
 
-JUDGED_SIDE = 128
+REPORT_SIDE = 128
 """Pixels of the shorter side of what is judged, where the camera's own are more: an object that is lost in those is
 hardly to be called seen."""
 LARGEST_SCALE = 4.0
@@ -59,8 +59,8 @@ def answer(
     """
     if isinstance(question, DrawCamera):
         return _drawn(opened, placed, question)
-    if isinstance(question, JudgeCamera):
-        return _judged(opened, question)
+    if isinstance(question, MeasureCamera):
+        return _measured(opened, question)
     if isinstance(question, RunCameras):
         return run_cameras(opened, question)
     progress = now_and_then(tell, _TELL_EVERY)
@@ -104,10 +104,10 @@ def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> P
             placed.place(env, key, before)
 
 
-def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
+def _measured(opened: OpenedTask, question: MeasureCamera) -> CameraReport:
     env = opened.env.env
     placement = placement_of(env, question.key, question.env, question.settings)
-    size = small_size(placement.settings.width, placement.settings.height, JUDGED_SIDE)
+    size = small_size(placement.settings.width, placement.settings.height, REPORT_SIDE)
     return measure_placement(env, question.env, placement, question.poses, size)
 
 

@@ -46,7 +46,7 @@ from workbench.session.protocol.messages import (
 )
 from workbench.session.protocol.questions import CameraQuestion, Captured, CaptureMoment
 from workbench.session.worker.camera_answers import answer
-from workbench.session.worker.guarded_task import HeldTask
+from workbench.session.worker.guarded_task import GuardedTask
 
 _PERIOD = 1 / 15
 _PAUSE_SHARE = 0.3
@@ -69,7 +69,7 @@ class _Begun:
 class WorkerCameras:
     """See the module's text."""
 
-    def __init__(self, held: HeldTask, on_first: Callable[[bool], None]) -> None:
+    def __init__(self, held: GuardedTask, on_first: Callable[[bool], None]) -> None:
         """
         Args:
             on_first: called with False before the first picture of the process is begun, and with True when it is there.

@@ -32,8 +32,8 @@ from workbench.jobs.from_recording import changed_since
 from workbench.jobs.open_task import OpenedTask, blamed, restore_checked, step_checked
 from workbench.jobs.replay import arrive, how
 from workbench.jobs.task import NO_MOMENT, Restored
-from workbench.session.protocol.messages import Restore, StepBack
-from workbench.session.protocol.questions import Judged, JudgeMoments
+from workbench.session.protocol.messages import EnterRecording, Restore
+from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
 
 MOST_SECONDS = 8.0
 """A way back that takes longer is given up, and the moment put there."""
@@ -53,13 +53,13 @@ def go_back(
     task, env = opened.env, opened.env.env
     snapshot: Snapshot = pickle.loads(request.snapshot)
     source = dict(zip(request.env_idx, request.source, strict=True))
-    lived = _live_through(opened, request, snapshot, source, on_step)
-    put = [i for i in request.env_idx if i not in lived]
+    replayed = _replay_steps(opened, request, snapshot, source, on_step)
+    put = [i for i in request.env_idx if i not in replayed]
     report = RestoreReport((), {})
     with blamed("restore", opened.loaded, task):
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
-        if lived:
+        if replayed:
             # Of all of them together: what the task keeps for the batch belongs to the moment of all.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
@@ -67,19 +67,19 @@ def go_back(
             _, missed = restore_memory(env, snapshot.memory, every, positions, whole)
             report = RestoreReport((), {**missed, **_of_simulation(report)})
         step = task.rescore()
-    steps = max((len(request.ways[i].actions) for i in lived), default=0)
+    steps = max((len(request.ways[i].actions) for i in replayed), default=0)
     return step, Restored(
         request.env_idx,
         request.source,
         request.origin,
         request.undoes,
         report.not_carried,
-        how=_how(request, len(lived), len(put), steps),
-        lived_through=tuple(lived),
+        how=_how(request, len(replayed), len(put), steps),
+        replayed=tuple(replayed),
     )
 
 
-def _live_through(
+def _replay_steps(
     opened: OpenedTask,
     request: Restore,
     snapshot: Snapshot,
@@ -129,13 +129,13 @@ def _of_simulation(report: RestoreReport) -> dict[str, str]:
     return {what: why for what, why in report.not_carried.items() if what.startswith("fresh physics")}
 
 
-def _how(request: Restore, lived: int, put: int, steps: int) -> str:
-    if not lived or steps == 0:
+def _how(request: Restore, replayed: int, put: int, steps: int) -> str:
+    if not replayed or steps == 0:
         return ""
     again = f"{steps} steps were made again, and " if steps > 1 else "a step was made again, and "
     if not put:
         return f"{again}every body is where it was, to the last bit."
-    return f"{again}in {lived} of {lived + put} envs every body is where it was, to the last bit; the others were put there."
+    return f"{again}in {replayed} of {replayed + put} envs every body is where it was, to the last bit; the others were put there."
 
 
 def going_back(done: int, total: int) -> str:
@@ -143,7 +143,7 @@ def going_back(done: int, total: int) -> str:
     return f"going back: step {done} of {total}"
 
 
-def judge_moments(opened: OpenedTask, request: JudgeMoments) -> Judged:
+def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMoments:
     """Live through the moments of `request`, in order; stops at the first that raises, which is then told."""
     steps: list[StepResult] = []
     missed: dict[str, str] = {}
@@ -157,19 +157,19 @@ def judge_moments(opened: OpenedTask, request: JudgeMoments) -> Judged:
                 opened.env, opened.loaded, snapshot, moment.env_idx, moment.env_idx
             )
         except TaskError as error:
-            return Judged(tuple(steps), missed, error.problem)
+            return RescoredMoments(tuple(steps), missed, error.problem)
         steps.append(step)
         if len(moment.env_idx) == opened.env.num_envs:
             # With some of the envs what holds for the whole batch is never put back: neither was it in the record.
             missed |= report.not_carried
-    return Judged(tuple(steps), missed)
+    return RescoredMoments(tuple(steps), missed)
 
 
 # --- into a recording ----------------------------------------------------------------------------------
 
 
-def step_back(
-    opened: OpenedTask, request: StepBack, on_step: Callable[[int], None]
+def enter_recording(
+    opened: OpenedTask, request: EnterRecording, on_step: Callable[[int], None]
 ) -> tuple[StepResult, Restored]:
     """Let the envs of `request` stand at the last state of its run.
 
@@ -177,18 +177,22 @@ def step_back(
         TaskError: the task's code raised on the way; the envs stand somewhere on it.
     """
     run = request.run
-    step, arrival = arrive(opened, run, run.length, request.env_idx, on_step)
+    step, replay_result = arrive(opened, run, run.length, request.env_idx, on_step)
     source = request.env_idx
     where = f"{run.name}, step {run.length}"
     loaded = opened.loaded
     file = None if loaded.file is None else str(loaded.file)
     changed = changed_since(request.source_file, request.source, file, loaded.source)
-    said = f"{where} (changed since: {changed}): {how(arrival)}" if changed else f"{where}: {how(arrival)}"
+    said = (
+        f"{where} (changed since: {changed}): {how(replay_result)}"
+        if changed
+        else f"{where}: {how(replay_result)}"
+    )
     return step, Restored(
-        request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said, number=request.number
+        request.env_idx, source, NO_MOMENT, None, replay_result.missed, where, said, number=request.number
     )
 
 
-def going_there(request: StepBack, done: int) -> str:
+def going_there(request: EnterRecording, done: int) -> str:
     """For the status line, while it takes long."""
     return f"going to {request.run.name}: step {done} of {request.run.length}"

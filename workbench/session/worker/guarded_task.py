@@ -22,7 +22,7 @@ from workbench.jobs.open_task import OpenedTask
 from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.session.process.heartbeat import Doing, PulseWriter
 from workbench.session.process.interrupts import Interrupts
-from workbench.session.protocol.messages import Event, Failed, Load, Request, is_a_step
+from workbench.session.protocol.messages import Event, Load, LoadFailed, Request, is_a_step
 from workbench.session.protocol.questions import QUESTIONS
 from workbench.session.worker.step_events import StepEvents
 
@@ -82,7 +82,7 @@ class ServerLine:
         return [request for request in requests if not isinstance(request, Load) or request is loads[-1]]
 
 
-class HeldTask:
+class GuardedTask:
     """See the module's text."""
 
     def __init__(
@@ -160,7 +160,7 @@ class HeldTask:
 
     def fail(self, problem: Problem) -> None:
         """Tell the server, and stop playing."""
-        self.line.send(Failed(problem, kept=self.opened is not None))
+        self.line.send(LoadFailed(problem, kept=self.opened is not None))
         self._on_failure()
 
     def back_to_the_moment(self) -> None:

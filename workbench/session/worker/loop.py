@@ -50,11 +50,12 @@ from workbench.session.protocol.messages import (
     SCENE_KEPT,
     Cancel,
     DrawPast,
-    Failed,
+    EnterRecording,
     Inspect,
     ListenForDebugger,
     Load,
     Loaded,
+    LoadFailed,
     Loading,
     PlaceCamera,
     Play,
@@ -68,19 +69,24 @@ from workbench.session.protocol.messages import (
     Settings,
     SingleStep,
     Status,
-    StepBack,
     WarmUp,
 )
 from workbench.session.protocol.questions import (
     CameraQuestion,
     CaptureMoment,
-    JudgeMoments,
     MakeScene,
+    RescoreMoments,
     RunCameras,
 )
 from workbench.session.worker.cameras import WorkerCameras
-from workbench.session.worker.go_back import go_back, going_back, going_there, judge_moments, step_back
-from workbench.session.worker.guarded_task import HeldTask, ServerLine
+from workbench.session.worker.go_back import (
+    enter_recording,
+    go_back,
+    going_back,
+    going_there,
+    rescore_moments,
+)
+from workbench.session.worker.guarded_task import GuardedTask, ServerLine
 from workbench.session.worker.make_scene import SceneEnv
 from workbench.session.worker.pacing import Pacer, Rate, now_and_then
 from workbench.session.worker.reload import Running, load_version
@@ -99,7 +105,7 @@ class Worker:
         self._interrupts = Interrupts()
         self._line = ServerLine(connection, self._interrupts)
         self._steps = StepEvents()
-        self._held = HeldTask(self._line, self._interrupts, pulse, self._steps, self._pause)
+        self._held = GuardedTask(self._line, self._interrupts, pulse, self._steps, self._pause)
         self._cameras = WorkerCameras(self._held, self._on_first_picture)
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
@@ -125,7 +131,7 @@ class Worker:
             PlaceCamera: self._cameras.place,
             SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
             Restore: lambda request: self._held.guarded(partial(self._go, request)),
-            StepBack: lambda request: self._held.guarded(partial(self._go, request)),
+            EnterRecording: lambda request: self._held.guarded(partial(self._go, request)),
             DrawPast: self._cameras.draw_past,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
@@ -198,8 +204,8 @@ class Worker:
             return self._cameras.place_now(opened, question)
         if isinstance(question, Reset):
             return self._reset_envs(opened, question.env_idx, self._seeds(question))
-        if isinstance(question, JudgeMoments):
-            return judge_moments(opened, question)
+        if isinstance(question, RescoreMoments):
+            return rescore_moments(opened, question)
         if isinstance(question, CaptureMoment):
             return self._cameras.capture(opened, question)
         assert isinstance(question, Rescore)
@@ -224,7 +230,7 @@ class Worker:
             self._load_version(request, self._line.send)
         except TaskError as error:
             self._held.drop_steps_if_left(error)
-            self._line.send(Failed(error.problem, self._held.opened is not None, error.classes))
+            self._line.send(LoadFailed(error.problem, self._held.opened is not None, error.classes))
 
     def _load_version(self, request: Load, tell: Callable[[Loaded], None]) -> None:
         self._cameras.settle()
@@ -408,14 +414,14 @@ class Worker:
         assert step is not None
         return step
 
-    def _go(self, request: Restore | StepBack, opened: OpenedTask) -> None:
+    def _go(self, request: Restore | EnterRecording, opened: OpenedTask) -> None:
         self._cameras.settle()  # the envs get new scenes, with the same entities, and may make steps
         try:
             if isinstance(request, Restore):
                 step, restored = go_back(opened, request, self._tell_now_and_then(going_back))
             else:
                 tell = self._tell_now_and_then(partial(going_there, request))
-                step, restored = step_back(opened, request, tell)
+                step, restored = enter_recording(opened, request, tell)
         except TaskError:
             self._held.back_to_the_moment()
             raise
@@ -497,7 +503,7 @@ _DOING: dict[type, Doing] = {
     SingleStep: "stepping",
     Reset: "resetting",
     Restore: "resetting",
-    StepBack: "resetting",
+    EnterRecording: "resetting",
     ReadPolicyAgain: "importing the policy",
     WarmUp: "warming up",
     ListenForDebugger: "starting",

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from workbench.authoring.loading.load import LoadedTask, Refused, load_task, take_back, with_late_imports
+from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, take_back, with_late_imports
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.reference import class_beside
 from workbench.authoring.problem import Interrupted, TaskError
@@ -116,7 +116,7 @@ def _another(request: Load, tried: LoadedTask, error: TaskError, opening: Openin
     for name in tried.alternatives:
         opening.on_activity(f"trying {name}")
         loaded = load_task(class_beside(request.task, tried.file, name), source=request.source)
-        loaded = replace(loaded, in_place_of=Refused(tried.chosen, str(error)))
+        loaded = replace(loaded, in_place_of=RefusedClass(tried.chosen, str(error)))
         try:
             return build_task(loaded, request.options, replace(opening, clock=Clock()))
         except TaskError as further:
@@ -238,7 +238,7 @@ def _exchange(
             with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
                 left = rehearse_hooks(env, change.tried_hooks)
         clock.lap("rehearse")
-        first = running.last if change.level == "same" else _judge(task, loaded, running.last, change)
+        first = running.last if change.level == "same" else _rescore(task, loaded, running.last, change)
         if change.level != "same":
             keep_observation_space(env, task.obs)
     except BaseException:
@@ -275,12 +275,12 @@ def _place_now(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str
     return None if line is None else (row.file, line)
 
 
-def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
+def _rescore(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
     # Without an action no reward is given; it is computed all the same, or its mistakes would come out later.
     action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
     try:
         with blamed("step", loaded, task):
-            judged = task.rescore(action)
+            rescored = task.rescore(action)
     except TaskError as error:
         if change.hooks & RESET_HOOKS:
             raise _MustRebuild(
@@ -288,8 +288,8 @@ def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) 
             ) from error
         raise
     if last.action is None:
-        return replace(judged, reward=np.zeros_like(judged.reward), action=None)
-    return judged
+        return replace(rescored, reward=np.zeros_like(rescored.reward), action=None)
+    return rescored
 
 
 # --- another env ---------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import viser
 from workbench.authoring.loading.reference import TaskName
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.from_recording import (
-    CannotStepIn,
+    CannotEnterRecording,
     options_of,
     reference_of,
     run_of,
@@ -24,7 +24,7 @@ from workbench.jobs.from_recording import (
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files_in_words
-from workbench.session.clearance import Clearances, NotCleared, Wanted
+from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
 from workbench.session.review.view import ReviewView
 from workbench.ui.live.banners import is_busy_for_long
@@ -83,7 +83,7 @@ class _Way:
         return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
 
 
-class StepIn:
+class GoLive:
     """Continues recordings in a live env.
 
     If the recording's task is open already, its env (or all) gets the recorded state; else another session is opened
@@ -122,7 +122,7 @@ class StepIn:
             return
         try:
             run = run_of(one.episode, state)
-        except CannotStepIn as error:
+        except CannotEnterRecording as error:
             self._say(str(error))
             return
         info = one.episode.info
@@ -136,7 +136,7 @@ class StepIn:
         if there is not None:
             self._enter(there, way)
             return
-        wanted = Wanted(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
+        wanted = CodeToRun(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
         # An answer may take long, and the page's buttons share few threads.
         way.thread = threading.Thread(
             target=self._clear_and_go, args=(way, wanted), name="clear", daemon=True
@@ -155,13 +155,13 @@ class StepIn:
             task = None if known is None else known.view().task
             return known if task is not None and not why_not_into(task, info) else None
 
-    def _clear_and_go(self, way: _Way, wanted: Wanted) -> None:
+    def _clear_and_go(self, way: _Way, wanted: CodeToRun) -> None:
         folder: Path | None = None
         try:
             reference = self._clearances.clear(wanted, way.given_up.is_set)
             if wanted.recorded_text:
                 folder, reference = write_source(wanted.info)
-        except (CannotStepIn, NotCleared) as error:
+        except (CannotEnterRecording, NotCleared) as error:
             if not way.given_up.is_set():
                 self._say(sentence(str(error)))
             if self._way is way:
@@ -178,7 +178,7 @@ class StepIn:
     def _enter(self, session: Session, way: _Way) -> None:
         self._place.session = session
         way.problems = session.view().problem_serial
-        way.number = session.step_back(way.run, self.everywhere, way.info.source_file, way.info.source)
+        way.number = session.enter_recording(way.run, self.everywhere, way.info.source_file, way.info.source)
         way.session = session
 
     def _give_up(self) -> None:
@@ -247,12 +247,12 @@ class StepIn:
         tell_all(self._place.server, "This recording cannot be gone into", text, "red")
 
 
-class StepInPart(PagePart[ReviewView]):
+class GoLivePart(PagePart[ReviewView]):
     """Options of going live: which code, and into which envs."""
 
-    def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
-        self._step_in = step_in
-        step_in.review_is_back()
+    def __init__(self, server: viser.ViserServer, go_live: GoLive) -> None:
+        self._go_live = go_live
+        go_live.review_is_back()
         self._about: object = None
         """The recording and the code that the note below the code is about."""
         gui = server.gui
@@ -261,14 +261,14 @@ class StepInPart(PagePart[ReviewView]):
             self._code = gui.add_dropdown(
                 "Code",
                 (TODAYS, RECORDED),
-                initial_value=RECORDED if step_in.recorded_source else TODAYS,
+                initial_value=RECORDED if go_live.recorded_source else TODAYS,
                 hint="Today's code of the task, or the recorded text, opened from a folder that goes when you are done",
             )
             self._besides = gui.add_html("")
             self._envs = gui.add_dropdown(
                 "Into",
                 (ONE, ALL),
-                initial_value=ALL if step_in.everywhere else ONE,
+                initial_value=ALL if go_live.everywhere else ONE,
                 hint="Which envs are put into the recorded state",
             )
             self._home = gui.add_button(
@@ -276,24 +276,24 @@ class StepInPart(PagePart[ReviewView]):
             )
         self._code.on_update(lambda _: self._chosen())
         self._envs.on_update(lambda _: self._chosen())
-        self._home.on_click(lambda _: step_in.go_home())
+        self._home.on_click(lambda _: go_live.go_home())
 
     def draw(self, view: ReviewView) -> None:
-        self._step_in.change_pages_when_there()
-        home = self._step_in.can_go_home()
+        self._go_live.change_pages_when_there()
+        home = self._go_live.can_go_home()
         self._folder.visible = bool(view.opened) or home
         self._home.visible = home
         info = None if view.chosen is None else view.chosen.episode.info
-        if self._about != (info and info.id, self._step_in.recorded_source):
-            self._about = info and info.id, self._step_in.recorded_source
+        if self._about != (info and info.id, self._go_live.recorded_source):
+            self._about = info and info.id, self._go_live.recorded_source
             words = ""
-            if info is not None and self._step_in.recorded_source:
+            if info is not None and self._go_live.recorded_source:
                 words = side_files_in_words(info.source_file, info.side_files)
             self._besides.content = render("note", text=words) if words else ""
 
     def _chosen(self) -> None:
-        self._step_in.recorded_source = self._code.value == RECORDED
-        self._step_in.everywhere = self._envs.value == ALL
+        self._go_live.recorded_source = self._code.value == RECORDED
+        self._go_live.everywhere = self._envs.value == ALL
 
 
 def _end(session: Session, folder: Path | None) -> None:

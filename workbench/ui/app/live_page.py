@@ -18,7 +18,7 @@ from workbench.ui.live.env_panel import EnvPanel
 from workbench.ui.live.episodes_panel import RecordPanel
 from workbench.ui.live.inspect_panel import ForceArrows, InspectPanel
 from workbench.ui.live.log_panel import LogPanel
-from workbench.ui.live.rescored import JudgedAbove, JudgementPanel
+from workbench.ui.live.rescored import PastRescorePanel, RescoredAbove
 from workbench.ui.live.reward import CurvesPanel, NumbersPanel
 from workbench.ui.live.run_panel import RunPanel
 from workbench.ui.live.status_line import RulesMark, StatusLine
@@ -121,10 +121,10 @@ class Page:
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             reward = [
                 NumbersPanel(server),
-                JudgedAbove(server),
+                RescoredAbove(server),
                 CurvesPanel(server),
             ]
-            self._judgement = JudgementPanel(server, session)
+            self._rescored = PastRescorePanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
@@ -134,7 +134,7 @@ class Page:
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
         on_run = self._run, self._view_panel, version
-        return run_tab, [*on_run, self._studio, *reward, self._judgement, self._inspect, self._record, log]
+        return run_tab, [*on_run, self._studio, *reward, self._rescored, self._inspect, self._record, log]
 
     def _add_table_of_envs(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
@@ -267,7 +267,7 @@ class Page:
 
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
-        judgement = self._judgement
+        rescored = self._rescored
         return [
             Command("Review recordings", self._on_review, "V"),
             Command("Play or pause", run.toggle_play, "space"),
@@ -280,11 +280,11 @@ class Page:
             Command("What is live", timeline.go_live, "end"),
             Command("Go on from here, in the selected env", timeline.go_on, "G"),
             Command(
-                "To the next episode that is judged otherwise now", lambda: judgement.go_to_difference(1), "J"
+                "To the next episode that is judged otherwise now", lambda: rescored.go_to_difference(1), "J"
             ),
             Command(
                 "To the last episode that is judged otherwise now",
-                lambda: judgement.go_to_difference(-1),
+                lambda: rescored.go_to_difference(-1),
                 "J",
                 "shift",
             ),

@@ -17,7 +17,7 @@ from workbench.session.review.events import success_words
 from workbench.session.review.pictures import PictureReader
 from workbench.session.review.review import MOST_OPEN, Review
 from workbench.session.review.view import ReviewView, column_at
-from workbench.ui.app.go_live import StepInPart
+from workbench.ui.app.go_live import GoLivePart
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
 from workbench.ui.library.panel import LibraryPanel
@@ -109,11 +109,11 @@ class ReviewPage:
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
         """Returns the Review tab, which gets more content later, and the parts of all tabs."""
         server, review, place = self._server, self._review, self._place
-        library, step_in = place.shelf.library, place.step_in
+        library, go_live = place.shelf.library, place.go_live
         tabs = server.gui.add_tab_group()
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
         with review_tab:
-            self._panel = ReviewPanel(server, review, step_in.go, step_in.going)
+            self._panel = ReviewPanel(server, review, go_live.go, go_live.going)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
             self._cameras = CamerasPanel(
@@ -124,7 +124,7 @@ class ReviewPage:
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
             compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
-        with tabs.add_tab("Judge", viser.Icon.GAVEL):
+        with tabs.add_tab("PastRescorer", viser.Icon.GAVEL):
             self._rescore = RescorePanel(
                 server, place.rescorer, review, library, place.rescore_choices, place.task_files
             )
@@ -133,7 +133,7 @@ class ReviewPage:
             sharing = place.sharing
             share = sharing.part(server, library, self._library, self._make_way, self._other_unfolded)
         with review_tab:
-            going = StepInPart(server, step_in)
+            going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark)
         return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
@@ -156,7 +156,9 @@ class ReviewPage:
         )
         self._library.add_action(
             Action(
-                "Judge again", "Run today's reward and evaluate over them (J)", self._rescore.judge_and_tell
+                "Judge again",
+                "Run today's reward and evaluate over them (J)",
+                self._rescore.rescore_and_notify,
             )
         )
         self._library_window.dock_left()
@@ -203,7 +205,7 @@ class ReviewPage:
         self._status.content = render(
             "review_status",
             view=view,
-            going=self._place.step_in.going(),
+            going=self._place.go_live.going(),
             # `library_keys.js` disables these while the library is folded.
             library_keys=" ".join(self._library.keys),
             success_words=success_words,
@@ -326,16 +328,16 @@ class ReviewPage:
             Command("Frame what is shown", self._in_3d.frame, "F"),
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
-            Command("Judge again what is selected, or else what is open", self._judge_chosen, "J"),
-            Command("Go on live from here", self._panel.step_back, "G"),
+            Command("Judge again what is selected, or else what is open", self._rescore_chosen, "J"),
+            Command("Go on live from here", self._panel.enter_recording, "G"),
         ]
         if self._place.session is not None:
             commands.append(Command(BACK, self._go_back, "V"))
         return commands
 
-    def _judge_chosen(self) -> None:
+    def _rescore_chosen(self) -> None:
         opened = tuple(one.id for one in self._review.view().opened)
-        self._rescore.judge_and_tell(self._library.selected() or opened)
+        self._rescore.rescore_and_notify(self._library.selected() or opened)
 
     def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
         self._panel.lay_side_by_side()

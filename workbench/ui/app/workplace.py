@@ -20,12 +20,12 @@ from workbench.session.live.session import Session
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.recorded_scene import SceneProcess
 from workbench.session.review.review import Review
-from workbench.ui.app.go_live import MakeSession, StepIn
+from workbench.ui.app.go_live import GoLive, MakeSession
 from workbench.ui.app.review_page import ReviewPage
 from workbench.ui.app.trust_dialog import TrustDialog
 from workbench.ui.review.rescore import RescoreChoices
 from workbench.ui.scene.viewpoint import Stage
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.panel import Sharing
 from workbench.ui.widgets.hotkeys import Command
 
@@ -61,7 +61,7 @@ class Workplace:
 
     def __init__(
         self,
-        door: Door,
+        gated_server: GatedServer,
         recordings: Path,
         make_session: MakeSession,
         base: TaskOptions,
@@ -70,7 +70,7 @@ class Workplace:
         trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
     ) -> None:
-        self.server, self._recordings, self._tasks = door.server, recordings, tasks
+        self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
         self._imports, self._on_notice = base.imports, on_notice
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
@@ -81,9 +81,9 @@ class Workplace:
         """Shown by the live page when it is next built."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
-        self.step_in = StepIn(self, make_session, clearances, base)
+        self.go_live = GoLive(self, make_session, clearances, base)
         self.rescorer, self.rescore_choices = Rescorer(clearances, base), RescoreChoices()
-        self.sharing = Sharing(door)
+        self.sharing = Sharing(gated_server)
         self.stage = Stage(self.server)
         self.pages = Pages(self.server, self.stage, self._page)
 
@@ -133,7 +133,7 @@ class Workplace:
                     self._mending.join(timeout=10.0)
                 self._shelf.review.close()
                 self._shelf.library.close()
-        for part in (self.sharing, self.dialog, self.rescorer.judging, self.step_in):
+        for part in (self.sharing, self.dialog, self.rescorer.rescoring, self.go_live):
             part.close()
 
     def _page(self, which: Which, dark: bool) -> Page | ReviewPage:

@@ -77,7 +77,7 @@ class CameraCompare:
             other = camera.info.settings if choice == FILE else self._kept[camera.key]
             self._asked = (camera.key, camera.now, other, choice)
             self._pair.asked(self._session.view().studio.looked.compared)
-            self._session.studio.judging.compare(other)
+            self._session.studio.reports.compare(other)
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio

@@ -34,7 +34,7 @@ class CameraPick:
         # After a picture that is added to the container later.
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
-        self._press = presses.place_id("picture", session.studio.judging.pick)
+        self._press = presses.place_id("picture", session.studio.reports.pick)
         self._cross = line_set(server, "/picked/cross", MARK_COLOUR, 3.0)
         self._label = view_label(server, "/picked/label", "bottom-left")
 

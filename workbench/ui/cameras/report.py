@@ -33,7 +33,7 @@ class CameraReportPanel:
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
+        with server.gui.add_folder("PastRescorer", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
                 OVERS,
@@ -58,14 +58,14 @@ class CameraReportPanel:
                 visible=False,
                 hint="How many, each with a seed of its own.",
             )
-            self._judge = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
+            self._measure = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
             self._report = JobResult(server, session)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
             )
             self._pictures = JobResult(server, session)
             self._presses = Presses(server)
-        self._judge.on_click(lambda _: self._ask())
+        self._measure.on_click(lambda _: self._ask())
         self._sheet.on_click(lambda _: self._ask_for_sheet())
 
     # --- requests ------------------------------------------------------------------------------------
@@ -74,13 +74,13 @@ class CameraReportPanel:
         self._report.asked(self._session.view().studio.looked.report)
         over = self._over.value
         if over == STEPS:
-            self._session.studio.judging.judge_steps(self._steps.value)
+            self._session.studio.reports.measure_steps(self._steps.value)
         else:
-            self._session.studio.judging.judge(self._resets.value if over == FRESH else 0)
+            self._session.studio.reports.measure(self._resets.value if over == FRESH else 0)
 
     def _ask_for_sheet(self) -> None:
         self._pictures.asked(self._session.view().studio.looked.sheet)
-        self._session.studio.judging.make_sheet()
+        self._session.studio.reports.make_sheet()
 
     def _show_moment(self, position: int) -> None:
         moments = self._session.view().studio.looked.report_moments
@@ -115,7 +115,7 @@ class CameraReportPanel:
             assert camera is not None and report is not None, "drawn only then"
             return self._report_html(studio, camera, report, new)
 
-        told = studio.report_stale, looked.judging, None if camera is None else camera.now
+        told = studio.report_stale, looked.measuring, None if camera is None else camera.now
         self._report.draw(studio.progress, report, told, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
@@ -158,7 +158,7 @@ class CameraReportPanel:
         return render(
             "camera_report",
             stale=studio.report_stale,
-            before=looked.judging,
+            before=looked.measuring,
             new=new,
             over=over,
             how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "

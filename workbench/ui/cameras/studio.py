@@ -36,7 +36,7 @@ from workbench.ui.widgets.inputs import Control, refusals_told
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import render, sentence
 
-NOBODY = "none"
+NO_CAMERA = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
 KINDS = {"rgb": "colour", "segmentation": "bodies"}
 SCALES = {"own size": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
@@ -77,15 +77,15 @@ class StudioPanel(PagePart[SessionView]):
         self._server, self._session = server, session
         self._placing = Placing(session)
         self._keys: tuple[CameraKey, ...] = ()
-        self._names: dict[str, CameraKey | None] = {NOBODY: None}
+        self._names: dict[str, CameraKey | None] = {NO_CAMERA: None}
         self._in_its_eye = False
         self._is_empty = False
         """No camera is chosen, and everything below the choice is hidden."""
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
-        choices: tuple[str, ...] = (NOBODY,)
+        choices: tuple[str, ...] = (NO_CAMERA,)
         self._choice: Control[Any, Any] = Control(
-            gui.add_dropdown("Camera", choices, initial_value=NOBODY, visible=False),
+            gui.add_dropdown("Camera", choices, initial_value=NO_CAMERA, visible=False),
             read=lambda name: self._names.get(name),
             send=self.select,
             shown=self._name_of,
@@ -124,7 +124,7 @@ class StudioPanel(PagePart[SessionView]):
         self._session.studio.select(key)
 
     def _name_of(self, key: CameraKey | None) -> str | None:
-        return next((name for name, known in self._names.items() if known == key), NOBODY)
+        return next((name for name, known in self._names.items() if known == key), NO_CAMERA)
 
     # --- in the view -------------------------------------------------------------------------------------
 
@@ -189,7 +189,7 @@ class StudioPanel(PagePart[SessionView]):
         if keys != self._keys:
             self._keys = keys
             self._names = {
-                NOBODY: None,
+                NO_CAMERA: None,
                 **{f"{name} · {KIND_NAMES[kind]}": (kind, name) for kind, name in keys},
             }
             self._choice.handle.options = tuple(self._names)

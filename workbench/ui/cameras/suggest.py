@@ -126,7 +126,7 @@ class CameraSuggest:
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             self._offers.asked(self._session.view().studio.looked.suggestions)
-            self._session.studio.judging.suggest(wanted, *self._bounds(), self._resets.value)
+            self._session.studio.reports.suggest(wanted, *self._bounds(), self._resets.value)
 
     # --- drawing -------------------------------------------------------------------------------------
 

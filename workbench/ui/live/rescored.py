@@ -13,21 +13,21 @@ from workbench.jobs.verdict import Verdict, in_order
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text as words
-from workbench.session.rescore.background import JudgedView
-from workbench.session.rescore.past import JudgedCurve, PastRun
+from workbench.session.rescore.background import RescoreView
+from workbench.session.rescore.past import PastRun, RescoredCurve
 from workbench.ui.widgets.line_chart import part_round
 from workbench.ui.widgets.parts import PagePart
-from workbench.ui.widgets.rescored import JudgedPanel
+from workbench.ui.widgets.rescored import RescoredPanel
 from workbench.ui.widgets.templates import render
 
 TITLE = "The past, judged again"
 
 
-class JudgementPanel(JudgedPanel[SessionView, PastRun]):
+class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         super().__init__(server, "env")
         self._session = session
-        self._add_status("Stop judging", session.judge.stop)
+        self._add_status("Stop judging", session.rescorer.stop)
         names: tuple[str, ...] = ("reward",)
         self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Curve",
@@ -45,27 +45,27 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
     def key(self, view: SessionView) -> object:
         past = view.timeline
         chosen = self._name.value, self._pages.first
-        return view.judgement.serial, view.selected_env, past.shown, past.first, *chosen
+        return view.rescored.serial, view.selected_env, past.shown, past.first, *chosen
 
     def draw(self, view: SessionView) -> None:
-        judged = view.judgement
+        rescored = view.rescored
         self._shown, self._first = (view.selected_env, view.timeline.shown), view.timeline.first
-        if judged.state == "none":
+        if rescored.state == "none":
             self._pages.go_to(0)
-        self._draw_status(judged, TITLE)
-        if judged.verdicts is not self._verdicts:
-            self._verdicts = judged.verdicts
-            self._listed = in_order([verdict for verdict in judged.verdicts if verdict.differs])
+        self._draw_status(rescored, TITLE)
+        if rescored.verdicts is not self._verdicts:
+            self._verdicts = rescored.verdicts
+            self._listed = in_order([verdict for verdict in rescored.verdicts if verdict.differs])
         self._draw_list(self._listed)
-        self._draw_curve(judged, view)
+        self._draw_curve(rescored, view)
 
-    def _draw_curve(self, judged: JudgedView, view: SessionView) -> None:
-        names, env = judged.names, view.selected_env
+    def _draw_curve(self, rescored: RescoreView, view: SessionView) -> None:
+        names, env = rescored.names, view.selected_env
         if names and self._name.options != names:
             self._name.options = names
         name = self._name.value
-        differs = bool(self._listed or judged.differing_names)
-        curve = self._session.judge.curve(name, env) if differs else None
+        differs = bool(self._listed or rescored.differing_names)
+        curve = self._session.rescorer.curve(name, env) if differs else None
         self._name.visible = curve is not None
         if curve is None:
             self._chart.hide()
@@ -109,7 +109,7 @@ def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
     return verdict.of.env, verdict.of.at(verdict.look_at)
 
 
-def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
+def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, ...]:
     """Data for uPlot: x, the recorded curve, the new curve, and a dot at the shown moment, if any.
 
     Of a long curve the newest part, or the part around the shown moment.
@@ -122,24 +122,24 @@ def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
     return x, old, new, np.where(curve.serial[part] == shown, np.where(np.isnan(new), old, new), np.nan)
 
 
-def in_a_line(judged: JudgedView) -> str:
+def in_a_line(rescored: RescoreView) -> str:
     """Summary in one line; empty while there is nothing to report."""
-    if judged.state == "loading":
+    if rescored.state == "loading":
         return "The past is judged again: loading the new code"
-    if judged.state == "judging":
+    if rescored.state == "rescoring":
         # In tenths: each change is sent to the page.
-        return f"The past is judged again: {10 * int(10 * judged.done / max(1, judged.total))} %"
-    if judged.state == "done":
-        return f"{TITLE}: {words.headline(judged.verdicts, others=judged.differing_names)}"
-    return f"{TITLE}: {judged.why}" if judged.why else ""
+        return f"The past is judged again: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
+    if rescored.state == "done":
+        return f"{TITLE}: {words.headline(rescored.verdicts, others=rescored.differing_names)}"
+    return f"{TITLE}: {rescored.why}" if rescored.why else ""
 
 
-class JudgedAbove(PagePart[SessionView]):
+class RescoredAbove(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer) -> None:
         self._line = server.gui.add_html("", visible=False)
 
     def draw(self, view: SessionView) -> None:
-        says = in_a_line(view.judgement)
+        says = in_a_line(view.rescored)
         self._line.visible = bool(says)
         if says:
-            self._line.content = render("judged_above", says=says)
+            self._line.content = render("rescored_above", says=says)

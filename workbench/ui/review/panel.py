@@ -52,7 +52,7 @@ class ReviewPanel(PagePart[ReviewView]):
             visible=False,
             hint="Restores the state that is shown in the live env, with today's code (G).",
         )
-        self._live.on_click(lambda _: self.step_back())
+        self._live.on_click(lambda _: self.enter_recording())
         self._speed = Control(
             gui.add_dropdown("Speed", tuple(SPEED_NAMES), initial_value="1 ×", visible=False),
             read=lambda value: SPEED_NAMES[value],
@@ -92,7 +92,7 @@ class ReviewPanel(PagePart[ReviewView]):
     def lay_side_by_side(self) -> None:
         self._arrange.value = GRID
 
-    def step_back(self) -> None:
+    def enter_recording(self) -> None:
         view = self._review.view()
         if view.chosen is not None:
             self._on_step_back(view.chosen.id, view.states[view.selected])

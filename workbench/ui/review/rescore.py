@@ -23,7 +23,7 @@ from workbench.session.review.review import Review
 from workbench.session.review.view import ReviewView
 from workbench.ui.widgets.inputs import tell_all
 from workbench.ui.widgets.line_chart import part_round
-from workbench.ui.widgets.rescored import JudgedPanel
+from workbench.ui.widgets.rescored import RescoredPanel
 from workbench.ui.widgets.templates import counted, render
 
 TODAYS, RECORDED = "today's", "as recorded"
@@ -101,7 +101,7 @@ def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
     return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
 
 
-class RescorePanel(JudgedPanel[ReviewView, Source]):
+class RescorePanel(RescoredPanel[ReviewView, Source]):
     """The panel in the present container.
 
     Args:
@@ -129,7 +129,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         self._library, self._choices, self._known = library, choices, known
         gui = server.gui
         self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
-        self._begin.on_click(lambda _: self.judge([one.id for one in review.view().opened]))
+        self._begin.on_click(lambda _: self.rescore([one.id for one in review.view().opened]))
         self._codes = codes_for((), ())
         self._codes_of: object = None
         labels = tuple(code.label for code in self._codes)
@@ -147,21 +147,21 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
             hint="Put the recorded state in after every step, so that nothing drifts from the record",
         )
         self._states.on_update(lambda _: self._chosen())
-        self._add_status("Stop", rescorer.judging.stop)
+        self._add_status("Stop", rescorer.rescoring.stop)
         self._add_list()
         self._add_chart()
         self._selected: str | None = None
 
-    def judge_and_tell(self, ids: Sequence[str]) -> None:
-        """As `judge`, for a press from where the tab is not seen."""
+    def rescore_and_notify(self, ids: Sequence[str]) -> None:
+        """As `rescore`, for a press from where the tab is not seen."""
         if not ids:
             tell_all(self._server, "Nothing to judge", "No recording is selected or open.")
             return
-        self.judge(ids)
+        self.rescore(ids)
         title = f"Judging {counted(len(ids), 'recording')} again"
         tell_all(self._server, title, "What is otherwise now is listed under Judge.", None, 4.0)
 
-    def judge(self, ids: Sequence[str]) -> None:
+    def rescore(self, ids: Sequence[str]) -> None:
         """Begin with these recordings of the library."""
         files = episode_files(self._library, ids)
         self._selected = None
@@ -180,7 +180,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
     # --- drawing -----------------------------------------------------------------------------------
 
     def key(self, view: ReviewView) -> object:
-        at = self._rescorer.judging.view.serial, view.opened_serial, view.selected
+        at = self._rescorer.rescoring.view.serial, view.opened_serial, view.selected
         return *at, self._pages.first, self._selected, self._codes_are_of(view)
 
     def _codes_are_of(self, view: ReviewView) -> object:
@@ -189,7 +189,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
 
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
-        told = self._rescorer.judging.view
+        told = self._rescorer.rescoring.view
         self._begin.visible = bool(view.opened) and told.state not in RUNNING
         self._draw_status(told, idle=IDLE)
         self._draw_list(in_order(told.verdicts))

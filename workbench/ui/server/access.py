@@ -14,7 +14,7 @@ _AUTHORITY = re.compile(r"(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]
 
 
 @dataclass(frozen=True)
-class Gate:
+class AccessRules:
     """The token and the host names of this server.
 
     The page drives the author's machine: it runs their code, reads their files and writes into their source. A server
@@ -24,7 +24,7 @@ class Gate:
     """
 
     token: str | None
-    """None: no token is needed (loopback only, see `DoorOptions`)."""
+    """None: no token is needed (loopback only, see `ServerOptions`)."""
     names: frozenset[str] = frozenset()
     """Lower-case host names and addresses, without a port, that are ours; loopback always is."""
     any_address: bool = False
@@ -32,7 +32,7 @@ class Gate:
 
 
 @dataclass(frozen=True)
-class Asked:
+class RequestParts:
     """The parts of a request that the gate looks at. Each header is the list of all its values: a header that is sent
     twice tries to make two programs read two different things."""
 
@@ -123,16 +123,16 @@ def is_loopback(host: str) -> bool:
     return host == "localhost" if address is None else address.is_loopback
 
 
-def host_is_ours(gate: Gate, host: str) -> bool:
+def host_is_ours(rules: AccessRules, host: str) -> bool:
     """Whether ``host`` is a name of this server.
 
     The port is not compared: ``ssh -L 9000:localhost:8080`` and a container's port map make the browser say another
     one. That is safe: rebinding makes a *foreign name* point here, and no attacker can re-point ``localhost`` or a
     bare IP address.
     """
-    if is_loopback(host) or host in gate.names:
+    if is_loopback(host) or host in rules.names:
         return True
-    return gate.any_address and _address(host) is not None
+    return rules.any_address and _address(host) is not None
 
 
 def cookie_name(port: int) -> str:
@@ -171,7 +171,7 @@ def _without_token(path: str) -> str:
     return plain + ("?" + urlencode(rest) if rest else "")
 
 
-def decide(gate: Gate, asked: Asked) -> Decision:
+def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     """Decide on one request or handshake. Never raises, for any client input.
 
     Checked in this order. *Host*: is the name ours? A rebound name cannot fake this. *Origin*: does the asking page
@@ -180,10 +180,10 @@ def decide(gate: Gate, asked: Asked) -> Decision:
     read and that other sites' pages do not send.
 
     Not stopped: cookies know hosts but no ports, so another *server* that the author visits under the same host name
-    gets our cookie too. No cookie attribute prevents that; on a shared machine use a Unix socket (`DoorOptions.socket`).
+    gets our cookie too. No cookie attribute prevents that; on a shared machine use a Unix socket (`ServerOptions.socket`).
     """
     host = split_authority(asked.host[0]) if len(asked.host) == 1 else None
-    if host is None or not host_is_ours(gate, host[0]):
+    if host is None or not host_is_ours(rules, host[0]):
         return RefusedRequest(
             Why.NAME,
             "It asked for this page under a name that the workbench does not know as its own. "
@@ -201,22 +201,22 @@ def decide(gate: Gate, asked: Asked) -> Decision:
     if foreign and not opened_by_link and not asked.websocket:
         return RefusedRequest(Why.SITE, "It was made by a page of another site.")
 
-    if gate.token is None:
+    if rules.token is None:
         return Admitted(asked.host[0])
 
     # The browser's port, not ours: behind ssh -L they differ.
     name = cookie_name(host[1] or 80)
     tokens = [value for key, value in parse_qsl(asked.path.partition("?")[2]) if key == "token"]
     if tokens and not asked.websocket:
-        if len(tokens) > 1 or not _equal(tokens[0], gate.token):
+        if len(tokens) > 1 or not _equal(tokens[0], rules.token):
             return RefusedRequest(Why.OTHER_TOKEN, _OTHER_TOKEN)
         return Entered(
             location=_without_token(asked.path),
-            set_cookie=f"{name}={gate.token}; Path=/; HttpOnly; SameSite=Strict",
+            set_cookie=f"{name}={rules.token}; Path=/; HttpOnly; SameSite=Strict",
             by_page=foreign,
         )
     shown = _cookies(asked.cookie, name)
-    if any(_equal(value, gate.token) for value in shown):
+    if any(_equal(value, rules.token) for value in shown):
         return Admitted(asked.host[0])
     if shown:
         return RefusedRequest(Why.OTHER_TOKEN, _OTHER_TOKEN)

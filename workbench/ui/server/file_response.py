@@ -20,7 +20,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 if TYPE_CHECKING:
-    from workbench.ui.server.gated_server import Door
+    from workbench.ui.server.gated_server import GatedServer
 
 BLOCK = 1 << 18
 """Bytes read and sent at a time."""
@@ -134,17 +134,17 @@ _POLICY = {
 
 
 class Downloads:
-    """The files that a page may fetch. One for each `Door`.
+    """The files that a page may fetch. One for each `GatedServer`.
 
     A browser never sends a path: it gets an address with a random part, made for one file, and the file is looked up
     by that part alone. The name behind it is for people (and for rerun, which tells a recording by its suffix).
     """
 
-    def __init__(self, door: Door) -> None:
+    def __init__(self, gated_server: GatedServer) -> None:
         self._lock = threading.Lock()
         self._files: dict[str, FileReply] = {}
         self._ids: dict[FileReply, str] = {}
-        door.add_route(PREFIX, self._answer, headers=_POLICY)
+        gated_server.add_route(PREFIX, self._answer, headers=_POLICY)
 
     def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
         """The address of a file, from the root of the server; always the same for the same file.

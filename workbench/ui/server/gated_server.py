@@ -17,14 +17,14 @@ from websockets.http11 import Request, Response
 
 from workbench.machine.web_assets import web_assets_folder
 from workbench.ui.server import access, viser_private
-from workbench.ui.server.listening import DEFAULT_PORT, DoorError, Listening, listen_on_file, listen_on_port
+from workbench.ui.server.listening import DEFAULT_PORT, Listening, ServerError, listen_on_file, listen_on_port
 from workbench.ui.server.responses import (
     Handler,
     admitted_reply,
-    asked_of,
     entered_reply,
     folder_handler,
     refusals,
+    request_parts,
 )
 from workbench.ui.server.strangers import Connection, RareLog, of_peer
 
@@ -41,7 +41,7 @@ TURNED_AWAY = {
 
 
 @dataclass(frozen=True)
-class DoorOptions:
+class ServerOptions:
     """Where the page is served, and who may open it."""
 
     host: str = "127.0.0.1"
@@ -77,15 +77,15 @@ class DoorOptions:
 
 
 @dataclass
-class Door:
-    """The running server. Make it with `open_door`.
+class GatedServer:
+    """The running server. Make it with `open_server`.
 
     viser by itself listens on every interface, knows no token, checks no Origin, moves to another port silently, lets
     any client publish the page through a tunnel and trusts every value of a client. The page it serves runs the
     author's code. One port suits work over ssh: one ``ssh -L`` line carries all of it.
     """
 
-    options: DoorOptions
+    options: ServerOptions
     server: viser.ViserServer
     port: int
     """The bound port."""
@@ -96,7 +96,7 @@ class Door:
     notice: str | None
     """For the terminal: the page is on another port than usual. None if it is not."""
     _listening: Listening = field(repr=False)
-    _doorkeeper: _Doorkeeper = field(repr=False)
+    _access_check: _AccessCheck = field(repr=False)
     _gated: viser_private.GatedViser = field(repr=False)
     _routes: dict[str, tuple[Handler, Mapping[str, str]]] = field(repr=False)
     _closed: bool = field(default=False, repr=False)
@@ -104,7 +104,7 @@ class Door:
     @property
     def turned_away(self) -> int:
         """Number of requests refused so far."""
-        return self._doorkeeper.turned_away
+        return self._access_check.turned_away
 
     def add_route(self, prefix: str, handler: Handler, headers: Mapping[str, str] | None = None) -> None:
         """Answer GET requests below ``prefix`` (``/recordings/``), behind the same checks. The longest prefix wins.
@@ -131,7 +131,7 @@ class Door:
     def addresses(self, path: str = "/") -> tuple[str, ...]:
         """The addresses, with the token, of ``path`` (from the root: ``/rerun/...``): for a browser on this machine,
         then for those on other machines (none on loopback; which of them works depends on their network)."""
-        token = self._doorkeeper.gate.token
+        token = self._access_check.rules.token
         shown = f"?token={token}" if token else ""
         hosts = dict.fromkeys((self._listening.host, *self._listening.hosts_elsewhere()))
         return tuple(f"http://{host}:{self.port}{path}{shown}" for host in hosts)
@@ -146,7 +146,7 @@ class Door:
         if not self.options.token:
             raise ValueError("This page asks for no token; there is none to renew.")
         token = secrets.token_urlsafe(32)
-        self._doorkeeper.gate = replace(self._doorkeeper.gate, token=token)
+        self._access_check.rules = replace(self._access_check.rules, token=token)
         self._gated.close_pages("the token was renewed")
         return self.url
 
@@ -158,14 +158,14 @@ class Door:
         atexit.unregister(self.close)
         self._gated.stop()
         self._listening.remove()
-        self._doorkeeper.say_the_rest()
+        self._access_check.say_the_rest()
 
 
-class _Doorkeeper:
+class _AccessCheck:
     """Decides on each request, answers it, and reports refused ones in the terminal."""
 
-    def __init__(self, the_gate: access.Gate, example: str, told: RareLog) -> None:
-        self.gate = the_gate
+    def __init__(self, rules: access.AccessRules, example: str, told: RareLog) -> None:
+        self.rules = rules
         self.turned_away = 0
         self.tells = False
         self._refuse = refusals(example)
@@ -178,8 +178,8 @@ class _Doorkeeper:
         connection: ServerConnection,
         request: Request,
     ) -> Response | None:
-        asked = asked_of(request)
-        verdict = access.decide(self.gate, asked)
+        asked = request_parts(request)
+        verdict = access.decide(self.rules, asked)
         if isinstance(verdict, access.RefusedRequest):
             self._count(verdict, connection)
             return self._refuse(verdict.reason)
@@ -207,7 +207,7 @@ class _Doorkeeper:
             self._told.happened(refused.why, TURNED_AWAY[refused.why].format(of_peer(peer)))
 
 
-def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) -> Door:
+def open_server(options: ServerOptions = ServerOptions(), label: str | None = None) -> GatedServer:
     """Serve viser's page behind the checks of `access`.
 
     Binds the socket itself (so that the printed address is the bound one) and tests itself with a request that must be
@@ -225,9 +225,9 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
     else:
         listening = listen_on_file(options.socket, options.port)
     token = secrets.token_urlsafe(32) if options.token else None
-    the_gate = access.Gate(token=token, names=_our_names(options), any_address=not listening.loopback)
+    rules = access.AccessRules(token=token, names=_our_names(options), any_address=not listening.loopback)
     told = RareLog()
-    keeper = _Doorkeeper(the_gate, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
+    keeper = _AccessCheck(rules, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
 
     def wrap(viser_hook: viser_private.Hook) -> viser_private.AsyncHook:
@@ -238,7 +238,7 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
     except BaseException:
         listening.remove()
         raise
-    door = Door(
+    gated_server = GatedServer(
         options=options,
         server=gated.server,
         port=listening.port,
@@ -254,29 +254,29 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         if listening.path is not None or options.port in (0, listening.port)
         else f"Port {options.port} is taken by another program, so this page is on port {listening.port}.",
         _listening=listening,
-        _doorkeeper=keeper,
+        _access_check=keeper,
         _gated=gated,
         _routes=routes,
     )
     # Runs before viser's own exit handler, which prints "Server stopped" into the author's terminal.
-    atexit.register(door.close)
+    atexit.register(gated_server.close)
     try:
-        _try_own_door(listening)
+        _test_refusal(listening)
     except BaseException:
-        door.close()
+        gated_server.close()
         raise
     keeper.tells = True
-    door.add_route("/workbench/", folder_handler(web_assets_folder()))
-    return door
+    gated_server.add_route("/workbench/", folder_handler(web_assets_folder()))
+    return gated_server
 
 
-def _our_names(options: DoorOptions) -> frozenset[str]:
+def _our_names(options: ServerOptions) -> frozenset[str]:
     own = socket.gethostname()
     split = (access.split_authority(name) for name in (options.host, own, f"{own}.local"))
     return frozenset(name[0] for name in split if name is not None)
 
 
-def _try_own_door(listening: Listening) -> None:
+def _test_refusal(listening: Listening) -> None:
     """Send a request as from a rebound name: it must be refused, or the checks are not in front of viser.
 
     Raises:
@@ -290,7 +290,7 @@ def _try_own_door(listening: Listening) -> None:
     finally:
         knock.close()
     if status != 403:
-        raise DoorError(
+        raise ServerError(
             f"The page is not protected: a request that must be refused got {status}. "
             f"It is written for viser {viser_private.WRITTEN_FOR} and {viser.__version__} is installed; install "
             f"viser=={viser_private.WRITTEN_FOR}."

@@ -23,7 +23,7 @@ LONGEST_PATH = 107
 BACKLOG = 100
 
 
-class DoorError(RuntimeError):
+class ServerError(RuntimeError):
     """The page cannot be served. The message says what to do."""
 
 
@@ -99,18 +99,18 @@ def listen_on_port(host: str, port: int) -> Listening:
             asked, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError) as error:
-        raise DoorError(f"Cannot listen on {host}: {error}. Give an address of this machine.") from None
+        raise ServerError(f"Cannot listen on {host}: {error}. Give an address of this machine.") from None
     last = min(port + PORTS_TO_TRY, 65536) if port == DEFAULT_PORT else port + 1
     for candidate in range(port, last):
         try:
             made = socket.create_server((address[0], candidate), family=family, backlog=BACKLOG)
         except PermissionError:
-            raise DoorError(
+            raise ServerError(
                 f"Port {candidate} needs root's rights; give one from 1024 on with --port."
             ) from None
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
-                raise DoorError(
+                raise ServerError(
                     f"Cannot listen on {host}: {error.strerror}. Give an address of this machine."
                 ) from None
             continue
@@ -118,8 +118,8 @@ def listen_on_port(host: str, port: int) -> Listening:
         loopback = ipaddress.ip_address(bound.partition("%")[0]).is_loopback
         return Listening(made, _reach(bound), bound_port, bound, loopback)
     if port == DEFAULT_PORT:
-        raise DoorError(f"Ports {port} to {last - 1} are all taken; --port 0 takes any free one.")
-    raise DoorError(f"Port {port} is taken by another program; give another with --port, or 0 for any.")
+        raise ServerError(f"Ports {port} to {last - 1} are all taken; --port 0 takes any free one.")
+    raise ServerError(f"Port {port} is taken by another program; give another with --port, or 0 for any.")
 
 
 def listen_on_file(path: Path, port: int) -> Listening:
@@ -138,7 +138,7 @@ def listen_on_file(path: Path, port: int) -> Listening:
     folder = path.expanduser().absolute().parent.resolve()
     place = folder / path.name
     if len(os.fsencode(place)) > LONGEST_PATH:
-        raise DoorError(f"The path of a socket has at most {LONGEST_PATH} bytes; {place} is longer.")
+        raise ServerError(f"The path of a socket has at most {LONGEST_PATH} bytes; {place} is longer.")
     made = socket.socket(socket.AF_UNIX)
     try:
         with _alone_in(folder):
@@ -152,8 +152,8 @@ def listen_on_file(path: Path, port: int) -> Listening:
             )
     except OSError as error:
         made.close()
-        raise DoorError(f"Cannot make the socket {place}: {error.strerror}.") from None
-    except DoorError:
+        raise ServerError(f"Cannot make the socket {place}: {error.strerror}.") from None
+    except ServerError:
         made.close()
         raise
 
@@ -164,14 +164,14 @@ def _alone_in(folder: Path) -> Iterator[None]:
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except (FileNotFoundError, NotADirectoryError):
-        raise DoorError(
+        raise ServerError(
             f"There is no folder {folder} for the socket; mkdir -m 700 {folder} makes one that is yours alone."
         ) from None
     try:
         found = os.fstat(handle)
         others_write = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
         if found.st_uid not in (os.getuid(), 0) or others_write:
-            raise DoorError(
+            raise ServerError(
                 f"Others can write into {folder}, and could put a socket of theirs in place of this one. Give a "
                 "folder that is yours alone, such as one made with mkdir -m 700."
             )
@@ -187,7 +187,7 @@ def _make_room(place: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.getuid():
-        raise DoorError(
+        raise ServerError(
             f"{place} is there, and is not a socket of yours. It is left alone; give another path."
         )
     with socket.socket(socket.AF_UNIX) as client:
@@ -199,7 +199,7 @@ def _make_room(place: Path) -> None:
             return
         except OSError:  # it listens, too busy to answer
             pass
-    raise DoorError(f"Another program listens at {place}, a workbench perhaps; give another path.")
+    raise ServerError(f"Another program listens at {place}, a workbench perhaps; give another path.")
 
 
 def _reach(host: str) -> str:

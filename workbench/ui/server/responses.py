@@ -55,10 +55,10 @@ LONGEST_PATH = 3000
 _log = logging.getLogger("workbench.door")
 
 
-def asked_of(request: Request) -> access.Asked:
+def request_parts(request: Request) -> access.RequestParts:
     """The parts of a request that `access` checks."""
     get = request.headers.get_all
-    return access.Asked(
+    return access.RequestParts(
         path=request.path,
         host=get("Host"),
         origin=get("Origin"),

@@ -31,7 +31,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
-from workbench.ui.server.listening import DoorError
+from workbench.ui.server.listening import ServerError
 from workbench.ui.server.page_guard import PageGuard
 from workbench.ui.server.strangers import Connection, RareLog, Strangers, close_when_stalled
 
@@ -158,8 +158,8 @@ def _page_is_known() -> bool:
     return page.is_file() and hashlib.sha256(page.read_bytes()).hexdigest() == PAGE_SHA256
 
 
-def _moved(what: str) -> DoorError:
-    return DoorError(
+def _moved(what: str) -> ServerError:
+    return ServerError(
         f"The page cannot be made safe: {what}. The workbench needs viser {WRITTEN_FOR}, and viser {viser.__version__} is "
         f"installed; install viser=={WRITTEN_FOR}."
     )

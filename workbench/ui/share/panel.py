@@ -21,7 +21,7 @@ from workbench.recording.library.library import Library
 from workbench.session.review.view import ReviewView
 from workbench.ui.library.panel import LibraryPanel
 from workbench.ui.server.file_response import Downloads
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView, What, file_name
 from workbench.ui.share.rerun_view import RerunPages, RerunView
 from workbench.ui.widgets.parts import PagePart
@@ -200,11 +200,11 @@ def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
 
 
 class Sharing:
-    """Downloads, rerun and work in progress: what outlives the pages. One for each `Door`."""
+    """Downloads, rerun and work in progress: what outlives the pages. One for each `GatedServer`."""
 
-    def __init__(self, door: Door) -> None:
-        self._offers = Downloads(door)
-        self._rerun = RerunPages(door, self._offers)
+    def __init__(self, gated_server: GatedServer) -> None:
+        self._offers = Downloads(gated_server)
+        self._rerun = RerunPages(gated_server, self._offers)
         self._making = Making()
 
     def part(

@@ -18,7 +18,7 @@ from workbench.machine.web_assets import web_assets_folder
 from workbench.recording.reader.reading import told_rerun
 from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
 from workbench.ui.server.file_response import Downloads, FileReply
-from workbench.ui.server.gated_server import Door
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.templates import render
 
@@ -37,7 +37,7 @@ _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 
 
 class RerunPages:
-    """The addresses under which rerun shows recordings. One for each `Door`.
+    """The addresses under which rerun shows recordings. One for each `GatedServer`.
 
     rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its makers.
     Here it comes from the wheel that wrote the recordings (so file and viewer have one version), packed, under the
@@ -51,14 +51,14 @@ class RerunPages:
     recording has come. A rerun without that message opens at the first step.
     """
 
-    def __init__(self, door: Door, offers: Downloads) -> None:
+    def __init__(self, gated_server: GatedServer, offers: Downloads) -> None:
         self._offers = offers
         self._lock = threading.Lock()
         self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}
         self._keys: dict[tuple[Path, ...], str] = {}
         headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
-        door.add_route(_VIEWER, _viewer_file, headers)
-        door.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
+        gated_server.add_route(_VIEWER, _viewer_file, headers)
+        gated_server.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
 
     def address(self, recordings: Sequence[Path], moments: Callable[[], Moments] = dict) -> str:
         """The address, from the root of the server, that opens these ``.rrd`` files together.

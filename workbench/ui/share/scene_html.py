@@ -16,7 +16,7 @@ from workbench.recording.films import Eye, usual_eye
 from workbench.session.review.events import success_words
 from workbench.ui.scene.bodies import SceneView
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.server.gated_server import DoorOptions, open_door
+from workbench.ui.server.gated_server import ServerOptions, open_server
 from workbench.ui.widgets.templates import counted, render
 
 TRIANGLES = 80_000
@@ -54,11 +54,11 @@ def write_scene_html(
     eye = eye or usual_eye(episode)
     with new_file(path) as temporary:
         # viser needs a running server; its address is never shown.
-        door = open_door(DoorOptions(port=0))
+        gated_server = open_server(ServerOptions(port=0))
         try:
-            page = _recorded(door.server, episode, eye, on_progress)
+            page = _recorded(gated_server.server, episode, eye, on_progress)
         finally:
-            door.close()
+            gated_server.close()
         title = f"{episode.info.task}, {counted(episode.length, 'step')}"
         page = page.replace("</body>", _caption(episode) + "</body>", 1)
         page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{html.escape(title)}</title>", page, count=1)

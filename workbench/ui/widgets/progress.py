@@ -9,7 +9,7 @@ from typing import ClassVar
 import viser
 
 from workbench.session.live.session import Session
-from workbench.session.process.job_lane import Progress
+from workbench.session.process.job_lane import JobProgress
 from workbench.ui.widgets.templates import render
 
 JUST = 1.0
@@ -55,7 +55,7 @@ class JobResult:
         gui = server.gui
         self._bar = gui.add_html("", visible=False)
         self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        self._stop.on_click(lambda _: session.studio.judging.stop())
+        self._stop.on_click(lambda _: session.studio.reports.stop())
         self._html = gui.add_html("", visible=False)
         self._began: float | None = None
         self._new = NewResult()
@@ -66,7 +66,9 @@ class JobResult:
         JobResult._asked_last = self
         self._new.asked(now)
 
-    def draw(self, running: Progress | None, came: object, told: object, html: Callable[[bool], str]) -> None:
+    def draw(
+        self, running: JobProgress | None, came: object, told: object, html: Callable[[bool], str]
+    ) -> None:
         """Draw the bar and the result, where they changed.
 
         Args:
@@ -82,7 +84,7 @@ class JobResult:
             if came:
                 self._html.content = html(new)
 
-    def _draw_bar(self, running: Progress | None) -> None:
+    def _draw_bar(self, running: JobProgress | None) -> None:
         if running is None or JobResult._asked_last is not self:
             self._began = None
         elif self._began is None:

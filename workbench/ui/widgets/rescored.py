@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from workbench.jobs.verdict import Verdict
 from workbench.session.rescore import verdict_text as words
-from workbench.session.rescore.background import RUNNING, JudgedView
+from workbench.session.rescore.background import RUNNING, RescoreView
 from workbench.ui.widgets.click_targets import Paged, Presses
 from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
 from workbench.ui.widgets.parts import PagePart
@@ -23,7 +23,7 @@ View = TypeVar("View")
 Of = TypeVar("Of")
 
 
-class JudgedPanel(PagePart[View], Generic[View, Of]):
+class RescoredPanel(PagePart[View], Generic[View, Of]):
     """Its parts, to be put into the present container in an order of its own; a row of the list goes to its run.
 
     Args:
@@ -54,11 +54,11 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
     def _add_chart(self) -> None:
         self._chart = LineChart(self._server, self._server.gui.add_folder(None), height=160)
 
-    def _draw_status(self, judged: JudgedView, title: str = "", idle: str = "") -> None:
-        self._failed_since = judged.why if judged.state == "failed" else ""
-        self._stop.visible = judged.state in RUNNING
-        self._status.visible = judged.state != "none" or bool(idle)
-        self._status.content = status_html(judged, title, idle, self.advice)
+    def _draw_status(self, rescored: RescoreView, title: str = "", idle: str = "") -> None:
+        self._failed_since = rescored.why if rescored.state == "failed" else ""
+        self._stop.visible = rescored.state in RUNNING
+        self._status.visible = rescored.state != "none" or bool(idle)
+        self._status.content = status_html(rescored, title, idle, self.advice)
 
     def _draw_list(self, listed: Sequence[Verdict[Of]]) -> None:
         self._listed = listed
@@ -66,7 +66,7 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
         if listed:
             rows = [self._row(place) for place in self._pages.places(len(listed))]
             pages = self._pages.shown(lambda key, do: self._presses.id_of(key, lambda _: do()))
-            self._list.content = render("judged_list", rows=rows, more=pages, column=self._column)
+            self._list.content = render("rescored_list", rows=rows, more=pages, column=self._column)
 
     def _draw_chart(
         self, title: str, x: NDArray, old: NDArray, new: NDArray, dot: NDArray | None = None
@@ -101,11 +101,11 @@ class JudgedPanel(PagePart[View], Generic[View, Of]):
         raise NotImplementedError
 
 
-def status_html(judged: JudgedView, title: str = "", idle: str = "", advice: str = "") -> str:
+def status_html(rescored: RescoreView, title: str = "", idle: str = "", advice: str = "") -> str:
     """
     Args:
         title: Over it.
         idle: What is said before anything was judged.
-        advice: As `JudgedPanel.advice`.
+        advice: As `RescoredPanel.advice`.
     """
-    return render("judged", judged=judged, title=title, idle=idle, advice=advice, words=words)
+    return render("rescored", rescored=rescored, title=title, idle=idle, advice=advice, words=words)

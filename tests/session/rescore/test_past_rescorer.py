@@ -19,7 +19,7 @@ from tests.drive.waiting import until
 from workbench.session.history.history import Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.rescore.background import JudgedView, StoppedBy
+from workbench.session.rescore.background import RescoreView, StoppedBy
 
 N = 3
 ORIGINAL = (
@@ -52,8 +52,8 @@ class Desk:
         session.versions.reload("rebuilt")
         first = session.view().timeline.last
         wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
-        session.judge.stop()
-        wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
+        session.rescorer.stop()
+        wait_until(session, lambda v: v.rescored.state not in ("loading", "rescoring"), "its end")
         session.change(speed=math.inf)
         session.play()
         wait_until(session, lambda v: v.timeline.moments >= steps, "the steps")
@@ -65,19 +65,19 @@ class Desk:
         history = session._state.timeline.history
         return list(history.between(history.first, history.last))
 
-    def judged(self, *states: str) -> JudgedView:
+    def rescored(self, *states: str) -> RescoreView:
         before = self.serial
 
         def reached(view: SessionView) -> bool:
-            return view.judgement.serial > before and view.judgement.state in (states or ("done",))
+            return view.rescored.serial > before and view.rescored.state in (states or ("done",))
 
-        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").judgement
+        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").rescored
 
     serial = 0
 
     def note(self) -> None:
-        """From here on `judged` waits for something new."""
-        self.serial = self.session.view().judgement.serial
+        """From here on `rescored` waits for something new."""
+        self.serial = self.session.view().rescored.serial
 
 
 @pytest.fixture(scope="module")
@@ -106,11 +106,11 @@ def episodes_of(record: list[Moment]) -> int:
 
 def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: Desk, record) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
-    view = desk.judged()
+    view = desk.rescored()
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
     assert (view.done, view.total) == (len(rewards), len(rewards))
     for env in range(N):
-        curve = desk.session.judge.curve("reward", env)
+        curve = desk.session.rescorer.curve("reward", env)
         np.testing.assert_array_equal(curve.old, rewards[:, env])
         np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
     assert all(verdict.metres == verdict.radians == 0 for verdict in view.verdicts)
@@ -124,7 +124,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
 
 def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
     desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
-    view = desk.judged()
+    view = desk.rescored()
     assert len(view.verdicts) == episodes_of(record) >= 3 * N
     assert not any(verdict.differing or verdict.metres for verdict in view.verdicts)
     assert view.differing_names == frozenset()
@@ -136,7 +136,7 @@ def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk,
     heights = np.array([moment.step.poses[:, hand, 2] for moment in record])
     limit = float(np.float32(np.quantile(heights, 0.8)))
     desk.edit(SUCCESS, f'"success": self.agent.tcp.pose.p[:, 2] > {limit!r},')
-    view = desk.judged()
+    view = desk.rescored()
     wanted = {}
     for env in range(N):
         begins = [k for k, moment in enumerate(record) if moment.jumped[env]]
@@ -159,14 +159,14 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
     late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
     # The process that judges now stands at the end of an episode, where the new code raises at once.
     desk.edit(REWARD, f"{REWARD} * 2")
-    desk.judged()
+    desk.rescored()
     desk.note()
     desk.edit(REWARD, f"{late}\n        {REWARD}")
-    view = desk.judged("failed")
+    view = desk.rescored("failed")
     assert "KeyError: 'late'" in view.problem.message
     assert Path(view.problem.file) == desk.file
     assert desk.file.read_text().splitlines()[view.problem.line - 1].strip() == late
-    curve = desk.session.judge.curve("reward", 1)
+    curve = desk.session.rescorer.curve("reward", 1)
     rewards = np.array([moment.step.reward[1] for moment in steps_of(record)])
     np.testing.assert_array_equal(curve.old, rewards)
     assert np.isfinite(curve.new).sum() == view.done
@@ -177,21 +177,21 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     calls = desk.file.with_name("calls")
     slow = f"if {IN_THE_JUDGE}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
-    desk.judged("judging")
+    desk.rescored("rescoring")
     session = desk.session
     session.change(speed=1.0)
     session.play()
     last = session.view().timeline.last
     view = wait_until(session, lambda v: v.timeline.last > last + 10, "the worker that plays")
-    assert view.judgement.state == "judging"
+    assert view.rescored.state == "rescoring"
     session.pause()
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 4")
     # That the first is told as stopped is seen for as long as the process takes to come back, which may be no time.
-    view = desk.judged("done")
+    view = desk.rescored("done")
     assert len(calls.read_text()) < view.done
     for env in range(N):
-        curve = session.judge.curve("reward", env)
+        curve = session.rescorer.curve("reward", env)
         # What was played since the first of the two saves was rewarded twofold when it was recorded.
         factor = np.where(curve.serial <= record[-1].serial, 4, 2)
         np.testing.assert_array_equal(curve.new, factor * curve.old)
@@ -201,12 +201,12 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     loops = desk.file.with_name("loops")
     loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
     desk.edit(REWARD, f"{loop}\n        {REWARD}")
-    desk.judged("judging")
+    desk.rescored("rescoring")
     until(loops.exists, "the loop")
     desk.note()
     process = desk.session._background.pid
-    desk.session.judge.stop()
-    view = desk.judged("stopped")
+    desk.session.rescorer.stop()
+    view = desk.rescored("stopped")
     assert view.done < view.total and view.stopped_by is StoppedBy.HAND
     wait_until(
         desk.session, lambda v: desk.session._background.pid is None, "the end of the process that hangs"
@@ -214,27 +214,27 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     assert not Path(f"/proc/{process}").exists()
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
-    assert any(verdict.differs for verdict in desk.judged("done").verdicts)
+    assert any(verdict.differs for verdict in desk.rescored("done").verdicts)
 
 
 def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
     slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
-    desk.judged("judging")
+    desk.rescored("rescoring")
     first = desk.session._background.pid
     desk.note()
     os.kill(first, signal.SIGKILL)
-    view = desk.judged("failed")
+    view = desk.rescored("failed")
     assert "killed by SIGKILL" in view.why
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
-    desk.judged("done")
+    desk.rescored("done")
     second = desk.session._background.pid
     assert second not in (None, first)
     # The process is kept for the next time.
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 3")
-    desk.judged("stopped", "done")
+    desk.rescored("stopped", "done")
     assert desk.session._background.pid == second
 
 
@@ -244,7 +244,7 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     """Keeping an episode goes first, and the judgement comes to what it comes to without it."""
     slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
-    desk.judged("judging")
+    desk.rescored("rescoring")
     process, session = desk.session._background.pid, desk.session
     session.keep_past((0,), before=True)
     wait_until(
@@ -252,18 +252,18 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     )
     view = session.view()
     assert view.recording.keeping.said.startswith("kept 1 episode") and not view.recording.keeping.failed
-    assert view.judgement.state == "judging", "it has not ended meanwhile"
+    assert view.rescored.state == "rescoring", "it has not ended meanwhile"
     desk.note()
-    assert desk.judged("judging").done < view.judgement.total
+    assert desk.rescored("rescoring").done < view.rescored.total
     session.keep_past((1,), before=True)
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 3")
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
-    assert desk.judged().stopped_by is None
+    assert desk.rescored().stopped_by is None
     wait_until(
         session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "the second"
     )
     assert not session.view().recording.keeping.failed
     for env in range(N):
-        np.testing.assert_array_equal(session.judge.curve("reward", env).new, 3 * rewards[:, env])
+        np.testing.assert_array_equal(session.rescorer.curve("reward", env).new, 3 * rewards[:, env])
     assert session._background.pid == process
