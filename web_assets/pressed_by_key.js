@@ -4,9 +4,9 @@
 // (tabindex). What a press does is in their handlers, which hear a pointer; so a key becomes one here. Of a table or
 // a strip (data-roving) Tab stops at one part, and the arrows go from there to the others.
 //
-// Such HTML is replaced whenever what it says changes, also by the very press, and with it goes the focus: somebody at
-// the keyboard would begin anew at the top of the page. So the part that was walked to is found again in what took its
-// place, by the id of what it presses. The capture phase, on the window: or Space would play, and the arrows scrub.
+// Such HTML is replaced whenever what it says changes, also by the very press, and the focus goes with it: the keyboard
+// would start again at the top of the page. So the focused part is found again in the new HTML, by the id of what it
+// presses. The capture phase, on the window: or Space would play, and the arrows scrub.
 "use strict";
 {
   const PARTS = "[data-press], [data-copy], [data-row]";
@@ -44,6 +44,9 @@
   window.addEventListener("focusin", ({ target }) => {
     walkedTo = (target instanceof Element && target.matches("[data-press]") && target.dataset.press) || "";
   });
+  // Between the part that Tab leaves and the next one nothing has the focus. A change of the page in that moment would
+  // bring the focus back to the first.
+  window.addEventListener("focusout", ({ relatedTarget }) => relatedTarget && (walkedTo = ""));
   window.addEventListener("pointerdown", (event) => event.isTrusted && (walkedTo = ""), true);
 
   new MutationObserver(() => {

@@ -194,6 +194,19 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
 
 
+def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -> None:
+    tool(page, "move, turn")
+    page.evaluate(
+        """() => {
+            [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn').focus();
+            addEventListener("focusout", () => document.body.append(document.createElement("i")), { once: true });
+        }"""
+    )
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.textContent") == "eye and target"
+    page.evaluate("document.activeElement.blur()")
+
+
 def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     press(page, "Look through it")
     tool(page, "Back to my view")
