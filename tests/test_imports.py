@@ -31,7 +31,6 @@ SHORT_FOR_A_REASON = {
     "machine/processes/own_path": "it is imported before anything else, so that nothing else is imported from the wrong place",
     "machine/web_assets": "it says where the page's files lie, to parts that may not import each other",
     "recording/episode/source": "what lies below the readers names a recording by it",
-    "session/record/status": "the page reads it without what records",
 }
 """Modules below `FEWEST_LINES` lines, each with why it stays apart."""
 

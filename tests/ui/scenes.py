@@ -14,7 +14,7 @@ from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry,
 from workbench.jobs.task import ActionDimension, TaskDescription
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import Settings
-from workbench.session.record.status import RecordingStatus
+from workbench.session.record.live import RecordingStatus
 
 
 def box_mesh(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Mesh:

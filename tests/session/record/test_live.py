@@ -76,9 +76,9 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     session.stop_recording()
     live = written(session, 2)
     session.keep_past()
-    wait_until(session, lambda view: bool(view.recording.keeping.said), "the keeping")
+    wait_until(session, lambda view: bool(view.recording.keeping.message), "the keeping")
     said = f"kept 2 episodes, {2 * STEPS} steps; none of them had ended"
-    assert session.view().recording.keeping.said == said
+    assert session.view().recording.keeping.message == said
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
     assert kept.keys() == {0, 1}
@@ -108,14 +108,14 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
     # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
-    said = session.view().recording.keeping.said
+    said = session.view().recording.keeping.message
     assert kept.info.seed == 5 and "no seed" not in said
     session.keep_past((1,), before=True)
     kept = written(session, count + 2)[-1]
     assert kept.info.env_index == 1 and kept.info.seed == -1
     said = wait_until(
-        session, lambda view: bool(view.recording.keeping.said), "what came of it"
-    ).recording.keeping.said
+        session, lambda view: bool(view.recording.keeping.message), "what came of it"
+    ).recording.keeping.message
     assert "its start was drawn for several envs at once" in said
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
     session.change(action_source="random")
@@ -128,10 +128,10 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
 
     def keep(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
         session.keep_past((0,))
-        wait_until(session, lambda view: bool(view.recording.keeping.said) or begun(view), "a keep")
+        wait_until(session, lambda view: bool(view.recording.keeping.message) or begun(view), "a keep")
 
     def kept() -> Episode:
-        wait_until(session, lambda view: bool(view.recording.keeping.said), "what was kept")
+        wait_until(session, lambda view: bool(view.recording.keeping.message), "what was kept")
         return written(session, session.view().recording.episodes_written)[-1]
 
     def drawing(view: SessionView) -> bool:
@@ -170,7 +170,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
 
     keep(drawing)
     measure()
-    assert measured() == alone and not session.view().recording.keeping.said, "the keep came first"
+    assert measured() == alone and not session.view().recording.keeping.message, "the keep came first"
     assert_same(kept(), episode)
     for begin, came, of in ((measure, measured, alone), (search, found, offers)):
         begin()
@@ -210,7 +210,7 @@ def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Sess
     step(session, 2)
     session.keep_past((0,))
     view = wait_until(session, lambda view: view.recording.keeping.failed, "the refusal")
-    assert "its beginning is no longer in memory" in view.recording.keeping.said
+    assert "its beginning is no longer in memory" in view.recording.keeping.message
     session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
 
 

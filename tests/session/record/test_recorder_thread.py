@@ -19,8 +19,8 @@ from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.process.job_lane import JobProgress
 from workbench.session.record import live
-from workbench.session.record.live import LiveRecorder, recovered_in_words
-from workbench.session.record.status import KeepStatus, RecordingStatus
+from workbench.session.record.keep_past import KeepStatus
+from workbench.session.record.live import LiveRecorder, RecordingStatus, recovered_in_words
 from workbench.ui.live.episodes_panel import recording_html
 
 

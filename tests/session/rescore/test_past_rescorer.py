@@ -248,10 +248,12 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     process, session = desk.session._background.pid, desk.session
     session.keep_past((0,), before=True)
     wait_until(
-        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "what was kept"
+        session,
+        lambda v: v.recording.keeping.progress is None and v.recording.keeping.message,
+        "what was kept",
     )
     view = session.view()
-    assert view.recording.keeping.said.startswith("kept 1 episode") and not view.recording.keeping.failed
+    assert view.recording.keeping.message.startswith("kept 1 episode") and not view.recording.keeping.failed
     assert view.rescored.state == "rescoring", "it has not ended meanwhile"
     desk.note()
     assert desk.rescored("rescoring").done < view.rescored.total
@@ -261,7 +263,7 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
     assert desk.rescored().stopped_by is None
     wait_until(
-        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.said, "the second"
+        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.message, "the second"
     )
     assert not session.view().recording.keeping.failed
     for env in range(N):

@@ -47,7 +47,7 @@ from workbench.session.protocol.messages import (
     Settings,
     Status,
 )
-from workbench.session.record.keep_past import PastEpisode, WhatToKeep, episode_round
+from workbench.session.record.keep_past import KeepRequest, PastEpisode, find_episode
 
 
 @dataclass
@@ -343,25 +343,25 @@ class LiveState:
             None if self.timeline is None else self.timeline.history.snapshot_at(self.timeline.history.last)
         )
 
-    def what_to_keep(
+    def keep_request(
         self,
         env_idx: tuple[int, ...] | None,
         load: Load | None,
         placed: tuple[PlaceCamera, ...],
         before: bool = False,
-    ) -> WhatToKeep | str:
+    ) -> KeepRequest | str:
         """See `Session.keep_past`; in a sentence why there is nothing to keep."""
         if self.now.task is None or self.timeline is None or load is None:
             return "no task is loaded"
         history, shown = self.timeline.history, self.timeline.shown
         envs = range(self.now.task.num_envs) if env_idx is None else env_idx
         serial = None if shown is None else shown.serial
-        found = {env: episode_round(history, env, serial, before) for env in envs}
+        found = {env: find_episode(history, env, serial, before) for env in envs}
         episodes = tuple(episode for episode in found.values() if isinstance(episode, PastEpisode))
         if not episodes:
             env, why = next(iter(found.items()))
             return f"nothing was kept of env {env}: {why}"
-        return WhatToKeep(self.now.task, load, placed, episodes)
+        return KeepRequest(self.now.task, load, placed, episodes)
 
     def view(self, **known: Any) -> SessionView:
         """A snapshot of what is shown.

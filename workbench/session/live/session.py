@@ -272,7 +272,7 @@ class Session:
         load = self.versions.same_again()
         placed = self.studio.placed_cameras()
         with self._lock:
-            what = self._state.what_to_keep(env_idx, load, placed, before)
+            what = self._state.keep_request(env_idx, load, placed, before)
         if isinstance(what, str):
             self.keeper.refuse(what)
         else:

@@ -21,7 +21,7 @@ from workbench.session.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken, Settings
-from workbench.session.record.status import RecordingStatus
+from workbench.session.record.live import RecordingStatus
 from workbench.session.rescore.background import RescoreView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]

@@ -1,1 +1,1 @@
-"""Episodes kept from a live session, while they happen or afterwards."""
+"""Records episodes of a live session, while they happen or afterwards."""

@@ -1,19 +1,4 @@
-"""Keep what I just saw: an episode of the past becomes a recording after the fact.
-
-An episode is what an env lived through from a reset on, through the moments that it was put back to, until it
-terminated, was truncated, or was reset or left. That is what the Record button gathers while it happens; here it is
-found afterwards, and only where its beginning is still in memory, since an episode without its reset could not be
-made again.
-
-Nobody presses Record before the run that is worth keeping. But the history has it all: of every moment the poses, the
-action, the reward and what ``evaluate`` returned, as they were said then; and a snapshot. What a recording holds
-beyond that (env states, observations, pictures of every camera) is read off the envs when they are put back to
-the snapshot. That happens in a process of its own, so playing goes on, and the result is the file that recording it
-live would have given. It takes some seconds for the process to start, and then about as long as its pictures take.
-
-If the file was edited since, env states, observations and pictures are those that today's code gives for that state; the
-rest is as it was said then.
-"""
+"""Records an episode after it happened, from the history."""
 
 from __future__ import annotations
 
@@ -31,20 +16,34 @@ from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.writing.publish import RecordingError
 from workbench.session.history.history import EnvMoment, History, Moment
 from workbench.session.process.askers import WAITING, Background
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.process.job_lane import Job, JobFailed, JobLane, JobProgress
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset
 from workbench.session.protocol.questions import CaptureMoment
-from workbench.session.record.status import KeepStatus
+
+
+@dataclass(frozen=True)
+class KeepStatus:
+    """Progress and result of recording a past episode."""
+
+    message: str = ""
+    """Result of the last job that ended."""
+    failed: bool = False
+    """`message` is an error."""
+    progress: JobProgress | None = None
+    """In moments; None while no job runs."""
 
 
 @dataclass(frozen=True)
 class PastEpisode:
-    """The moments of one env's episode, oldest first; the first is its reset."""
+    """The moments of one env's episode, oldest first; the first is its reset.
+
+    It runs through the moments that the env was put back to, until it terminated, was truncated, was reset or was left.
+    """
 
     env: int
     moments: tuple[EnvMoment, ...]
     seed: int
-    """Below 0 where it is not known."""
+    """Negative if unknown."""
 
     @property
     def steps(self) -> int:
@@ -52,50 +51,50 @@ class PastEpisode:
 
     @property
     def ended(self) -> bool:
-        """Whether the task ended it; else it runs, or was reset before."""
+        """Whether the task ended it; false if it still runs or was reset early."""
         moment, env = self.moments[-1]
         step = moment.as_recorded
         return bool(step.terminated[env] or step.truncated[env])
 
 
 @dataclass(frozen=True)
-class WhatToKeep:
-    """Everything that the work needs; it goes on while the history moves on."""
+class KeepRequest:
+    """Episodes to record and what a worker needs for it. Independent of the history, which moves on meanwhile."""
 
     task: TaskDescription
     load: Load
-    """How another worker gets the version that runs."""
+    """Loads the running version into another worker."""
     placed: tuple[PlaceCamera, ...]
-    """Cameras that stand elsewhere than the file says."""
+    """Cameras that were placed by hand."""
     episodes: tuple[PastEpisode, ...]
 
 
-def episode_round(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
-    """The episode of this env round a moment, to where it ended; or in a sentence why there is none to keep.
+def find_episode(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
+    """The episode of this env that contains a moment, up to its end; or the reason why none can be recorded.
 
     Args:
-        serial: None for what was just seen: the episode that runs, or the one before if that has no step yet.
+        serial: None for the running episode, or the one before if that has no step yet.
         before: the one before that.
     """
     if not len(history):
         return "nothing was seen yet"
-    found = _of(history, env, history.last if serial is None else serial)
+    found = _episode_at(history, env, history.last if serial is None else serial)
     if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
-        found = _before(history, env, found) or found
+        found = _episode_before(history, env, found) or found
     if before and isinstance(found, PastEpisode):
-        found = _before(history, env, found) or "there is no episode before it in memory"
+        found = _episode_before(history, env, found) or "there is no episode before it in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
         return "its episode has no step yet"
     return found
 
 
-def _before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
-    """The one before; None where that is not in memory any more."""
+def _episode_before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
+    """The episode before; None if it is no longer in memory."""
     begin = episode.moments[0][0].serial
-    return _of(history, env, begin - 1) if begin > history.first else None
+    return _episode_at(history, env, begin - 1) if begin > history.first else None
 
 
-def _of(history: History, env: int, serial: int) -> PastEpisode | str:
+def _episode_at(history: History, env: int, serial: int) -> PastEpisode | str:
     moments = history.episode(env, serial)
     if not moments:
         return "nothing was seen yet"
@@ -114,7 +113,7 @@ def _of(history: History, env: int, serial: int) -> PastEpisode | str:
 
 
 def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, list[PastEpisode]]]]:
-    """All their moments once, oldest first; and of each, by env, the episodes that it is a moment of."""
+    """All their moments once, oldest first, each with the episodes that it belongs to, by env."""
     found: dict[int, tuple[Moment, dict[int, list[PastEpisode]]]] = {}
     for episode in episodes:
         for moment, env in episode.moments:
@@ -127,7 +126,12 @@ _SAME_START = 1e-6
 
 
 class PastKeeper:
-    """Keeps episodes, one job at a time."""
+    """Records past episodes, one job at a time, in the background process.
+
+    The history has poses, actions, rewards and results of ``evaluate`` as they were, and a snapshot of each moment. The
+    rest (env states, observations, pictures of all cameras) is read from envs that are put back to the snapshots. So the
+    file equals that of a live recording; but after an edit of the task's file that rest is what the new code gives.
+    """
 
     def __init__(
         self, folder: Path, finisher: EpisodeFinisher, on_change: Callable[[], None], process: Background
@@ -137,19 +141,19 @@ class PastKeeper:
         self._process = process
         self._job_lane = JobLane("keep-past", on_change, self._failed)
 
-    def keep(self, what: WhatToKeep) -> None:
-        """Begin; what was under way is given up."""
-        self._say("")
+    def keep(self, what: KeepRequest) -> None:
+        """Start; cancels the running job."""
+        self._report("")
         self._job_lane.start(WAITING, lambda job: self._keep(job, what))
 
     def stop(self) -> None:
-        """Give up; nothing of it is kept."""
+        """Cancel the running job; it writes no file."""
         self._job_lane.stop()
-        self._say("stopped; nothing was kept")
+        self._report("stopped; nothing was kept")
 
     def refuse(self, why: str) -> None:
-        """Say why nothing can be kept."""
-        self._say(why, failed=True)
+        """Report why nothing can be recorded."""
+        self._report(why, failed=True)
 
     def status(self) -> KeepStatus:
         return replace(self._status, progress=self._job_lane.progress)
@@ -159,19 +163,19 @@ class PastKeeper:
 
     # --- on the lane's thread --------------------------------------------------------------------------
 
-    def _keep(self, job: Job, what: WhatToKeep) -> None:
+    def _keep(self, job: Job, what: KeepRequest) -> None:
         seeds: dict[int, int] = {}
         writers: dict[int, GatheredEpisode] = {}
         moments, packer = deque(moments_of(what.episodes)), BatchPacker()
         total = len(moments)
 
-        def see_again() -> None:
-            """From where it gave way."""
+        def redraw() -> None:
+            """Continue with the first moment that is not captured yet: a job of higher rank may have interrupted this one."""
             self._process.ensure(job, what.load, what.placed)
             for episode in what.episodes:
                 if episode.env not in seeds:
                     job.tell(len(seeds), len(what.episodes), "trying the seeds")
-                    seeds[episode.env] = self._sure_seed(job, episode)
+                    seeds[episode.env] = self._verified_seed(job, episode)
             while moments:
                 job.tell(total - len(moments), total, "drawing it again")
                 moment, rows = moments[0]
@@ -189,7 +193,7 @@ class PastKeeper:
                         writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
 
         try:
-            self._process.in_turns(job, see_again)
+            self._process.in_turns(job, redraw)
         except BaseException as error:
             for episode in writers.values():
                 episode.writer.discard()
@@ -205,12 +209,12 @@ class PastKeeper:
         unfinished = sum(not episode.ended for episode in what.episodes)
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
         kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
-        self._say(kept + _not_ended(unfinished, len(made)) + _no_seed(lost, len(made)))
+        self._report(kept + _unfinished_text(unfinished, len(made)) + _lost_seed_text(lost, len(made)))
 
-    def _sure_seed(self, job: Job, episode: PastEpisode) -> int:
-        """Its seed, if a reset of its env alone with that gives its first state; else below 0.
+    def _verified_seed(self, job: Job, episode: PastEpisode) -> int:
+        """Its seed, if a reset of its env alone with it gives the first state; else -1.
 
-        What envs that were reset together drew from torch's generator hangs on all of them.
+        What envs that were reset together drew from torch's generator depends on all of them.
         """
         if episode.seed < 0:
             return episode.seed
@@ -225,14 +229,14 @@ class PastKeeper:
             where = "" if problem.line is None else f" (line {problem.line})"
             why = f"it could not be drawn again: {problem.message}{where}"
         if not job.stopped:
-            self._say(why, failed=True)
+            self._report(why, failed=True)
 
-    def _say(self, words: str, failed: bool = False) -> None:
-        self._status = KeepStatus(said=words, failed=failed)
+    def _report(self, message: str, failed: bool = False) -> None:
+        self._status = KeepStatus(message, failed)
         self._on_change()
 
 
-def _not_ended(count: int, kept: int) -> str:
+def _unfinished_text(count: int, kept: int) -> str:
     if not count:
         return ""
     if kept == 1:
@@ -240,7 +244,7 @@ def _not_ended(count: int, kept: int) -> str:
     return "; none of them had ended" if count == kept else f"; {count} of them had not ended"
 
 
-def _no_seed(count: int, kept: int) -> str:
+def _lost_seed_text(count: int, kept: int) -> str:
     if not count:
         return ""
     what = "its start was" if kept == 1 else "their starts were" if count == kept else f"{count} starts were"

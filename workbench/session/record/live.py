@@ -1,19 +1,11 @@
-"""Recording while the page runs: rows are gathered on one thread, files are made on another.
-
-A row is encoded and put into the journal in a millisecond or less, but the disk may take its time over it, and
-making the files of an episode takes a fraction of a second and more for a long one. No event of the worker may wait
-for either. So the session's thread only hands the steps over. What waits is bounded: a disk that is slower than the
-simulation for long ends the recording with a sentence, since the alternatives are to lose steps unsaid or to fill
-the memory.
-
-A file that cannot be written is said and stops nothing but the recording.
-"""
+"""Records episodes while the session runs, on a thread of its own."""
 
 from __future__ import annotations
 
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -22,28 +14,56 @@ from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.recording.reader.reading import mend, recovered_in_words
 from workbench.recording.writing.publish import RecordingError
-from workbench.session.record.status import RecordingStatus
+from workbench.session.record.keep_past import KeepStatus
 
 _MOST_WAITING = 256 * 1024**2
-"""Bytes of steps that the disk has not taken."""
+"""Bytes of steps that wait for the disk."""
+
+
+@dataclass(frozen=True)
+class RecordingStatus:
+    """Running and finished recordings of a session, for the page."""
+
+    active: bool = False
+    env_idx: tuple[int, ...] = ()
+    waiting: int = 0
+    """Envs of these whose episode begins with their next reset."""
+    steps: int = 0
+    """Steps captured of the running episodes."""
+    bytes_written: int = 0
+    """Of this session's episodes, the running ones included."""
+    episodes_written: int = 0
+    being_written: int = 0
+    """Ended episodes whose files are being made."""
+    recovered: tuple[str, ...] = ()
+    """.rrd files of episodes that an earlier server left unfinished, repaired at the start."""
+    folder: str = ""
+    last_file: str | None = None
+    problem: str | None = None
+    """Why the recording ended, or the last file could not be written."""
+    keeping: KeepStatus = field(default_factory=KeepStatus)
 
 
 class LiveRecorder:
-    """Start and stop as often as wanted; `close` waits for what is still being written."""
+    """Records chosen envs. `close` waits until all files are written.
+
+    The session's thread only queues the steps: a row takes a millisecond or less to encode and write to the journal, but
+    a disk may be slow, and the files of an episode take a fraction of a second or more. The queue is bounded. A disk that
+    is slower than the simulation for long ends the recording, instead of losing steps silently or filling the memory.
+    """
 
     def __init__(
         self,
         folder: Path,
         on_change: Callable[[], None],
         on_envs: Callable[[tuple[int, ...]], None],
-        on_recovered: Callable[[str], None] = lambda words: None,
+        on_recovered: Callable[[str], None] = lambda message: None,
     ) -> None:
         """
         Args:
-            on_recovered: called with a sentence on the episodes that an earlier session left half written, from a
-                thread of its own.
-            on_change: called when `status` has something new, from any thread.
-            on_envs: called when an env needs to be captured no longer, with those that do; from a thread of its own.
+            on_change: called when `status` has changed, from any thread.
+            on_envs: called with the envs that still need capturing, when these are fewer; from a thread of its own.
+            on_recovered: called with a message about unfinished episodes of an earlier session, from a thread of its own.
         """
         self._folder = folder
         self._on_change, self._on_envs, self._on_recovered = on_change, on_envs, on_recovered
@@ -55,29 +75,29 @@ class LiveRecorder:
         self._waiting_bytes = 0
         self._ends_by_itself = False
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue()
-        """What the recorder's thread is to do; None to end."""
+        """Work of the recorder's thread; None ends it."""
         self.finisher = EpisodeFinisher(on_change, self._recover)
-        """Makes the files, of other episodes too."""
+        """Makes the files, also those of `PastKeeper`."""
         self._thread = watched_thread("recorder", self._work)
         self._thread.start()
 
     # --- the session's side ----------------------------------------------------------------------------
 
     def start(self, task: TaskDescription, env_idx: Sequence[int], one_each: bool = False) -> None:
-        """From each env's next reset on; of each only the next episode if `one_each`."""
+        """Record from each env's next reset on; only the next episode of each if `one_each`."""
         with self._lock:
             self._env_idx, self._problem, self._ends_by_itself = tuple(env_idx), None, one_each
         gatherer = EpisodeGatherer(task, env_idx, self._folder, self.finisher.finish, one_each=one_each)
         self._queue.put(partial(self._gather_with, gatherer))
 
     def stop(self) -> None:
-        """End the episodes under way; what was gathered of them is written."""
+        """End the running episodes and write what they have."""
         with self._lock:
             self._env_idx = ()
         self._queue.put(partial(self._gather_with, None))
 
     def take(self, stepped: Stepped) -> None:
-        """The next reset or step."""
+        """Queue the next reset or step."""
         size = _size(stepped)
         with self._lock:
             if not self._env_idx:
@@ -95,13 +115,13 @@ class LiveRecorder:
 
     @property
     def recording(self) -> tuple[int, ...]:
-        """The envs that are recorded, whether or not their episodes have begun."""
+        """The recorded envs, including those whose episode has not begun."""
         with self._lock:
             return self._env_idx
 
     @property
     def one_each(self) -> bool:
-        """Whether it ends by itself."""
+        """Whether the recording ends after one episode of each env."""
         with self._lock:
             return self._ends_by_itself
 
@@ -136,7 +156,7 @@ class LiveRecorder:
             work()
 
     def _gather_with(self, gatherer: EpisodeGatherer | None) -> None:
-        """End the episodes under way, and gather others from now on, or none."""
+        """End the running episodes; the next steps go to `gatherer`, or nowhere."""
         with self._lock:
             before, self._gatherer = self._gatherer, gatherer
         if before is not None:
@@ -153,13 +173,13 @@ class LiveRecorder:
         try:
             gatherer.take(stepped)
         except Exception as error:
-            # A disk that is full, an entry of evaluate() that is no number, a step that was lost; else it is ours.
+            # Expected: a full disk, an entry of evaluate() that is no number, a lost step. All else is our own fault.
             if not isinstance(error, (RecordingError, ValueError)):
                 report_failure("A step could not be recorded", error)
             self._gather_with(None)
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
-            # Nothing more of `_env_idx`: another recording may have been started by now.
+            # `_env_idx` stays as it is from here on: another recording may have started by now.
             self._on_envs(())
             self._on_change()
             return
@@ -171,21 +191,21 @@ class LiveRecorder:
             self._on_change()
 
     def _recover(self) -> None:
-        """What a server before this one left behind; on the finisher's thread, before all else."""
+        """Repair episodes that an earlier server left unfinished; on the finisher's thread, before all else."""
         if not self._folder.is_dir():
             return
         try:
             recovered = [str(file) for file in mend(self._folder)]
         except RecordingError as error:
-            said = f"what an earlier recording left could not be mended: {error}"
+            message = f"what an earlier recording left could not be mended: {error}"
             with self._lock:
-                self._problem = said
+                self._problem = message
         else:
-            said = recovered_in_words(recovered)
+            message = recovered_in_words(recovered)
             with self._lock:
                 self._recovered = tuple(recovered)
-        if said:
-            self._on_recovered(said)
+        if message:
+            self._on_recovered(message)
         self._on_change()
 
 

@@ -9,7 +9,7 @@ import viser
 from workbench.recording.reader.reading import recovered_in_words
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.record.status import RecordingStatus
+from workbench.session.record.live import RecordingStatus
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
 
