@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from workbench.authoring.loading.load import LoadedTask, load_task
-from workbench.authoring.problem import Problem
-from workbench.authoring.return_problems import check_step_returns
+from workbench.authoring.problem import Problem, check_step_returns
 from workbench.core.env.evaluate_entries import wrong_reward
 
 Write = Callable[..., Path]

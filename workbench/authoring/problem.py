@@ -1,12 +1,4 @@
-"""What went wrong in the author's file, in the words and at the line that the author needs.
-
-A traceback of a broken task is mostly ManiSkill's own frames; the author wants the last line of
-*their* code in it. `Problem` is that, as plain data that crosses the pipe from the worker, and
-`problem_from_exception` finds it: it walks the exception, then what caused it, for the innermost
-frame in the author's files; it names the hook of the task that was running, because "in the
-reward" is how the author thinks of it and "in step" is not; and it keeps the whole traceback, but
-bounded, because a `RecursionError` or an exception that prints a tensor can be megabytes.
-"""
+"""Finds the author's line, hook and message of an exception, as plain data (`Problem`)."""
 
 from __future__ import annotations
 
@@ -48,9 +40,8 @@ HOOK_STAGES: dict[str, str] = {
     "_before_simulation_step": "step",
     "_after_simulation_step": "step",
 }
-"""Method of `BaseEnv` to the stage that an author knows it as. `get_info`, `get_reward` and
-`_flatten_raw_obs` are ManiSkill's callers of the author's hooks: what they choke on is what a hook
-returned (``evaluate()`` giving None raises in `get_info`)."""
+"""Method of `BaseEnv` to the stage that the page names. `get_info`, `get_reward` and `_flatten_raw_obs` are ManiSkill's
+callers of the author's hooks; they raise because of what a hook returned (``evaluate()`` giving None in `get_info`)."""
 _CALLERS = ("get_info", "get_reward", "_flatten_raw_obs")
 
 
@@ -59,6 +50,8 @@ def hooks_of(stage: str) -> tuple[str, ...]:
     return tuple(name for name, of in HOOK_STAGES.items() if of == stage and name not in _CALLERS)
 
 
+_REWARD_HOOKS = hooks_of("reward")
+
 MESSAGE_LIMIT = 500
 TRACEBACK_LINE_LIMIT = 1000
 TRACEBACK_HEAD_LINES = 60
@@ -66,51 +59,53 @@ TRACEBACK_TAIL_LINES = 140
 
 _LOCATION_IN_TEXT = re.compile(r" \([^()]*, line \d+\)$")
 _MACHINERY = ("workbench", "importlib", "_frozen_importlib", "_frozen_importlib_external")
-"""Packages whose frames, at the start of a traceback, only say who ran the author's code."""
+"""Packages whose frames are left out at the start of a traceback: they only run the author's code."""
 
 
 class Interrupted(BaseException):
-    """Somebody had enough of waiting. Not an Exception: ``except Exception`` in a loop must not swallow it."""
+    """A person stopped the task. Not an Exception: ``except Exception`` in a loop must not swallow it."""
 
 
-_person: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
+_ctrl_c: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
 
 
-def nobody_presses_ctrl_c() -> None:
-    """Of a process that has no terminal: a KeyboardInterrupt in it is the author's, and a failure like others."""
-    global _person
-    _person = ()
+def treat_ctrl_c_as_error() -> None:
+    """In a process without a terminal: a KeyboardInterrupt is raised by the task, and is an error like others."""
+    global _ctrl_c
+    _ctrl_c = ()
 
 
 def is_ctrl_c(error: BaseException | None) -> bool:
-    """Whether it is a person at the terminal who leaves; to be raised on, and never blamed on a task."""
-    return isinstance(error, _person)
+    """Whether a person pressed Ctrl-C: to be raised again, never reported as the task's error."""
+    return isinstance(error, _ctrl_c)
 
 
 @dataclass(frozen=True)
 class Problem:
+    """An error in the author's code. Crosses the pipe from the worker, so its texts are bounded: a RecursionError or an
+    exception that prints a tensor can be megabytes."""
+
     stage: str
-    """What was being done: ``syntax import build reset step evaluate reward observation returns
-    policy pictures worker``."""
+    """What failed: ``syntax import build reset step evaluate reward observation returns policy pictures worker``."""
     message: str
     """One line: exception type and text."""
     file: str | None
-    """The author's file, or None when none of their lines is involved."""
+    """The author's file; None if the traceback has none of their lines."""
     line: int | None
     """1-based line in `file`."""
     code: str | None
     """The text of that line, stripped."""
     traceback: str
-    """The whole of it, as Python prints it; may be empty."""
+    """As Python prints it, shortened; may be empty."""
     interrupted: bool = False
-    """A person stopped it by hand."""
+    """A person stopped it."""
 
 
 class TaskError(Exception):
-    """The author's task cannot be had; `problem` says why in the author's terms.
+    """The task cannot be loaded or built; `problem` says why.
 
     Args:
-        classes: What can be chosen in the task's file, this one first; empty where it has nothing else.
+        classes: task classes of the file that can be opened, this one first; empty if it has no other.
     """
 
     def __init__(self, problem: Problem, classes: tuple[str, ...] = ()) -> None:
@@ -122,20 +117,19 @@ class TaskError(Exception):
         return place + self.problem.message
 
 
-def refused(message: str, file: Path | None = None) -> TaskError:
-    """A task that cannot be had for a reason that no line of its author's raised."""
+def task_error(message: str, file: Path | None = None) -> TaskError:
+    """A task that cannot be loaded, for a reason that no line of the author raised."""
     return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
 
 
 def problem_from_exception(
     exc: BaseException, stage: str, own_files: Collection[Path], cls: type | None = None
 ) -> Problem:
-    """Say what `exc` means to the author of `own_files`.
+    """The problem that `exc` is for the author of `own_files`.
 
-    The place is the innermost frame in `own_files`, looked for in `exc` itself, then in what it was
-    raised from. A hook of `HOOK_STAGES` on the traceback replaces `stage`, except while importing.
-    Where the traceback has no frame of the author's but a hook is known, and `cls` (the task's
-    class) is given, the place is that hook's ``def``.
+    Its line is the innermost frame in `own_files`, of `exc` or else of the exceptions that caused it. A hook of
+    `HOOK_STAGES` on the traceback replaces `stage`, except while importing. If no frame is the author's but a hook is
+    known, and `cls` (the task's class) is given, the line is that hook's ``def``.
     """
     own = {str(path) for path in own_files}
     if isinstance(exc, SyntaxError) and exc.filename in own and exc.lineno is not None:
@@ -159,7 +153,7 @@ def problem_from_exception(
     file, line = place if place is not None else (None, None)
     code = None
     if file is not None and line is not None:
-        linecache.checkcache(file)  # of a module that was mended since a line of it was last shown
+        linecache.checkcache(file)  # the file may have been edited since linecache read it
         code = linecache.getline(file, line).strip()
     if isinstance(exc, AssertionError) and not str(exc) and code:
         message = shorten(f"{message}: {code}")
@@ -168,16 +162,15 @@ def problem_from_exception(
 
 
 def shorten(text: str, limit: int = MESSAGE_LIMIT) -> str:
-    """`text` on one line, with its end cut off where it is longer than `limit`."""
+    """`text` on one line of at most `limit` characters."""
     line = " ".join(text[: 8 * limit].split())
     return line if len(line) <= limit else line[: limit - 1] + "…"
 
 
 def format_traceback(exc: BaseException) -> str:
-    """The traceback of `exc`, less the workbench's own frames at its start, bounded in size.
+    """The traceback of `exc` without the workbench's own frames at its start, and without its middle if it is long.
 
-    Python already folds one function that calls itself; two that call each other (a property and
-    its helper, say) still give two thousand lines, so the middle of a long traceback is left out.
+    Python folds a function that calls itself; two that call each other still give two thousand lines.
     """
     trace = exc.__traceback__
     while trace is not None and trace.tb_next is not None and _is_machinery(trace.tb_frame):
@@ -185,7 +178,7 @@ def format_traceback(exc: BaseException) -> str:
     try:
         lines = "".join(tracebacks.format_exception(type(exc), exc, trace)).splitlines()
     except RecursionError:
-        # The stack may still be nearly full where a RecursionError is caught deep down.
+        # A RecursionError caught deep down leaves too little stack to format it.
         lines = ["Traceback too deep to print", _message(exc)]
     if len(lines) > TRACEBACK_HEAD_LINES + TRACEBACK_TAIL_LINES:
         left_out = len(lines) - TRACEBACK_HEAD_LINES - TRACEBACK_TAIL_LINES
@@ -199,7 +192,7 @@ def format_traceback(exc: BaseException) -> str:
 def definition_line(function: object) -> tuple[str, int] | None:
     """File and 1-based line of the ``def`` of a function, method or property; None for others.
 
-    A code object's first line is that of its first decorator, which is not where one looks.
+    A code object's first line is that of its first decorator.
     """
     if isinstance(function, property):
         function = function.fget
@@ -217,7 +210,7 @@ def definition_line(function: object) -> tuple[str, int] | None:
 def hook_definition(
     cls: type, hooks: Iterable[str], own_files: Collection[Path]
 ) -> tuple[str, tuple[str, int]] | None:
-    """The first of these methods of `cls` that the author's files define, and where; None when they inherit all."""
+    """The first of `hooks` that a class of the author's files defines, with file and line; None if all are inherited."""
     own = {str(path) for path in own_files}
     for name in hooks:
         method = next((vars(base)[name] for base in cls.__mro__ if name in vars(base)), None)
@@ -227,12 +220,66 @@ def hook_definition(
     return None
 
 
+# --- what hooks return ---------------------------------------------------------------------------
+
+
+def check_step_returns(
+    cls: type,
+    num_envs: int,
+    evaluate: object,
+    reward: object | None,
+    source_files: Collection[Path],
+) -> Problem | None:
+    """The first wrong type or shape in what one step of `num_envs` envs of `cls` returned, or None.
+
+    ManiSkill 3.0.1 checks none of it. Some mistakes raise far from their cause (``success`` as a Python bool: "'bool'
+    object has no attribute 'clone'", inside `BaseEnv.step`). Others are silent with several envs: ``success`` of shape
+    ``()`` gives a ``terminated`` of shape ``()``; a reward of shape ``(N, 1)`` or ``()``, or a Python float, is returned
+    and broadcasts against ``(N,)`` into ``(N, N)`` in a trainer. With one env all of them look right.
+
+    Args:
+        evaluate: what ``evaluate()`` returned: a dict with ``success`` and ``fail`` as bool tensors of shape (N,); other
+            entries may be anything, ManiSkill passes them on.
+        reward: (N,) real numbers, or bools, which the rule `reward-rows` reports; None if no reward was computed.
+
+    With one env shape () is allowed too. Tensors may be on any device. The problem's stage is ``returns``; its place is in
+    `source_files`, or None if the hook is inherited. NaN has the right shape: `session.history.env_table` marks it.
+    """
+    from workbench.core.env.evaluate_entries import (  # torch, which the server does without
+        no_reward,
+        wrong_evaluate,
+    )
+
+    message = wrong_evaluate(evaluate, num_envs)
+    if message is not None:
+        return problem_from_return(cls, "evaluate", message, source_files)
+    message = None if reward is None else no_reward(reward, num_envs)
+    if message is not None:
+        return problem_from_return(cls, _REWARD_HOOKS[0], message, source_files)
+    return None
+
+
+def problem_from_return(cls: type, hook: str, message: str, source_files: Collection[Path]) -> Problem:
+    """The problem that `hook` of `cls` returned something wrong, described by `message`.
+
+    A reward's place is the reward hook that the author defined: ManiSkill calls the normalized one, which may call the
+    author's dense one.
+    """
+    hooks = _REWARD_HOOKS if hook in _REWARD_HOOKS else (hook,)
+    found = hook_definition(cls, hooks, source_files)
+    if found is None:
+        return Problem("returns", f"{hooks[0]}() {message}", None, None, None, "")
+    name, (file, line) = found
+    code = linecache.getline(file, line).strip() or None
+    return Problem("returns", f"{name}() {message}", file, line, code, "")
+
+
 def _syntax_problem(exc: SyntaxError) -> Problem:
     assert exc.filename is not None
     text = exc.text or linecache.getline(exc.filename, exc.lineno or 1)
-    # Python's own text for a SyntaxError ends in "(file.py, line 3)", which the place says already.
+    # Python's own text for a SyntaxError ends in "(file.py, line 3)".
     message = _LOCATION_IN_TEXT.sub("", _message(exc))
-    # Only the exception itself: the frames are those of whoever called the compiler.
+    # Only the exception itself: the frames are those of the compiler's caller.
     lines = "".join(tracebacks.format_exception_only(type(exc), exc)).rstrip("\n")
     return Problem("syntax", message, exc.filename, exc.lineno, shorten(text) or None, lines)
 
@@ -241,10 +288,10 @@ def _message(exc: BaseException) -> str:
     name = type(exc).__qualname__
     try:
         text = str(exc)
-    except Exception as failure:  # an author's own __str__ may be what is broken
+    except Exception as failure:  # the author's own __str__ may raise
         text = f"<its __str__ raised {type(failure).__qualname__}>"
     if isinstance(exc, BdbQuit) and not text:
-        text = "a debugger's prompt was left, or had no terminal to ask in; it was called just before this line: remove the call"
+        text = "a debugger's prompt was left, or had no terminal; it was called just before this line: remove the call"
     return shorten(f"{name}: {text}" if text.strip() else name)
 
 

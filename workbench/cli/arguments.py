@@ -101,13 +101,13 @@ class EnvArguments(BatchArguments):
 
 def imported(names: Sequence[str]) -> tuple[str, ...]:
     """Of each ``--import``: modules, which are not imported here."""
-    from workbench.authoring.loading.reference import find_module, is_module_name, not_found
+    from workbench.authoring.loading.reference import find_module, is_module_name, not_found_text
 
     for name in names:
         if not is_module_name(name):
             raise ValueError(f"--import takes the name of a module, as in --import lab.tasks; got {name!r}")
         if find_module(name) is None:
-            raise ValueError(f"--import {name}: {not_found(name)}")
+            raise ValueError(f"--import {name}: {not_found_text(name)}")
     return tuple(names)
 
 

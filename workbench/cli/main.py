@@ -72,9 +72,9 @@ def open_page(
         debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
         debug_wait: load the task only when a debugger has attached. Means --debug.
     """
-    from workbench.authoring.loading.reference import why_not_there
+    from workbench.authoring.loading.reference import why_missing
 
-    if (why := why_not_there(task)) is not None:
+    if (why := why_missing(task)) is not None:
         return refuse(why)
     from workbench.cli.page import open_in_terminal
     from workbench.session.process.debugger import port_for_debugger
@@ -111,9 +111,9 @@ def record(
         debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
             it. Whoever else can log in to this machine can attach as well.
     """
-    from workbench.authoring.loading.reference import why_not_there
+    from workbench.authoring.loading.reference import why_missing
 
-    if (why := why_not_there(recording.task)) is not None:
+    if (why := why_missing(recording.task)) is not None:
         return refuse(why)
     use_private_driver()
     with quick_imports():

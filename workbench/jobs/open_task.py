@@ -20,7 +20,7 @@ from workbench.authoring.loading.load import (
     LoadedTask,
     import_modules,
     load_task,
-    take_back,
+    undo_load,
     with_late_imports,
 )
 from workbench.authoring.loading.reference import TaskName
@@ -29,11 +29,12 @@ from workbench.authoring.problem import (
     Interrupted,
     Problem,
     TaskError,
+    check_step_returns,
     is_ctrl_c,
     problem_from_exception,
+    problem_from_return,
     shorten,
 )
-from workbench.authoring.return_problems import check_step_returns, problem_from_return
 from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.cameras.render import list_cameras, recorded_pictures, segmentation_names, take_pictures
@@ -138,7 +139,7 @@ def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
             raise
         return False
     finally:
-        take_back(loaded)
+        undo_load(loaded)
     return True
 
 
@@ -159,10 +160,10 @@ def open_task(
     try:
         return build_task(loaded, options, opening)
     except TaskError as error:
-        take_back(loaded)
+        undo_load(loaded)
         raise with_advice(error, loaded, options, lambda: load_task(reference)) from error.__cause__
     except BaseException:
-        take_back(loaded)
+        undo_load(loaded)
         raise
 
 

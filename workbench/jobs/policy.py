@@ -21,7 +21,7 @@ from typing import Any
 from workbench.authoring.loading.library_names import (
     files_named_like_libraries,
     is_library,
-    named_like_library,
+    named_like_library_text,
     searched_first,
 )
 from workbench.authoring.loading.watch import SourceWatcher
@@ -76,7 +76,7 @@ def load_policy(reference: str, beside: Path | None = None) -> Policy:
         for file in files_named_like_libraries(path.parent):
             if file not in (path, *_told):
                 _told.add(file)
-                print(named_like_library(file), file=sys.stderr)
+                print(named_like_library_text(file), file=sys.stderr)
         with searched_first(path.parent):
             spec.loader.exec_module(module)
     elif importlib.util.find_spec(package := name.partition(".")[0]) is None:

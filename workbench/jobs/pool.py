@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Protocol, TypeVar
 
-from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_c
+from workbench.authoring.problem import Problem, TaskError, treat_ctrl_c_as_error
 from workbench.machine.processes.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
 from workbench.machine.processes.family import describe_exit, end_family
@@ -373,7 +373,7 @@ def main(socket_fd: str) -> None:
     """Entry of a process, which `machine.processes.family` has started."""
     guard_terminal()
     refuse_breakpoints(ONE_PROCESS)
-    nobody_presses_ctrl_c()
+    treat_ctrl_c_as_error()
     connection = Connection(int(socket_fd))
     share = _FarShare(connection)
     try:

@@ -16,7 +16,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring.loading.reference import RecordedTask, TaskName, is_like_a_file
+from workbench.authoring.loading.reference import RecordedTask, TaskName, looks_like_file
 from workbench.authoring.loading.task_content import CannotRead, TaskContent, read_content
 from workbench.authoring.loading.trust import TrustStore
 from workbench.jobs.from_recording import NoText, below_one_folder
@@ -306,7 +306,7 @@ def asked_files(content: TaskContent, before: Mapping[str, str] | None = None) -
 
 def _registered(reference: RecordedTask) -> TaskName | NotCleared:
     """What is opened by its id, if an installed package has registered it."""
-    if not is_like_a_file(reference.env_id):
+    if not looks_like_file(reference.env_id):
         return reference
     return NotCleared(
         f"a recording names the file {_printable(reference.env_id)} as its task, and a path that a recording names in place of "

@@ -11,7 +11,7 @@ from pathlib import Path
 import mani_skill.envs.tasks
 import pytest
 
-from workbench.authoring.loading.copy_task import NoCopy, copied_text, copy_task
+from workbench.authoring.loading.copy_task import CannotCopy, copied_text, copy_task
 
 TASKS = Path(mani_skill.envs.tasks.__path__[0])
 TEXT = '''"""A task."""
@@ -96,20 +96,20 @@ def test_what_stands_before_all_else_stays_there(installed: Path, text: str, cop
     ],
 )
 def test_what_cannot_be_said_otherwise_is_refused(installed: Path, text: str, why: str) -> None:
-    with pytest.raises(NoCopy, match=why):
+    with pytest.raises(CannotCopy, match=why):
         copied_text(installed, text)
 
 
 def test_a_file_in_no_package_has_nothing_to_import_from_or_to_find_beside_it(tmp_path: Path) -> None:
     for text in ("from .base import x", "print(__file__)"):
-        with pytest.raises(NoCopy, match="line 1"):
+        with pytest.raises(CannotCopy, match="line 1"):
             copied_text(tmp_path / "task.py", text)
 
 
 def test_a_copy_is_never_written_over_another_file(installed: Path, tmp_path: Path) -> None:
     installed.write_text(TEXT)
     folder = tmp_path / "mine"
-    with pytest.raises(NoCopy, match="there is no folder"):
+    with pytest.raises(CannotCopy, match="there is no folder"):
         copy_task(installed, folder)
     folder.mkdir()
     (folder / "task.py").write_text("mine")
@@ -128,7 +128,7 @@ def test_every_file_of_maniskills_tasks_is_copied_with_few_lines_changed_or_refu
             continue
         try:
             new, ids = copied_text(file, text)
-        except NoCopy as reason:
+        except CannotCopy as reason:
             assert "line" in str(reason)
             refused += 1
             continue
@@ -164,7 +164,7 @@ def test_a_copy_that_cannot_be_written_leaves_nothing(
     with monkeypatch.context() as patch:
         for call, number in calls.items():
             patch.setattr(os, call, failing(number))
-        with pytest.raises(NoCopy, match=f"task.py cannot be written: {told}"):
+        with pytest.raises(CannotCopy, match=f"task.py cannot be written: {told}"):
             copy_task(installed, folder)
     assert list(folder.iterdir()) == []
     assert copy_task(installed, folder).file == folder / "task.py"

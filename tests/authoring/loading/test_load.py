@@ -24,8 +24,8 @@ from workbench.authoring.loading import registry
 from workbench.authoring.loading.load import (
     LoadedTask,
     load_task,
-    take_back,
     task_of_class,
+    undo_load,
     with_late_imports,
 )
 
@@ -543,16 +543,16 @@ def test_a_load_whose_class_cannot_be_built_is_taken_back(write: Write) -> None:
         path.write_text(path.read_text() + f"\nNUMBER = {number}\n")
         bad = load_task(str(path))
         assert sys.modules["helper"].SIZE == 2
-        assert take_back(bad) and not take_back(bad)
+        assert undo_load(bad) and not undo_load(bad)
         assert registered() == before
         assert {name: sys.modules.get(name) for name in modules} == modules
         assert "NUMBER" not in inspect.getsource(sys.modules[good.cls.__module__])
     assert with_late_imports(good).source_hash == good.source_hash
     again = load_task(str(path))
-    assert not take_back(good)
+    assert not undo_load(good)
     load_task(str(write("other.py", PUSH.replace("AuthorPush", "AuthorOther"), task=True)))
-    assert not take_back(again)
-    assert not take_back(load_task("PickCube-v1"))
+    assert not undo_load(again)
+    assert not undo_load(load_task("PickCube-v1"))
 
 
 def test_old_versions_are_let_go(write: Write) -> None:
@@ -599,7 +599,7 @@ def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Writ
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is newer.cls
     one.write_text(text)
     again = load_task(str(one))
-    assert take_back(again) and registered() == before
+    assert undo_load(again) and registered() == before
 
 
 def test_what_a_failed_load_put_on_the_search_path_is_gone(write: Write, folder: Path) -> None:

@@ -12,14 +12,14 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from tests.authoring.conftest import Write
 from tests.authoring.refusal import refused
 from workbench.authoring.loading import library_names
-from workbench.authoring.loading.load import class_of_module, import_modules, load_task, take_back
+from workbench.authoring.loading.load import class_of_module, import_modules, load_task, undo_load
 from workbench.authoring.loading.reference import (
     RecordedTask,
-    class_beside,
     find_module,
     followed_folder,
     named_file,
-    why_not_there,
+    reference_to_class,
+    why_missing,
 )
 from workbench.authoring.problem import TaskError
 
@@ -39,7 +39,7 @@ REFERENCE = "lab_of_mine.tasks:MinimalEnv"
 @pytest.fixture(autouse=True)
 def nothing_for_good(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An import is for the rest of the process: not of this one."""
-    monkeypatch.setattr(library_names, "_guarded_for_good", False)
+    monkeypatch.setattr(library_names, "_permanent_folder", False)
     names = set(sys.modules)
     yield
     for name in set(sys.modules) - names:
@@ -66,9 +66,9 @@ def test_it_is_found_without_being_imported(lab: Path) -> None:
     assert named_file(REFERENCE) == lab / "tasks" / "__init__.py"
     assert named_file("lab_of_mine.robots.arm:Arm") == lab / "robots" / "arm.py"
     assert followed_folder(REFERENCE) == lab
-    assert why_not_there(REFERENCE) is None
+    assert why_missing(REFERENCE) is None
     assert not [name for name in sys.modules if name.startswith("lab_of_mine")]
-    why = why_not_there("lab_of_yours.tasks:MinimalEnv")
+    why = why_missing("lab_of_yours.tasks:MinimalEnv")
     assert why is not None and "there is no module lab_of_yours.tasks" in why and str(lab.parent) in why
     assert named_file("lab_of_mine.tasks.nowhere:MinimalEnv") is None
 
@@ -94,7 +94,7 @@ def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> No
     assert task.cls.__module__ == "lab_of_mine.tasks.minimal"
     assert {minimal, arm, lab / "tasks" / "__init__.py"} <= set(task.source_files)
     assert set(task.source_files) <= set(lab.rglob("*.py"))
-    assert class_beside(REFERENCE, minimal, "OtherEnv") == "lab_of_mine.tasks.minimal:OtherEnv"
+    assert reference_to_class(REFERENCE, minimal, "OtherEnv") == "lab_of_mine.tasks.minimal:OtherEnv"
 
     arm.write_text("REACH = 2\n")
     again = load_task(REFERENCE)
@@ -104,7 +104,7 @@ def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> No
     assert (problem.stage, problem.file, problem.line) == ("syntax", str(arm), 1)
     assert REGISTERED_ENVS["LabOfMine-v1"].cls is again.cls
     assert sys.modules["lab_of_mine.tasks.minimal"] is sys.modules[again.cls.__module__]
-    assert take_back(again)
+    assert undo_load(again)
 
 
 def test_a_librarys_module_is_imported_as_it_is() -> None:
@@ -127,7 +127,7 @@ def test_the_current_folder_goes_ahead_of_no_library(
     monkeypatch.chdir(folder)
     monkeypatch.delitem(sys.modules, "colorsys", raising=False)
     assert named_file("torch:MinimalEnv") != folder / "torch.py"
-    assert why_not_there("mani_skill.envs.mine:MinimalEnv") is not None
+    assert why_missing("mani_skill.envs.mine:MinimalEnv") is not None
     import_modules(("lab_of_mine.tasks",))
     assert load_task("LabOfMine-v1").cls is class_of_module("lab_of_mine.tasks", "MinimalEnv")
     assert not str(sys.modules["colorsys"].__file__).startswith(str(folder))

@@ -6,7 +6,7 @@ import pytest
 
 from tests.authoring.conftest import Write
 from tests.authoring.refusal import refused
-from workbench.authoring.loading.load import load_task, take_back
+from workbench.authoring.loading.load import load_task, undo_load
 
 ROBOTS = """
 from mani_skill.agents.registration import register_agent
@@ -37,7 +37,7 @@ def test_it_opens_in_an_empty_scene_and_says_so(write: Write) -> None:
     )
     other = load_task(f"{file}:TallPanda")
     assert (other.chosen, other.default_kwargs) == ("TallPanda", {"robot_uids": "tall_panda"})
-    assert not take_back(task) and take_back(other)
+    assert not undo_load(task) and undo_load(other)
 
 
 def test_an_agent_that_is_not_registered_is_named(write: Write) -> None:

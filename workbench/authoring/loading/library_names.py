@@ -1,11 +1,4 @@
-"""What is a library's and what is the author's: files by where they lie, names by who else needs them.
-
-A folder that goes on ``sys.path`` for a task or a policy goes there first, as with ``python task.py``. A file in it
-that is called ``numpy.py`` or ``queue.py`` would then stand in for the library wherever one imports it late: in the
-middle of an episode, in the renderer, in ours. So the names of the standard library and of what the workbench depends
-on are looked for as if that folder were not there, and the author is told of the file. All other names are found
-beside the file first, as Python does it.
-"""
+"""Tells the author's files and modules from those of libraries."""
 
 from __future__ import annotations
 
@@ -33,21 +26,21 @@ _INSTALLED = tuple(
     }
 )
 LIBRARY_ROOTS = (str(Path(__file__).resolve().parents[2]) + os.sep, *_INSTALLED)
-"""Folders of nobody's own files: the workbench's, and those that Python installs into."""
-_IMPORTED_BY_NOBODY = {"docs", "example", "examples", "scripts", "test", "tests", "utils"}
-"""Packages install such folders by mistake (sapien 3.0.3 an ``example``); authors have their own."""
+"""Folders without files of an author: the workbench's, and those that Python installs into."""
+_INSTALLED_BY_MISTAKE = {"docs", "example", "examples", "scripts", "test", "tests", "utils"}
+"""Packages install such folders by mistake (sapien 3.0.3: ``example``); authors have folders of these names too."""
 
 _author_folders: set[str] = set()
-"""All that was ever put on ``sys.path`` for an author."""
-_guarded_for_good = False
-"""One of them stays there."""
+"""Every folder that was put on ``sys.path`` for an author."""
+_permanent_folder = False
+"""An author's folder stays on ``sys.path``."""
 
 
 def is_own_file(path: str, folder: Path) -> bool:
     """True for the author's files in or below `folder`.
 
-    A task in a project's root has everything below it: a virtual environment, and the workbench
-    itself where it is installed from its repository. Those are nobody's helpers.
+    Below a project's root also lie a virtual environment and, if installed from its repository, the workbench: those are
+    not the author's.
     """
     root = str(folder) + os.sep
     if not path.startswith(root) or path.startswith(LIBRARY_ROOTS):
@@ -58,15 +51,15 @@ def is_own_file(path: str, folder: Path) -> bool:
 
 
 def is_library(name: str) -> bool:
-    """Whether the top-level module `name` is a library's, whatever an author has of that name."""
-    # In this order: what the distributions contain takes a tenth of a second to read, once.
-    if _library_spec(name) is None or name in _IMPORTED_BY_NOBODY:
+    """Whether the top-level module `name` is a library's, also if an author has a file of that name."""
+    # In this order: reading what the distributions contain takes 0.1 s, once.
+    if _library_spec(name) is None or name in _INSTALLED_BY_MISTAKE:
         return False
     return name in sys.stdlib_module_names or name in _dependency_names()
 
 
 def files_named_like_libraries(folder: Path) -> tuple[Path, ...]:
-    """The author's files in `folder` that no ``import`` finds there, because a library has their name."""
+    """The author's files in `folder` that ``import`` does not find, because a library has their name."""
     found: list[Path] = []
     try:
         entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
@@ -84,35 +77,39 @@ def files_named_like_libraries(folder: Path) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def named_like_library(file: Path) -> str:
-    """What an author must know of such a file, in a sentence."""
+def named_like_library_text(file: Path) -> str:
+    """Notice about a file that has the name of a library."""
     return (
         f"{file} has the name of a library: `import {file.stem}` gives the library, here and in every library that "
         "imports it. Rename the file to use it."
     )
 
 
-def search_first(folder: Path, for_good: bool = False) -> None:
-    """Put an author's folder first on ``sys.path``, but for the names of libraries.
+def search_first(folder: Path, permanent: bool = False) -> None:
+    """Put an author's folder first on ``sys.path``, except for the names of libraries.
+
+    As with ``python task.py``, the folder comes first. A ``numpy.py`` or ``queue.py`` in it would replace the library
+    wherever one imports it late: in the middle of an episode, in the renderer, in the workbench. So names of the standard
+    library and of the workbench's dependencies are found as if the folder were not there.
 
     Args:
-        for_good: It stays there, and `stop_guarding` does nothing any more.
+        permanent: the folder stays, and `remove_library_finder` does nothing from now on.
     """
-    global _guarded_for_good
-    _guarded_for_good = _guarded_for_good or for_good
+    global _permanent_folder
+    _permanent_folder = _permanent_folder or permanent
     name = str(folder)
-    # A file of an installed package is opened with the folder of all packages: that stays the libraries'.
+    # site-packages is no author's folder, also if a task in it is opened.
     if folder.name not in LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
         _author_folders.add(name)
-    if not _is_guarded():
+    if not _finder_is_installed():
         sys.meta_path.insert(0, LibraryFinder())
     sys.path[:] = [name, *(entry for entry in sys.path if entry != name)]
 
 
 @contextmanager
 def searched_first(folder: Path) -> Iterator[None]:
-    """As `search_first`, for a while."""
-    path, guarded = list(sys.path), _is_guarded()
+    """`search_first` within the context."""
+    path, guarded = list(sys.path), _finder_is_installed()
     search_first(folder)
     try:
         yield
@@ -120,39 +117,39 @@ def searched_first(folder: Path) -> Iterator[None]:
         added = [entry for entry in sys.path if entry not in (*path, str(folder))]
         sys.path[:] = [*added, *path]
         if not guarded:
-            stop_guarding()
+            remove_library_finder()
 
 
-def stop_guarding() -> None:
-    """No author's folder is on ``sys.path`` any more, unless one is there for good."""
-    if _guarded_for_good:
+def remove_library_finder() -> None:
+    """Remove the finder, once no author's folder is on ``sys.path``; nothing happens if one is permanent."""
+    if _permanent_folder:
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, LibraryFinder)]
 
 
 class LibraryFinder(MetaPathFinder):
-    """Finds the libraries whose names files of the author's have; all else it leaves to others."""
+    """Finds a library where an author's file has its name; other names are left to the next finder."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if path is not None or not _beside(fullname) or not is_library(fullname):
+        if path is not None or not _is_author_module(fullname) or not is_library(fullname):
             return None
         return _library_spec(fullname)
 
 
-def _is_guarded() -> bool:
+def _finder_is_installed() -> bool:
     return any(isinstance(finder, LibraryFinder) for finder in sys.meta_path)
 
 
-def _beside(name: str) -> bool:
-    """Whether an author has something of that name where it would be found."""
+def _is_author_module(name: str) -> bool:
+    """Whether a module of that name is in an author's folder on ``sys.path``."""
     folders = [entry for entry in sys.path if entry in _author_folders]
     return PathFinder.find_spec(name, folders) is not None
 
 
 def _library_spec(name: str) -> ModuleSpec | None:
-    """Where `name` is found without the authors' folders."""
+    """The spec of `name`, searched without the authors' folders."""
     for finder in (BuiltinImporter, FrozenImporter):
         if (spec := finder.find_spec(name)) is not None:
             return spec
@@ -161,11 +158,11 @@ def _library_spec(name: str) -> ModuleSpec | None:
 
 @lru_cache
 def _dependency_names() -> frozenset[str]:
-    """Top-level modules of the workbench and of all that it depends on, as far as it is installed."""
+    """Top-level modules of the workbench and of its installed dependencies."""
     found: set[str] = set()
-    wanted = [DISTRIBUTION]
-    while wanted:
-        name = _plain(wanted.pop())
+    pending = [DISTRIBUTION]
+    while pending:
+        name = _plain(pending.pop())
         if name in found:
             continue
         try:
@@ -173,13 +170,13 @@ def _dependency_names() -> frozenset[str]:
         except importlib.metadata.PackageNotFoundError:
             continue  # for another platform, or another version of Python
         found.add(name)
-        wanted += [
-            said[0]
+        pending += [
+            match[0]
             for line in required
-            if "extra ==" not in line and (said := re.match(r"[\w.-]+", line)) is not None
+            if "extra ==" not in line and (match := re.match(r"[\w.-]+", line)) is not None
         ]
     of = importlib.metadata.packages_distributions()
-    # What was removed by halves has no name.
+    # A half-removed distribution has no name.
     tops = (top for top in of if found.intersection(_plain(owner) for owner in of[top] if owner))
     return frozenset({"workbench", *tops})
 

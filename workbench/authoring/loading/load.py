@@ -1,11 +1,4 @@
-"""From what a person names (a file, a class in it or in a module, a registered id) to the task class.
-
-A load is all or nothing. The file is executed afresh, with the modules beside it, and either gives
-a class, or the process is as it was: the last good version's modules stand in ``sys.modules``
-again (it may import lazily, while it runs on behind the banner), its classes in ManiSkill's
-tables, its text in tracebacks. Whatever stands in the way, from a wrong path to ``exit()`` at the
-end of a script, is a `TaskError` that says what to do, at the author's line where there is one.
-"""
+"""Loads the task class of a file, a class reference or a registered id; a failed load changes nothing."""
 
 from __future__ import annotations
 
@@ -14,6 +7,7 @@ import difflib
 import importlib
 import inspect
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,16 +16,21 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from workbench.authoring.loading import registry
-from workbench.authoring.loading.import_problems import import_problem, named_module_problem
-from workbench.authoring.loading.library_names import named_like_library, search_first, stop_guarding
+from workbench.authoring.loading.library_names import (
+    files_named_like_libraries,
+    is_own_file,
+    named_like_library_text,
+    remove_library_finder,
+    search_first,
+)
 from workbench.authoring.loading.modules import (
     AuthorFinder,
     ModuleName,
-    SetAside,
+    UnloadedModules,
     hidden_by_libraries,
-    put_back,
     read_source,
-    set_aside,
+    restore_modules,
+    unload_modules,
 )
 from workbench.authoring.loading.reference import (
     NamedModule,
@@ -40,12 +39,12 @@ from workbench.authoring.loading.reference import (
     file_and_class,
     find_module,
     is_module_name,
-    not_found,
+    not_found_text,
     split_reference,
 )
-from workbench.authoring.loading.task_classes import Robot, choose_task, no_such_class, shown_in_a_scene
+from workbench.authoring.loading.task_classes import Robot, choose_task, missing_class, robot_scene_text
 from workbench.authoring.loading.task_content import source_hash
-from workbench.authoring.problem import TaskError, is_ctrl_c, refused
+from workbench.authoring.problem import Problem, TaskError, is_ctrl_c, problem_from_exception, task_error
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
@@ -75,43 +74,42 @@ class LoadedTask:
     """sha256 over `source`, 12 hex digits; the same wherever the files lie."""
     max_episode_steps: int | None
     default_kwargs: dict[str, Any]
-    """What ``@register_env`` was given for the class's constructor."""
+    """Constructor arguments from ``@register_env``."""
     followed: bool
-    """True for a file that is to be followed; False for an id that was registered elsewhere."""
+    """True if the file is watched; False for an id that was registered elsewhere."""
     others: tuple[str, ...] = ()
-    """Further task classes of the file, and robots if it has no task, to be had as ``file.py:Name``."""
+    """Further task classes of the file (robots if it has no task), which ``file.py:Name`` opens."""
     alternatives: tuple[str, ...] = ()
-    """Those that may be opened in its place if it fails, in the order of trying; none where a class was named."""
+    """Those of `others` to try if this one fails, in order; none if a class was named."""
     in_place_of: RefusedClass | None = None
-    """What was tried first, and failed."""
+    """The class that was tried first and failed."""
     robot: Robot | None = None
-    """Of a file that has no task: the one that is shown in a scene of ManiSkill's."""
+    """Shown in a scene of ManiSkill, for a file without a task."""
     replaced_ids: tuple[str, ...] = ()
-    """Ids that belonged to somebody else (``PickCube-v1``): plain ManiSkill would have skipped this
-    file's class under them."""
+    """Ids that another task had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
     named_like_libraries: tuple[Path, ...] = ()
-    """Files in the folder that it imports from, and that no import finds there."""
+    """Files of its folder that no import finds, because a library has their name."""
 
     @property
     def chosen(self) -> str:
-        """The name in the file of what is open: a task class, or a robot's."""
+        """Name of the open class: the task's, or the robot's."""
         return self.class_name if self.robot is None else self.robot.class_name
 
     @property
     def asset_ids(self) -> tuple[str, ...]:
-        """What it was registered to need, and has to be downloaded."""
+        """Assets that its registration names, to be downloaded."""
         spec = registry.environment(self.env_id)
         return () if spec is None else tuple(spec.asset_download_ids or ())
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What its author should know although it works, in sentences."""
-        found = [named_like_library(file) for file in self.named_like_libraries]
+        """Sentences for the author about a task that works."""
+        found = [named_like_library_text(file) for file in self.named_like_libraries]
         if self.in_place_of is not None:
             name, why = self.in_place_of.name, self.in_place_of.why
             found.append(f"{name} was tried first and failed ({why}): {self.chosen} is open in its place.")
         if self.robot is not None and self.file is not None:
-            found.append(shown_in_a_scene(self.robot, self.file))
+            found.append(robot_scene_text(self.robot, self.file))
         if self.replaced_ids:
             ids = ", ".join(self.replaced_ids)
             found.append(
@@ -127,25 +125,28 @@ class _Load:
     registrations: registry.Registrations
     before: _Load | None
     """The load of the same file that this one replaced."""
-    aside: SetAside | None
-    """What stood in ``sys.modules`` before it; None once another load has built on this one."""
+    unloaded: UnloadedModules | None
+    """The modules before it; None once a later load depends on this one."""
     cls: type[BaseEnv] | None = None
-    """What it gave."""
+    """The class that it gave."""
 
 
 _loads: dict[Path, _Load] = {}
-"""The last good load of each file. ``sys.modules`` and the registries are of the process, so this is."""
+"""The last good load of each file. Global, as ``sys.modules`` and the registries are."""
 
 
 def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> LoadedTask:
     """Import the task that `reference` names: ``file.py``, ``file.py:ClassName``, ``package.module:ClassName`` or an id.
 
-    What a recording names (`RecordedTask`) is a registered id, or texts that a person agreed to; no path out of a
-    recording is followed.
+    All or nothing: the file is executed afresh with the modules of its folder. If that fails, the modules, registrations
+    and tracebacks of the last good version are restored: it may be running, and import lazily.
 
-    `source` gives, by path, texts to use in place of what is on disk, for the task's file and for
-    modules beside it; files in it need not exist. Raises `TaskError`, and lets a person's Ctrl-C
-    through; in either case all is as it was before.
+    Args:
+        reference: of a `RecordedTask` only a registered id or approved texts are opened, never a path.
+        source: texts by path that replace the files on disk; those files need not exist.
+
+    Raises:
+        TaskError: with the author's line where there is one. KeyboardInterrupt by a person is passed on.
     """
     if isinstance(reference, RecordedTask):
         return _load_recorded(reference, source or {})
@@ -161,18 +162,18 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
 
 
 def with_late_imports(task: LoadedTask) -> LoadedTask:
-    """`task` with those modules added that it has imported since, inside its hooks."""
+    """`task` with the modules that its hooks have imported since added."""
     load = _load_of(task)
     return task if load is None else dataclasses.replace(task, **_source_fields(load.finder))
 
 
-def take_back(task: LoadedTask) -> bool:
+def undo_load(task: LoadedTask) -> bool:
     """Undo the load that gave `task`, as if it had failed: for a class that imports but cannot be built.
 
-    Only the newest load can be taken back; False for any other, and for a task that is not followed.
+    Only the newest load can be undone; returns False for any other, and for a task that is not watched.
     """
     load = _load_of(task)
-    if load is None or load.aside is None or sys.modules.get(load.finder.main) is None:
+    if load is None or load.unloaded is None or sys.modules.get(load.finder.main) is None:
         return False
     if load.cls is not task.cls:
         return False
@@ -186,61 +187,58 @@ def _load_of(task: LoadedTask) -> _Load | None:
 
 def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
     if task.approved is None:
-        # A file that was asked about and not approved is not here; `env_id` may look like a path, and is none.
+        # A file that was not approved is not opened; `env_id` may look like a path and is not read as one.
         if registry.environment(task.env_id) is None:
-            raise refused(
+            raise task_error(
                 f"a recording names the task {task.env_id!r}, and no installed package registers one of that id. {IMPORT_HINT}"
             )
         return _registered(task.env_id)
     if task.file is None or task.file not in task.approved:
-        raise refused(f"the texts that were agreed to do not hold the file of {task.env_id}")
+        raise task_error(f"the approved texts do not include the file of {task.env_id}")
     return _load_file(Path(task.file), task.class_name, {**task.approved, **source}, only_given=True)
 
 
 def import_module(name: str) -> ModuleType:
-    """Import a module that a person named, as Python does it; see `reference` for where it is looked for.
-
-    Raises TaskError.
-    """
+    """Import a module that a person named, as Python does; `find_module` says where it is searched. Raises TaskError."""
     if name in sys.modules:
         return sys.modules[name]
     found = find_module(name)
     if found is None:
-        raise refused(not_found(name))
+        raise task_error(not_found_text(name))
     if found.search_folder is not None and str(found.search_folder) not in sys.path:
-        search_first(found.search_folder, for_good=True)
+        search_first(found.search_folder, permanent=True)
     try:
         return importlib.import_module(name)
     except BaseException as exc:
         if is_ctrl_c(exc):
             raise
-        raise TaskError(named_module_problem(exc, found)) from exc
+        raise TaskError(_named_module_problem(exc, found)) from exc
 
 
 def import_modules(names: Sequence[str]) -> None:
-    """Import what a person named with ``--import``, for the ids that it registers. Raises TaskError."""
+    """Import the modules of ``--import``, for the ids that they register. Raises TaskError."""
     for name in names:
         import_module(name)
 
 
 def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
-    """A task class of a module that is imported as Python does it. Raises TaskError."""
+    """A task class of a module that is imported as Python does. Raises TaskError."""
     module = import_module(name)
     cls = getattr(module, class_name, None)
     if not isinstance(cls, type) or not registry.is_task(cls):
         names = [value.__name__ for value in vars(module).values() if registry.is_task(value)]
-        raise no_such_class(class_name, cls, name, Path(module.__file__ or name), names)
+        raise missing_class(class_name, cls, name, Path(module.__file__ or name), names)
     return cls
 
 
 def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask:
-    """``package.module:ClassName``: as its file is loaded, with the package's modules beside it.
+    """Load ``package.module:ClassName`` as its file, with the package's modules.
 
-    A library's module is imported as it is: nobody edits it, and others have its classes.
+    A library's module is imported as it is: it is not edited, and other code has its classes.
     """
     found = find_module(name)
     if found is None:
-        raise refused(not_found(name))
+        raise task_error(not_found_text(name))
     place = _place_of(found)
     if place is None:
         cls = class_of_module(name, class_name)
@@ -250,7 +248,7 @@ def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask
     file = Path(home.__file__ or found.file)
     if file == found.file or str(file) not in task.source:
         return task
-    # A package imports its tasks from the modules in which they are written: there is what is edited and followed.
+    # The package only imports the class from another of its modules, which is the one to edit and watch.
     _revert(_loads[found.file])
     return _load_file(
         file, task.class_name, given, named=dataclasses.replace(place, name=task.cls.__module__)
@@ -271,35 +269,35 @@ def _load_file(
     named: ModuleName | None = None,
 ) -> LoadedTask:
     finder = AuthorFinder(file, given, only_given, named)
-    # Of a package that was named everything is read again, the module in which its task is written too.
+    # Every module of a named package is read again, also the one that defines its task.
     package = None if named is None else named.own_folder
     others = {
         load.finder.main
         for path, load in _loads.items()
         if path != file and not (package is not None and path.is_relative_to(package))
     }
-    load = _begin(finder, set_aside(finder, others.__contains__))
+    load = _begin(finder, unload_modules(finder, others.__contains__))
     with registry.registering(finder.texts.__contains__, load.registrations):
         try:
             module = importlib.import_module(finder.main)
             task = _task_in(module, class_name, load)
         except BaseException as exc:
-            # Before anything is put back: the problem's lines are those of the text that failed.
-            problem = None if is_ctrl_c(exc) else import_problem(exc, finder)
+            # Before the modules are restored: the problem's lines are those of the text that failed.
+            problem = None if is_ctrl_c(exc) else _import_problem(exc, finder)
             _revert(load)
             if problem is None:
                 raise
             raise TaskError(problem) from exc
     for earlier in _loads.values():
         if earlier is not load:
-            earlier.aside = None
-    # With them would live every version there ever was.
+            earlier.unloaded = None
+    # Else every earlier version would stay in memory.
     if load.before is not None:
-        load.before.aside = load.before.before = None
+        load.before.unloaded = load.before.before = None
     return task
 
 
-def _begin(finder: AuthorFinder, aside: SetAside) -> _Load:
+def _begin(finder: AuthorFinder, unloaded: UnloadedModules) -> _Load:
     before = _loads.get(finder.file)
     if before is not None:
         before.registrations.undo()
@@ -307,21 +305,21 @@ def _begin(finder: AuthorFinder, aside: SetAside) -> _Load:
     if not finder.only_given:
         search_first(finder.search_folder)
     sys.meta_path.insert(0, finder)
-    # A helper that was created a moment ago is not in the listing of its folder that Python keeps.
+    # Python's cached folder listing lacks a helper that was just created.
     importlib.invalidate_caches()
-    _loads[finder.file] = load = _Load(finder, registry.Registrations(), before, aside)
+    _loads[finder.file] = load = _Load(finder, registry.Registrations(), before, unloaded)
     return load
 
 
 def _revert(load: _Load) -> None:
-    assert load.aside is not None
+    assert load.unloaded is not None
     load.registrations.undo()
     sys.meta_path.remove(load.finder)
-    put_back(load.aside, load.finder)
+    restore_modules(load.unloaded, load.finder)
     if load.before is None:
         del _loads[load.finder.file]
         if not _loads:
-            stop_guarding()
+            remove_library_finder()
     else:
         load.before.registrations.redo()
         sys.meta_path.insert(0, load.before.finder)
@@ -332,18 +330,20 @@ def _revert(load: _Load) -> None:
 
 
 def _parse(reference: str) -> tuple[Path, str | None]:
-    """File and class of what is no registered id."""
+    """File and class of a reference that is no registered id."""
     if not reference.strip():
-        raise refused(
+        raise task_error(
             "no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1"
         )
     path, name = file_and_class(reference)
     if name is not None and not _exists(reference):
         if not name.isidentifier():
-            raise refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
+            raise task_error(
+                f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv"
+            )
         return _resolve(path), name
     if is_module_name(reference) and not _exists(reference) and find_module(reference) is not None:
-        raise refused(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
+        raise task_error(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
     if _looks_like_path(reference):
         return _resolve(reference), None
     raise _unknown_id(reference)
@@ -362,7 +362,7 @@ def _looks_like_path(reference: str) -> bool:
 def _exists(reference: str) -> bool:
     try:
         return Path(reference).exists()
-    except (OSError, ValueError):  # a name too long, or with a null byte in it
+    except (OSError, ValueError):  # too long, or with a null byte
         return False
 
 
@@ -370,7 +370,7 @@ def _resolve(path: str | Path) -> Path:
     try:
         return Path(path).expanduser().resolve()
     except (OSError, RuntimeError, ValueError) as exc:  # no such user's home; a loop of links; a null byte
-        raise refused(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
+        raise task_error(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
 
 
 def _check_file(file: Path) -> None:
@@ -378,37 +378,37 @@ def _check_file(file: Path) -> None:
         if file.is_dir():
             names = sorted(path.name for path in file.glob("*.py"))[:5]
             inside = f", for example {' or '.join(names)}" if names else " (there is none in it)"
-            raise refused(f"{file} is a folder; name a .py file in it{inside}")
+            raise task_error(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
             raise _missing(file)
         if not file.is_file():
-            # A pipe, say: reading it would wait for ever. A device, which a link may lead to, may have no end.
-            raise refused(f"{file} is not an ordinary file")
+            # Reading a pipe may wait for ever, and a device may have no end.
+            raise task_error(f"{file} is not an ordinary file")
         if file.suffix != ".py":
-            raise refused(
+            raise task_error(
                 f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
             )
     except OSError as exc:
-        raise refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
+        raise task_error(f"cannot look at the file ({exc.strerror}): {file}") from exc
 
 
 def _missing(file: Path) -> TaskError:
     if not file.parent.is_dir():
-        return refused(f"{file} does not exist, nor does its folder {file.parent}")
+        return task_error(f"{file} does not exist, nor does its folder {file.parent}")
     names = difflib.get_close_matches(file.name, [path.name for path in file.parent.glob("*.py")], n=3)
     hint = f"; did you mean {' or '.join(names)}?" if names else ""
-    return refused(f"{file} does not exist{hint}")
+    return task_error(f"{file} does not exist{hint}")
 
 
 def _unknown_id(env_id: str) -> TaskError:
     if registry.is_other_gymnasium_id(env_id):
-        return refused(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
+        return task_error(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
     ids = {known.lower(): known for known in registry.environment_ids()}
     close = [ids[name] for name in difflib.get_close_matches(env_id.lower(), list(ids), n=3)]
     hint = (
         f"did you mean {' or '.join(close)}?" if close else "give a .py file, or an id such as PickCube-v1."
     )
-    return refused(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
+    return task_error(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
 
 
 IMPORT_HINT = (
@@ -421,17 +421,16 @@ IMPORT_HINT = (
 
 
 def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
-    """What is known of a class that is there already, under whatever id it goes.
+    """The `LoadedTask` of a class that exists already.
 
-    If it came from a file that `load_task` read, with the texts that were executed; else with those on disk.
+    With the executed texts if `load_task` loaded its file, else with the text on disk.
     """
     for load in _loads.values():
-        # A class of others that the file only imports has its own file.
+        # Not a class that the file only imports.
         registered = any(made.cls is cls and made.name == env_id for made in load.registrations.made)
         if registered or cls.__module__ in load.finder.names:
             return _task(cls, env_id, load.finder.file, followed=True, **_source_fields(load.finder))
-    # Of a class made without a file (in a notebook, or by type()), and of one that is shipped as bytecode only,
-    # there is no text to keep.
+    # A class made without a file (in a notebook, by type()) or shipped as bytecode has no text.
     with suppress(TypeError, OSError, SyntaxError):
         file = Path(inspect.getsourcefile(cls) or "").resolve()
         return _task(cls, env_id, file, **_fields({str(file): read_source(file)}, file, file.parent))
@@ -461,10 +460,10 @@ def _registered(env_id: str) -> LoadedTask:
     return dataclasses.replace(task_of_class(spec.cls, env_id), followed=False)
 
 
-def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
+def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTask:
     finder = load.finder
     text = finder.texts[str(finder.file)]
-    chosen = choose_task(module, wanted, finder.file, text, load.registrations)
+    chosen = choose_task(module, requested, finder.file, text, load.registrations)
     load.cls = chosen.cls
     task = _task(
         chosen.cls,
@@ -486,10 +485,77 @@ def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
 
 
 def _fields(source: Mapping[str, str], file: Path | None, folder: Path) -> dict[str, Any]:
-    # A helper may have been read first, where the file is part of a package.
+    # In a package a helper may have been read first.
     files = sorted((Path(path) for path in source), key=lambda path: path != file)
     return {
         "source_files": tuple(files),
         "source": {str(path): source[str(path)] for path in files},
         "source_hash": source_hash(source, folder),
     }
+
+
+# --- failed imports ------------------------------------------------------------------------------
+
+
+def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
+    """The problem for the author of the file whose import raised `exc`, with a hint what to do."""
+    if isinstance(exc, TaskError):
+        return exc.problem
+    problem = problem_from_exception(exc, "import", [Path(path) for path in finder.texts])
+    message = problem.message
+    if isinstance(exc, registry.DuplicateName):
+        message = str(exc)
+    elif isinstance(exc, SystemExit):
+        message = (
+            f"the file ended the program (SystemExit: {exc.code}) while being imported; what is only for "
+            'running it as a script belongs under `if __name__ == "__main__":`'
+        )
+    elif isinstance(exc, ModuleNotFoundError) and exc.name:
+        message = f"{message}; {_module_hint(exc.name, finder)}"
+    elif isinstance(exc, ImportError) and (file := _named_like(exc.name, finder)) is not None:
+        message = f"{message}; {named_like_library_text(file)}"
+    elif isinstance(exc, OSError) and exc.filename == str(finder.file) and problem.file is None:
+        message = f"{finder.file} cannot be read: {exc.strerror}; is it being written just now?"
+    if problem.file is None:
+        # None of the author's code ran yet, but this file is the one that cannot be loaded.
+        problem = dataclasses.replace(problem, file=str(finder.file))
+    return dataclasses.replace(problem, message=message)
+
+
+def _named_module_problem(exc: BaseException, module: NamedModule) -> Problem:
+    """The problem of a named module that is imported as Python does."""
+    folder = module.own_folder or module.file.parent
+    files = [Path(frame.filename) for frame in traceback.extract_tb(exc.__traceback__)]
+    if isinstance(exc, SyntaxError) and exc.filename is not None:
+        files.append(Path(exc.filename))
+    own = [file for file in files if file == module.file or is_own_file(str(file), folder)]
+    problem = problem_from_exception(exc, "import", own)
+    message = f"{module.name} cannot be imported: {problem.message}"
+    return dataclasses.replace(problem, message=message, file=problem.file or str(module.file))
+
+
+def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
+    """The author's file that has the name of the library `name`."""
+    top = (name or "").partition(".")[0]
+    return next((file for file in files_named_like_libraries(finder.search_folder) if file.stem == top), None)
+
+
+def _module_hint(name: str, finder: AuthorFinder) -> str:
+    if (file := _named_like(name, finder)) is not None:
+        return named_like_library_text(file)
+    top = name.partition(".")[0]
+    if Path(f"{top}.py").is_file() or Path(top, "__init__.py").is_file():
+        return (
+            f"there is one in the folder where the command was started, which is not searched: move {top} beside the "
+            "file, or name its folder in PYTHONPATH"
+        )
+    beside = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
+    if finder.only_given and name.rpartition(".")[2] in beside:
+        return (
+            f"{name} lies beside the file, but was not among what you were asked about; open {finder.file} by its name "
+            "to run it with all that lies beside it"
+        )
+    close = difflib.get_close_matches(name, beside, n=1)
+    if close:
+        return f"there is {close[0]}.py beside the file"
+    return f"neither beside the file nor installed for {sys.executable}"

@@ -1,18 +1,4 @@
-"""The author's modules in Python's own tables: found, executed fresh, and put back.
-
-`importlib.reload` is the wrong tool for a file that is executed on every save: it runs the new text
-in the old namespace, so names that were deleted live on, and it does nothing for the modules
-beside the file. Python's own import is wrong too, in one small way that bites: it believes a
-``.pyc`` whose recorded modification time, in whole seconds, and size match the source, so of two
-saves within a second that change ``0.1`` to ``0.2`` the second is not seen.
-
-So each task has an `AuthorFinder` on ``sys.meta_path``. It finds what lies in the task's folder as
-Python would, but compiles from text alone, remembers every text it executed (that is what the
-watcher follows, what a recording keeps, and what `linecache` must show in tracebacks although the
-file on disk has moved on), and can be given texts to use in place of what is on disk, which is how
-the last good version comes back. `set_aside` takes the author's modules out of ``sys.modules`` so
-that an edited helper is read again, and `put_back` undoes that.
-"""
+"""Finds, executes and unloads an author's modules, without bytecode files and stale namespaces."""
 
 from __future__ import annotations
 
@@ -46,19 +32,18 @@ _MODULE_PREFIX = "workbench_task_"
 
 @dataclass(frozen=True)
 class ModuleName:
-    """How a task's file is called in ``sys.modules``, and what must be on ``sys.path`` for it."""
+    """Name of a task's file in ``sys.modules``, and the folder that must be on ``sys.path``."""
 
     name: str
     search_folder: Path
     own_folder: Path
-    """What is in or below it is its author's, and comes in with it."""
+    """Files in or below it are the author's."""
 
 
 def module_name(file: Path) -> ModuleName:
-    """A name that is the same for every load of `file` and that no other module has.
+    """The module name of `file`: unique, and the same at every load.
 
-    A file in a package (its folder has an ``__init__.py``) goes by its dotted name, because only
-    then do its relative imports work.
+    A file in a package (its folder has an ``__init__.py``) has its dotted name, which relative imports need.
     """
     if (file.parent / "__init__.py").is_file():
         parts, folder = [] if file.stem == "__init__" else [file.stem], file.parent
@@ -72,13 +57,19 @@ def module_name(file: Path) -> ModuleName:
 
 
 def hidden_by_libraries(file: Path, search_folder: Path | None = None) -> tuple[Path, ...]:
-    """Files beside the task `file` that it cannot import; the task's own file may have any name."""
+    """Files in the folder of the task `file` that it cannot import because a library has their name."""
     folder = search_folder or module_name(file).search_folder
     return tuple(found for found in files_named_like_libraries(folder) if found != file)
 
 
 class AuthorFinder(MetaPathFinder):
-    """Finds and executes the modules of one task: its file, and what lies in the folder beside it."""
+    """Finds and executes the modules of one task: its file, and those of its folder.
+
+    `importlib.reload` runs new text in the old namespace, so deleted names live on, and ignores the other modules of the
+    folder. Python's own import trusts a ``.pyc`` whose modification time (in whole seconds) and size match, so of two saves
+    within a second that change ``0.1`` to ``0.2`` it misses the second. This finder compiles from text alone and keeps every
+    text it executed, for the watcher, for recordings, and for `linecache`, whose tracebacks must show the text that ran.
+    """
 
     def __init__(
         self,
@@ -87,32 +78,32 @@ class AuthorFinder(MetaPathFinder):
         only_given: bool = False,
         named: ModuleName | None = None,
     ) -> None:
-        """`named` is how a person named the module; else its name follows from where the file lies."""
+        """`named` is the module as a person named it; None derives the name from the file's path."""
         self.file = file
         place = named or module_name(file)
         self.main, self.search_folder, self.own_folder = place.name, place.search_folder, place.own_folder
         self.goes_by_stem = named is None
-        """A helper may import the task by its file's name."""
+        """Helpers may import the task by its file's name."""
         self.given = given
-        """Path to text that is used in place of what is on disk."""
+        """Path to text that replaces the file on disk."""
         self.only_given = only_given
-        """Nothing else in the folder is executed: a recording named the file, and a person agreed to these texts."""
+        """Execute no other file of the folder: a recording named the task, and a person approved these texts."""
         self.texts: dict[str, str] = {}
-        """Path to text of everything read so far, in order; the task's own file first."""
+        """Path to text of the files read so far, in order."""
         self.names: list[str] = []
-        """Names in ``sys.modules`` of what was executed."""
+        """Names in ``sys.modules`` of the executed modules."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
         if fullname == self.main:
             return self._spec(fullname, str(self.file), is_package=self.file.stem == "__init__")
-        spec = self._beside(fullname, path, target)
+        spec = self._find_in_folder(fullname, path, target)
         if spec is not None and path is None and is_library(fullname):
             return None
         return spec
 
-    def _beside(
+    def _find_in_folder(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None
     ) -> importlib.machinery.ModuleSpec | None:
         last = fullname.rpartition(".")[2]
@@ -137,10 +128,10 @@ class AuthorFinder(MetaPathFinder):
     def _given_folder(
         self, fullname: str, last: str, path: Sequence[str] | None
     ) -> importlib.machinery.ModuleSpec | None:
-        """For a name that is no given text: what is installed, else a folder of given texts without an ``__init__.py``.
+        """For a name without a given text: an installed module, else a folder of given texts without an ``__init__.py``.
 
-        Raises ModuleNotFoundError for what lies beside the file, where an earlier task, or the code itself, has put the
-        folder on ``sys.path``: Python would go on to `PathFinder`, and find it.
+        Raises ModuleNotFoundError for other files of the folder: if an earlier task, or the code itself, has put the folder
+        on ``sys.path``, Python would go on to `PathFinder` and find them.
         """
         root = str(self.file.parent)
         places = [place for place in (sys.path if path is None else path) if not _is_in(place, root)]
@@ -167,22 +158,22 @@ class AuthorFinder(MetaPathFinder):
 
     @property
     def _is_newest(self) -> bool:
-        """Whether what is imported now is imported for this task, and not for one that was loaded after it."""
+        """Whether no other task was loaded after this one, so that imports are for this one."""
         return next((f for f in sys.meta_path if isinstance(f, AuthorFinder)), None) is self
 
     def text(self, path: str) -> str:
-        """What is executed for `path`. Raises OSError, or SyntaxError for what is no text."""
+        """The text to execute for `path`. Raises OSError, or SyntaxError if it is not text."""
         if path in self.given:
             return self.given[path]
         raw = read_regular_file(path, MOST_SOURCE_BYTES)
         try:
             return decode(path, raw)
         except SyntaxError:
-            # The author is to be shown the line, and this is one of their files.
-            self.remember(path, raw.decode(errors="replace"))
+            # So that the problem's line can be shown.
+            self.add_text(path, raw.decode(errors="replace"))
             raise
 
-    def remember(self, path: str, text: str) -> None:
+    def add_text(self, path: str, text: str) -> None:
         self.texts[path] = text
         show_in_tracebacks(path, text)
 
@@ -196,7 +187,7 @@ class AuthorFinder(MetaPathFinder):
 
 
 class _AuthorLoader(importlib.machinery.SourceFileLoader):
-    """Executes one text. Has no part in bytecode files: they are neither read nor written."""
+    """Executes one text. Reads and writes no bytecode files."""
 
     def __init__(self, finder: AuthorFinder, name: str, path: str) -> None:
         super().__init__(name, path)
@@ -209,10 +200,10 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
         text = self.finder.text(path)
-        # Before compile(): a SyntaxError's place must be looked up in the text that has it.
-        self.finder.remember(path, text)
+        # Before compile(): the line of a SyntaxError is looked up in this text.
+        self.finder.add_text(path, text)
         if "\0" in text:
-            # What Python raises here names neither file nor line.
+            # Python's own error names neither file nor line.
             line = text[: text.index("\0")].count("\n") + 1
             raise SyntaxError("source code cannot contain null bytes", (path, line, 1, None))
         return compile(text, path, "exec", dont_inherit=True)
@@ -223,8 +214,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
         stem = self.finder.file.stem
         is_main = name == self.finder.main and self.finder.goes_by_stem
         if is_main and stem not in sys.modules and not is_library(stem):
-            # A helper that imports the task by its file's name must get this module: executed a
-            # second time under another name, it would register its ids twice.
+            # A helper that imports the task by its file's name must get this module: a second one, under another name,
+            # would register its ids twice.
             sys.modules[stem] = module
             self.finder.names.append(stem)
         exec(self.get_code(name), module.__dict__)
@@ -234,8 +225,8 @@ def read_source(path: str | Path) -> str:
     """The text of a Python source file, see `decode`.
 
     Raises:
-        OSError: it cannot be read, also because it is no regular file or larger than any program.
-        SyntaxError: it is no text.
+        OSError: it cannot be read, is not a regular file, or is larger than any program.
+        SyntaxError: it is not text.
     """
     return plain_line_ends(read_exactly(path)[1])
 
@@ -278,8 +269,8 @@ def _is_in(path: str, root: str) -> bool:
 
 
 @dataclass(frozen=True)
-class SetAside:
-    """The author's modules, and what tracebacks showed of them, while a new version is tried."""
+class UnloadedModules:
+    """The author's modules and their `linecache` entries, while a new version is tried."""
 
     modules: dict[str, ModuleType]
     lines: dict[str, Any]
@@ -287,31 +278,31 @@ class SetAside:
 
 
 _libraries: dict[str, ModuleType] = {}
-"""Modules that are nobody's own, as far as they were looked at: to look at three thousand takes 7 ms."""
+"""Modules known to be a library's, since checking three thousand takes 7 ms."""
 
 
-def set_aside(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> SetAside:
-    """Take the author's modules out of ``sys.modules``: those in the folder, other tasks' helpers.
+def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> UnloadedModules:
+    """Remove the author's modules from ``sys.modules``, so that edited helpers are read again.
 
-    The latter because ``helper`` of another task's folder would be found in ``sys.modules`` before
-    ``helper`` of this one. Main modules of other tasks stay (`is_other_task` of their name): nothing
-    imports them by name, and their classes may be in use.
+    Those of the folder, and helpers of other tasks: ``helper`` of another folder would be found before this one's. Main
+    modules of other tasks stay (`is_other_task` of their name): they are not imported by name, and their classes may be in
+    use.
     """
     folder = finder.own_folder
-    aside: dict[str, ModuleType] = {}
+    unloaded: dict[str, ModuleType] = {}
     for name, module in list(sys.modules.items()):
         if name in ("__main__", "__mp_main__") or is_other_task(name):
             continue
         if _libraries.get(name) is module and name != finder.main:
             continue
-        # Not getattr: modules that import lazily would import on being asked.
+        # Not getattr, which makes lazy modules import.
         attributes = getattr(module, "__dict__", {})
         spec, file = attributes.get("__spec__"), attributes.get("__file__")
         if name == finder.main or isinstance(getattr(spec, "loader", None), _AuthorLoader):
-            aside[name] = module
+            unloaded[name] = module
         elif isinstance(file, str):
             if file.endswith(".py") and is_own_file(file, folder):
-                aside[name] = module
+                unloaded[name] = module
             elif file.startswith(LIBRARY_ROOTS):
                 _libraries[name] = module
         elif spec is not None and spec.origin is None and spec.submodule_search_locations is not None:
@@ -319,35 +310,34 @@ def set_aside(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> Set
             # of the namespace module, and would get the old one without any import.
             places = [os.path.join(place, "x.py") for place in spec.submodule_search_locations]
             if any(is_own_file(place, folder) for place in places):
-                aside[name] = module
+                unloaded[name] = module
     lines: dict[str, Any] = {
         path: entry for path, entry in linecache.cache.items() if is_own_file(path, folder)
     }
-    for name in aside:
+    for name in unloaded:
         del sys.modules[name]
-    return SetAside(aside, lines, list(sys.path))
+    return UnloadedModules(unloaded, lines, list(sys.path))
 
 
-def put_back(aside: SetAside, finder: AuthorFinder) -> None:
-    """Undo `set_aside` and all that `finder` executed since."""
+def restore_modules(unloaded: UnloadedModules, finder: AuthorFinder) -> None:
+    """Undo `unload_modules`, and remove the modules that `finder` executed since."""
     for name in finder.names:
         sys.modules.pop(name, None)
-    sys.modules.update(aside.modules)
-    for name, module in aside.modules.items():
+    sys.modules.update(unloaded.modules)
+    for name, module in unloaded.modules.items():
         # ``import package.part`` binds ``part`` on the package, and a failed load has rebound it.
         parent, _, last = name.rpartition(".")
         if parent in sys.modules:
             setattr(sys.modules[parent], last, module)
     for path in finder.texts:
         linecache.cache.pop(path, None)
-    linecache.cache.update(aside.lines)
-    sys.path[:] = aside.path
+    linecache.cache.update(unloaded.lines)
+    sys.path[:] = unloaded.path
 
 
 def show_in_tracebacks(path: str, text: str) -> None:
-    """Make `linecache` serve `text` for `path`, whatever becomes of the file.
+    """Make `linecache` serve `text` for `path`, also after the file has changed.
 
-    An entry without a modification time is one that `linecache.checkcache`, which runs before
-    every traceback, leaves alone.
+    `linecache.checkcache`, which runs before every traceback, skips entries without a modification time.
     """
     linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)

@@ -1,15 +1,4 @@
-"""What a task reference names, told from its form alone, and on whose word it is opened.
-
-A ``str`` is what a person named: a file, a class in it or in an importable module, or an id. What a recording names is a
-`RecordedTask`, which opens nothing but a registered id unless a person agreed to the very texts, and never a module by its
-name. The two are different types so that one cannot be taken for the other.
-
-The server must know which file to follow before, and whether or not, the worker can load it, and it
-must not import ManiSkill to find out: that takes seconds and a graphics driver. It must not run the file either, so not
-even the packages above a module are imported. A module is looked for where Python would find it, and then in the current
-folder, which is on nobody's ``sys.path``: who names a module in words means the one that they see where they are. What is
-a library stays the library (`library_names`).
-"""
+"""Parses what names a task (a file, a class in a file or module, an id) without importing or running it."""
 
 from __future__ import annotations
 
@@ -30,16 +19,20 @@ _REFERENCE = re.compile(rf"(?P<module>{_NAME.pattern}):(?P<cls>[^\W\d]\w*)")
 
 @dataclass(frozen=True)
 class RecordedTask:
-    """A task that a recording names."""
+    """A task that a recording names, as opposed to a ``str``, which a person gave.
+
+    Two types, so that a path or module name out of a recording is never opened as if a person had asked for it: only a
+    registered id, or the very texts that a person approved.
+    """
 
     env_id: str
-    """Opened if it is registered, never taken for a path."""
+    """Opened if it is registered; never read as a path."""
     file: str | None = None
-    """The task's own file, absolute, where the recording leads to one."""
+    """The task's own file, absolute, if the recording has one."""
     class_name: str | None = None
     approved: Mapping[str, str] | None = None
-    """Path to text of `file` and of the modules beside it, to which a person agreed: these are executed, and no others
-    beside the file. Without them `file` is not opened."""
+    """Path to text of `file` and of its modules, approved by a person: only these are executed. None: `file` is not
+    opened."""
 
     def __str__(self) -> str:
         if self.file is None:
@@ -48,19 +41,20 @@ class RecordedTask:
 
 
 TaskName = str | RecordedTask
-"""What may be opened."""
+"""A task to open."""
 
 
 def file_and_class(reference: str) -> tuple[str, str | None]:
-    """Of ``file.py`` or ``file.py:ClassName``; an empty file for another form."""
+    """File and class of ``file.py`` or ``file.py:ClassName``; an empty file for another form."""
     match = _FILE.fullmatch(reference)
     return ("", None) if match is None else (match["file"], match["cls"])
 
 
 def named_file(reference: TaskName) -> Path | None:
-    """The file of ``file.py`` or ``file.py:ClassName``, whether or not it exists, or of ``package.module:ClassName``.
+    """The file of ``file.py`` or ``file.py:ClassName`` (which need not exist), or of ``package.module:ClassName``.
 
-    None for an env id, and for a module that is not there.
+    None for an env id and for a module that is not found. Called by the server, which must not import ManiSkill
+    (seconds, and a graphics driver) nor run the author's code, so not even the packages above a module are imported.
     """
     if isinstance(reference, RecordedTask):
         return None if reference.file is None else Path(reference.file)
@@ -71,13 +65,13 @@ def named_file(reference: TaskName) -> Path | None:
     return Path(file).expanduser().resolve() if file else None
 
 
-def is_like_a_file(env_id: str) -> bool:
-    """Whether what stands in place of an id is the form of a path to a task, whether or not it is there."""
+def looks_like_file(env_id: str) -> bool:
+    """Whether `env_id` has the form of a path to a task; the file need not exist."""
     return bool(file_and_class(env_id)[0]) or env_id.startswith(("/", "./", "../", "~")) or "\\" in env_id
 
 
 def followed_folder(reference: TaskName) -> Path | None:
-    """The folder whose modules are followed with the task's file; None where no file is followed."""
+    """The folder whose modules are watched with the task's file; None if no file is watched."""
     if isinstance(reference, str) and (named := split_reference(reference)) is not None:
         module = find_module(named[0])
         return None if module is None else module.own_folder
@@ -85,23 +79,23 @@ def followed_folder(reference: TaskName) -> Path | None:
     return None if file is None else file.parent
 
 
-def why_not_there(reference: str) -> str | None:
-    """Why what a person named cannot be opened, as far as its form and the disk say; None for what may be."""
+def why_missing(reference: str) -> str | None:
+    """Why the named file or module cannot be opened, judged by form and disk alone; None if it may exist."""
     if (named := split_reference(reference)) is not None:
-        return not_found(named[0]) if find_module(named[0]) is None else None
+        return not_found_text(named[0]) if find_module(named[0]) is None else None
     file = named_file(reference)
     return None if file is None or file.is_file() else f"there is no file {file}"
 
 
-def class_beside(reference: TaskName, file: Path, class_name: str) -> TaskName:
-    """What names another class where `reference` led to; `file` is that of the class that it gave."""
+def reference_to_class(reference: TaskName, file: Path, class_name: str) -> TaskName:
+    """The reference of another class of the same file or package; `file` is that of the class that `reference` gave."""
     if isinstance(reference, RecordedTask):
         return replace(reference, class_name=class_name)
     named = split_reference(reference)
     module = None if named is None else find_module(named[0])
     if module is None or module.search_folder is None or not file.is_relative_to(module.search_folder):
         return f"{named_file(reference)}:{class_name}"
-    # The class may be of another module, which the one that was named only imports it from.
+    # The named module may only import the class from another one.
     parts = file.relative_to(module.search_folder).with_suffix("").parts
     return f"{'.'.join(parts[:-1] if parts[-1] == '__init__' else parts)}:{class_name}"
 
@@ -111,15 +105,15 @@ def class_beside(reference: TaskName, file: Path, class_name: str) -> TaskName:
 
 @dataclass(frozen=True)
 class NamedModule:
-    """A module that was named, and was found."""
+    """A module that a person named, found on disk."""
 
     name: str
     file: Path
     search_folder: Path | None
-    """What must be on ``sys.path`` for it; None where the file does not lie as its name says (an import hook maps it)."""
+    """The folder that must be on ``sys.path``; None if the file's path does not match its name (an import hook maps it)."""
     own_folder: Path | None
-    """Its first package, or where a module without a package lies: what is in there is its author's. None for a
-    library's module, which is imported as it is and not followed."""
+    """Its top package, or the folder of a module without a package: everything in it is the author's. None for a
+    library's module, which is imported as it is and not watched."""
 
 
 def split_reference(reference: str) -> tuple[str, str] | None:
@@ -131,12 +125,15 @@ def split_reference(reference: str) -> tuple[str, str] | None:
 
 
 def is_module_name(text: str) -> bool:
-    """Whether it has the form of one."""
+    """Whether `text` has the form of a dotted module name."""
     return _NAME.fullmatch(text) is not None
 
 
 def find_module(name: str) -> NamedModule | None:
-    """Where the module `name` lies; None where there is no source of it."""
+    """The module `name` as Python would find it, else in the current folder; None if it has no source file.
+
+    The current folder is not on ``sys.path`` of the command, but is where a person who types a name looks.
+    """
     first, *rest = name.split(".")
     file, folders = _first(first)
     for part in rest:
@@ -153,8 +150,8 @@ def find_module(name: str) -> NamedModule | None:
     return NamedModule(name, file, search_folder, own_folder if is_own else None)
 
 
-def not_found(name: str) -> str:
-    """That there is no such module, in a sentence with the places where it was looked for."""
+def not_found_text(name: str) -> str:
+    """Error text for a missing module, with the places that were searched."""
     return (
         f"there is no module {name} with a source file: it is neither installed for {sys.executable}, nor in a folder of "
         f"PYTHONPATH, nor below {Path.cwd()}"
@@ -162,7 +159,7 @@ def not_found(name: str) -> str:
 
 
 def _first(name: str) -> tuple[Path | None, list[Path]]:
-    """File of a top-level module, and the folders in which its submodules lie."""
+    """File of a top-level module, and the folders of its submodules."""
     spec: ModuleSpec | None = None
     for finder in sys.meta_path:
         spec = finder.find_spec(name, None) if hasattr(finder, "find_spec") else None
@@ -171,13 +168,13 @@ def _first(name: str) -> tuple[Path | None, list[Path]]:
     folders = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
     if spec is not None and spec.origin is not None:
         return (Path(spec.origin) if spec.has_location else None), folders
-    # A folder without an __init__.py gives way to a package further on, as it does on sys.path.
+    # A folder without an __init__.py yields to a package found later, as on sys.path.
     file, here = find_in([Path.cwd()], name)
     return (file, here) if file is not None else (None, [*folders, *here])
 
 
 def find_in(folders: list[Path], name: str) -> tuple[Path | None, list[Path]]:
-    """File of a module in one of these folders, as Python looks for it, and the folders in which its submodules lie."""
+    """File of a module in one of these folders, as Python searches them, and the folders of its submodules."""
     plain: list[Path] = []
     for folder in folders:
         package, module = folder / name, folder / f"{name}.py"

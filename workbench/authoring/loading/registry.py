@@ -1,20 +1,4 @@
-"""ManiSkill's and gymnasium's tables of names, while an author's file is being executed.
-
-`@register_env` keeps the *old* class when an id exists: it logs "already registered. Skip" and
-returns. For a file that is executed on every save this means that the first version stays for ever
-in the tables, and that a file which takes a built-in id is not looked at at all. So while a file
-is executed, the two decorators are replaced by ones that note what they were asked, clear the
-name, and hand over to ManiSkill's own. What stood under a name before is kept, slot by slot, so
-that a load that fails, or a new version that no longer uses the name, leaves the tables as if it
-had never been.
-
-Only registrations made from the author's files are treated so. A library that the file imports
-for the first time registers as it always does, and stays registered when the load fails, because
-it stays imported.
-
-This is the only module of `workbench.authoring` that relies on names of mani_skill which it does
-not document; tests/authoring/loading/test_registry.py fails when one of them moves (mani_skill 3.0.1).
-"""
+"""Registers envs and agents of an author's file in ManiSkill's and gymnasium's tables, and undoes it."""
 
 from __future__ import annotations
 
@@ -44,11 +28,11 @@ _TABLES: tuple[dict[str, Any], ...] = (REGISTERED_ENVS, gymnasium_registry, REGI
 _NOTHING = object()
 
 Slot = tuple[Any, ...]
-"""What the four tables hold under one name."""
+"""The entries of the four tables under one name."""
 
 
 class DuplicateName(Exception):
-    """One load registers the same id twice: the author's mistake, whose second place raises."""
+    """One load registers the same id twice; raised at the second registration."""
 
 
 @dataclass(frozen=True)
@@ -61,33 +45,33 @@ class Registration:
 
 @dataclass
 class Registrations:
-    """What one load put into the tables."""
+    """The table entries of one load."""
 
     made: list[Registration] = field(default_factory=list)
     """In order; environments and agents."""
     displaced: dict[str, Slot] = field(default_factory=dict)
-    """Name to what stood there before."""
+    """Name to the entries before the load."""
     placed: dict[str, Slot] = field(default_factory=dict)
-    """Name to what this load put there."""
-    _put_back: list[str] = field(default_factory=list)
-    """Of `placed`: names that the last `undo` took this load's entries from."""
+    """Name to the entries of this load."""
+    _removed: list[str] = field(default_factory=list)
+    """Names of `placed` whose entries the last `undo` removed."""
 
     def undo(self) -> None:
-        """Put back what stood under each name, unless somebody took the name since."""
-        self._put_back = []
+        """Restore the entries before the load, except for names that were registered again since."""
+        self._removed = []
         for name, before in self.displaced.items():
             if name not in self.placed or _same(_take(name), self.placed[name]):
                 _put(name, before)
-                self._put_back += [name] if name in self.placed else []
+                self._removed += [name] if name in self.placed else []
 
     def redo(self) -> None:
-        """Put those entries in again that `undo` took out: a name that somebody took before that stays theirs."""
-        for name in self._put_back:
+        """Restore the entries that `undo` removed."""
+        for name in self._removed:
             self.displaced[name] = _take(name)
             _put(name, self.placed[name])
 
     def replaced_names(self) -> tuple[str, ...]:
-        """Names that belonged to somebody else: built-in tasks, say."""
+        """Names that were registered before, such as those of built-in tasks."""
         return tuple(
             name for name, slot in self.displaced.items() if any(value is not _NOTHING for value in slot[:3])
         )
@@ -122,19 +106,24 @@ def is_robot(value: object) -> bool:
 
 @contextmanager
 def registering(is_own: Callable[[str], bool], registrations: Registrations) -> Iterator[None]:
-    """Note in `registrations`, and let through, what files for which `is_own` holds register meanwhile.
+    """Record in `registrations` what files with `is_own(path)` register within the context.
 
-    Leaves the tables as they are afterwards, whether the body raises or not: see `Registrations.undo`.
+    ManiSkill's `@register_env` keeps the old class of a known id ("already registered. Skip"), so a file that is executed
+    on every save would keep its first version, and one that takes a built-in id would be ignored. So the two decorators are
+    replaced by ones that clear the name first. The tables are not reset afterwards, whether the body raises or not: see
+    `Registrations.undo`. Registrations of libraries that the file imports are left alone, since those stay imported.
+
+    Depends on undocumented names of mani_skill 3.0.1; tests/authoring/loading/test_registry.py fails if one moves.
     """
     register_env, register_agent = env_registration.register_env, agent_registration.register_agent
 
-    def noting(
+    def record(
         name: str, cls: type, override: bool, caller: tuple[str, int], register: Callable[[], Any]
     ) -> Any:
         file, line = caller
         earlier = next((made for made in registrations.made if made.name == name), None)
         if earlier is not None and not override:
-            # ManiSkill would keep the first and say so in one log line, which nobody sees.
+            # ManiSkill would keep the first class, with only a log line.
             raise DuplicateName(
                 f"{name!r} is registered twice: in line {earlier.line} ({earlier.cls.__name__}) of "
                 f"{earlier.file} and in line {line} ({getattr(cls, '__name__', cls)})"
@@ -159,7 +148,7 @@ def registering(is_own: Callable[[str], bool], registrations: Registrations) -> 
                 return decorator
             given = inspect.signature(register).bind(*args, **kwargs).arguments
             override = bool(given.get("override"))
-            return lambda cls: noting(name_of(cls, given), cls, override, caller, lambda: decorator(cls))
+            return lambda cls: record(name_of(cls, given), cls, override, caller, lambda: decorator(cls))
 
         return own_register
 

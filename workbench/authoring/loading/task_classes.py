@@ -1,8 +1,4 @@
-"""Which class of a file is opened: the one that was named, else the task that is registered last, else a robot in a scene.
-
-A robot's file has no task, and is opened all the same: its author wants to see the robot move, and ManiSkill has a scene
-for that (``Empty-v1``), in which it stands alone.
-"""
+"""Chooses the class of a file to open: the named one, else the last registered task, else a robot in a scene."""
 
 from __future__ import annotations
 
@@ -15,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from workbench.authoring.loading import registry
 from workbench.authoring.loading.modules import module_name
-from workbench.authoring.problem import TaskError, refused
+from workbench.authoring.problem import TaskError, task_error
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
 
 _SCENE = "Empty-v1"
-"""ManiSkill's own for looking at robots."""
+"""ManiSkill's scene for looking at robots. A robot's file has no task, and opens with the robot alone in this scene."""
 
 
 @dataclass(frozen=True)
@@ -38,29 +34,29 @@ class ChosenTask:
     env_id: str | None
     """None for a class that is not registered."""
     others: tuple[str, ...]
-    """What else of the file can be named."""
+    """Other classes of the file that can be named."""
     alternatives: tuple[str, ...] = ()
-    """Those of them that may be opened in its place where none was named and it fails, in the order of trying."""
+    """Those of `others` to try if no class was named and this one fails, in order."""
     kwargs: dict[str, Any] = field(default_factory=dict)
-    """For the constructor, besides those of the registration."""
+    """For the constructor, in addition to the registered ones."""
     robot: Robot | None = None
 
 
 def choose_task(
     module: ModuleType,
-    wanted: str | None,
+    requested: str | None,
     file: Path,
     text: str,
     registrations: registry.Registrations,
 ) -> ChosenTask:
-    """The wanted class of a module that was just executed, or the one that is opened when none is named.
+    """The class `requested` of a module that was just executed, or the default one for None.
 
     Args:
         text: of the file.
-        registrations: what the module registered.
+        registrations: those that the module made.
 
     Raises:
-        TaskError: there is no such class, or none at all.
+        TaskError: there is no such class, or no task class at all.
     """
     mine = [made for made in registrations.made if made.file == str(file)]
     registered = {made.cls: made.name for made in mine if registry.is_task(made.cls)}
@@ -70,33 +66,34 @@ def choose_task(
         for value in vars(module).values()
         if registry.is_task(value) and value.__module__ == module.__name__
     ]
-    # Registered ones last, in the order of their registration: the last of all is the default.
+    # Registered ones last, in the order of registration: the last one is the default.
     candidates = [cls for cls in dict.fromkeys(defined) if cls not in registered] + list(registered)
     names = [cls.__name__ for cls in candidates]
-    if wanted is None:
+    if requested is None:
         if candidates:
             cls = candidates[-1]
         elif robots:
-            return _in_a_scene(module, list(robots)[-1], robots)
+            return _robot_in_scene(module, list(robots)[-1], robots)
         else:
             raise _no_class(module, file, text)
     else:
         cls = next(
-            (cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None)
+            (cls for cls in reversed(candidates) if cls.__name__ == requested),
+            getattr(module, requested, None),
         )
-        if wanted in robots and not registry.is_task(cls):
-            return _in_a_scene(module, wanted, robots)
+        if requested in robots and not registry.is_task(cls):
+            return _robot_in_scene(module, requested, robots)
         if not registry.is_task(cls):
-            raise no_such_class(wanted, cls, file.name, file, names or list(robots))
+            raise missing_class(requested, cls, file.name, file, names or list(robots))
     assert isinstance(cls, type)
     others = tuple(other.__name__ for other in candidates if other is not cls)
     return ChosenTask(
-        cls, registered.get(cls), others, () if wanted else _alternatives(cls, candidates, registered)
+        cls, registered.get(cls), others, () if requested else _alternatives(cls, candidates, registered)
     )
 
 
 def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
-    """Not what the tasks of a file have in common: a base class may open, and shows nothing."""
+    """Classes to try if `cls` fails. Base classes of it are left out: one may open and show nothing."""
     return tuple(
         other.__name__
         for other in reversed(candidates)
@@ -104,18 +101,20 @@ def _alternatives(cls: type, candidates: list[type], registered: Collection[type
     )
 
 
-def _in_a_scene(module: ModuleType, class_name: str, robots: dict[str, registry.Registration]) -> ChosenTask:
+def _robot_in_scene(
+    module: ModuleType, class_name: str, robots: dict[str, registry.Registration]
+) -> ChosenTask:
     spec = registry.environment(_SCENE)
     assert spec is not None
-    # A class of its own for each version: it stands for the file.
+    # A new class for each version, since the class identifies the load.
     cls = type(spec.cls.__name__, (spec.cls,), {"__module__": module.__name__})
     uid = robots[class_name].name
     others = tuple(name for name in robots if name != class_name)
     return ChosenTask(cls, _SCENE, others, kwargs={"robot_uids": uid}, robot=Robot(class_name, uid))
 
 
-def shown_in_a_scene(robot: Robot, file: Path) -> str:
-    """What the author of a robot must know of the scene that is shown, in a sentence."""
+def robot_scene_text(robot: Robot, file: Path) -> str:
+    """Notice for the author of a robot: which scene is shown, and how to see it in a task."""
     place = module_name(file)
     name = place.name if (file.parent / "__init__.py").is_file() else file.stem
     return (
@@ -125,19 +124,19 @@ def shown_in_a_scene(robot: Robot, file: Path) -> str:
     )
 
 
-def no_such_class(wanted: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
-    """There is no task class `wanted` in `name`, which has the classes `names`."""
+def missing_class(requested: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
+    """Error that `name`, which has the task classes `names`, has no task class `requested`."""
     if found is not None:
-        return refused(f"{wanted} in {name} is not a class that inherits BaseEnv", file)
-    close = difflib.get_close_matches(wanted, names, n=1)
+        return task_error(f"{requested} in {name} is not a class that inherits BaseEnv", file)
+    close = difflib.get_close_matches(requested, names, n=1)
     hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names) or 'no task class at all'}"
-    return refused(f"there is no class {wanted} in {name}; {hint}", file)
+    return task_error(f"there is no class {requested} in {name}; {hint}", file)
 
 
 def _no_class(module: ModuleType, file: Path, text: str) -> TaskError:
     name = file.name
     if not text.strip():
-        return refused(f"{name} is empty; a task is a class that inherits BaseEnv", file)
+        return task_error(f"{name} is empty; a task is a class that inherits BaseEnv", file)
     imported = [value for value in vars(module).values() if registry.is_task(value)]
     robots = [
         value
@@ -157,4 +156,4 @@ def _no_class(module: ModuleType, file: Path, text: str) -> TaskError:
             "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from "
             "tasks/minimal.py"
         )
-    return refused(f"no class in {name} inherits BaseEnv; {hint}", file)
+    return task_error(f"no class in {name} inherits BaseEnv; {hint}", file)

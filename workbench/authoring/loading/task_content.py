@@ -1,10 +1,4 @@
-"""What would run if a task file were opened: its text and that of the modules beside it, found without running them.
-
-The imports of each text are read (`ast`) and looked for where the import would look, beside the file. That finds what is
-imported by name, also inside functions. A text that imports by computed names could load any module beside it, so then all
-of them count. What is found is what is asked about, what is hashed, and, of a file that a recording names, all that runs:
-`load_task` executes these texts and no others.
-"""
+"""Collects the texts that opening a task file would run, by reading its imports without running them."""
 
 from __future__ import annotations
 
@@ -30,58 +24,62 @@ _COMPILED = (".so", ".pyd", ".pyc")
 
 
 class CannotRead(OSError):
-    """The file is none that can be read; the message is a sentence."""
+    """The file cannot be read; the message is a sentence."""
 
 
 @dataclass(frozen=True)
 class TaskContent:
-    """The texts that a task consists of."""
+    """The texts that a task consists of: those that are asked about, hashed, and, for a recording's task, all that
+    `load_task` executes."""
 
     main: str
     """Path of the task's own file, or its name in a recording."""
     texts: dict[str, str]
     """Path to text; the task's own file first."""
     unseen: tuple[str, ...] = ()
-    """What may run and is not among them, a sentence each."""
+    """Sentences about code that may run and is not in `texts`."""
     computed: bool = False
-    """A text imports by computed names, so that all that lies beside it is among the texts."""
+    """A text imports by computed names, so `texts` has every module of the folder."""
     sums: Mapping[str, str] = field(default_factory=dict)
-    """Path to the sha256 of the file's bytes, which its text does not tell (line ends, coding)."""
+    """Path to the sha256 of the file's bytes, which its text does not determine (line ends, encoding)."""
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """The other texts, as seen from the task's folder."""
+        """Paths of the other texts, relative to the task's folder."""
         return tuple(sorted(self.name(path) for path in self.texts if path != self.main))
 
     @property
     def file_sums(self) -> dict[str, str]:
-        """Name, as seen from the task's folder, to what ``sha256sum`` says of the file; the task's own file first."""
+        """Path, relative to the task's folder, to the file's ``sha256sum``; the task's own file first."""
         paths = [self.main, *sorted(path for path in self.texts if path != self.main)]
         raw = {path: self.texts[path].encode("utf-8", "surrogatepass") for path in paths}
         return {self.name(path): self.sums.get(path) or sha256(raw[path]).hexdigest() for path in paths}
 
     @property
     def hash(self) -> str:
-        """sha256 over names and texts; the same wherever the files lie."""
+        """sha256 over relative paths and texts; independent of the folder."""
         named = sorted((self.name(path), text) for path, text in self.texts.items())
         return _sum([self.name(self.main), *chain.from_iterable(named)])
 
     def name(self, path: str) -> str:
-        """As seen from the task's folder."""
+        """`path` relative to the task's folder."""
         return Path(os.path.relpath(path, os.path.dirname(self.main) or ".")).as_posix()
 
 
 def read_content(file: Path) -> TaskContent:
-    """What opening `file` would run.
+    """The texts that opening `file` would run.
+
+    Imports by name are found also inside functions. A text that imports by computed names could load any module of the
+    folder, so then all of them count.
 
     Raises:
-        CannotRead: it is no ordinary file of Python text, or there is too much of it.
+        CannotRead: it is not an ordinary file of Python text, or there is too much of it.
     """
     file = file.resolve()
-    return _Reading(file).content()
+    return _Reader(file).content()
 
 
-class _Reading:
+class _Reader:
     def __init__(self, file: Path) -> None:
         self._file, self._root = file, module_name(file).search_folder
         self._texts: dict[str, str] = {}
@@ -101,11 +99,11 @@ class _Reading:
             except (SyntaxError, ValueError, RecursionError, MemoryError):
                 self._unseen[f"{self._short(path)} is no Python that can be read."] = None
                 continue
-            self._follow(path, tree)
+            self._add_imports(path, tree)
         return TaskContent(str(self._file), self._texts, tuple(self._unseen), self._computed, self._sums)
 
     def _packages_above(self) -> Iterator[Path]:
-        """Of a file in a package the packages run first."""
+        """The packages of a file in a package, which run before it."""
         folder = self._file.parent
         while folder != self._root and folder.is_relative_to(self._root):
             yield folder / "__init__.py"
@@ -120,7 +118,7 @@ class _Reading:
         self._texts[name], self._sums[name] = _read(path)
         self._waiting.append(path)
 
-    def _follow(self, path: Path, tree: ast.AST) -> None:
+    def _add_imports(self, path: Path, tree: ast.AST) -> None:
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 for alias in node.names:
@@ -145,19 +143,19 @@ class _Reading:
         for part in parts:
             if part == "*":
                 if (folder / "__init__.py").is_file() and folder != self._root:
-                    for path in sorted(folder.glob("*.py")):  # what its __all__ names may be modules
+                    for path in sorted(folder.glob("*.py")):  # its __all__ may name modules
                         self._add(path)
                 return
             file, inside = find_in([folder], part)
             if file is not None:
                 self._add(file)
             elif not inside:
-                self._compiled(folder, part)
+                self._report_compiled(folder, part)
             if not inside:
                 return
             (folder,) = inside
 
-    def _compiled(self, folder: Path, name: str) -> None:
+    def _report_compiled(self, folder: Path, name: str) -> None:
         for path in sorted(folder.glob(f"{name}.*")) if name.isidentifier() else ():
             if path.suffix in _COMPILED:
                 self._unseen[f"{self._short(path)} is compiled and is not loaded."] = None
@@ -183,7 +181,7 @@ def read_text(path: Path) -> str:
     """The text of a Python file.
 
     Raises:
-        CannotRead: it cannot be read, is none, or is too long.
+        CannotRead: it cannot be read, is not text, or is too long.
     """
     return _read(path)[0]
 
@@ -198,7 +196,7 @@ def source_hash(source: Mapping[str, str], folder: Path) -> str:
 
 
 def _sum(parts: Iterable[str]) -> str:
-    """sha256 of texts one after the other, each with its length before it."""
+    """sha256 of the texts in order, each preceded by its length."""
     digest = sha256()
     for part in parts:
         content = part.encode("utf-8", "surrogatepass")
@@ -207,7 +205,7 @@ def _sum(parts: Iterable[str]) -> str:
 
 
 def _read(path: Path) -> tuple[str, str]:
-    """The text, and the sha256 of the bytes that it was read from."""
+    """The text, and the sha256 of its bytes."""
     try:
         raw, text, _ = read_exactly(path)
         return plain_line_ends(text), sha256(raw).hexdigest()
@@ -218,7 +216,7 @@ def _read(path: Path) -> tuple[str, str]:
 
 
 def _dynamic(node: ast.AST) -> str | None:
-    """What of this node imports or runs what its text does not name."""
+    """The name in this node that may import or run code that the text does not name."""
     if isinstance(node, ast.ImportFrom):
         return next((alias.name for alias in node.names if alias.name in _DYNAMIC), None)
     if isinstance(node, ast.Name) and node.id in _DYNAMIC:

@@ -18,7 +18,7 @@ from workbench.authoring.camera_source.cameras import Run
 from workbench.authoring.camera_source.disk import SourceEdit, not_writable
 from workbench.authoring.camera_source.hooks import HOOK_OF, snippet
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.loading.copy_task import NoCopy, copy_task
+from workbench.authoring.loading.copy_task import CannotCopy, copy_task
 from workbench.authoring.loading.modules import read_exactly
 from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraSettings, differences, setting_text
@@ -139,7 +139,7 @@ def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
         return None, Writing("refused", message="Not copied: the task has no file.")
     try:
         made = copy_task(Path(task.file), folder)
-    except NoCopy as reason:
+    except CannotCopy as reason:
         return None, Writing("refused", message=f"Not copied: {reason}.")
     named = ", ".join(f"{new} for {old}" for old, new in made.ids)
     ids = f" It registers {named}." if named else ""

@@ -17,9 +17,9 @@ from typing import Any
 from workbench.authoring.loading.reference import (
     RecordedTask,
     TaskName,
-    class_beside,
     followed_folder,
     named_file,
+    reference_to_class,
 )
 from workbench.authoring.problem import Problem
 from workbench.core.capture.inspection import Inspection
@@ -122,7 +122,7 @@ class LiveState:
         if not (restored and self.now.choices):  # else another may have been asked for since
             self.set(choices=(task.chosen, *task.others) if task.others else ())
         if task.others and task.source_files and task.file is not None:
-            self.running_reference = class_beside(self.reference, Path(task.file), task.chosen)
+            self.running_reference = reference_to_class(self.reference, Path(task.file), task.chosen)
             if task.in_place_of is not None:
                 # Saves bring in what is open; the other is to be chosen when it is mended.
                 self.reference = self.running_reference
@@ -278,7 +278,7 @@ class LiveState:
         file = (
             self.own_file if self.now.task is None or self.now.task.file is None else Path(self.now.task.file)
         )
-        self.reference = class_beside(self.reference, file, name)
+        self.reference = reference_to_class(self.reference, file, name)
         self.set(choices=(name, *(other for other in self.now.choices if other != name)))
         return True
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring.loading.library_names import named_like_library
+from workbench.authoring.loading.library_names import named_like_library_text
 from workbench.authoring.loading.modules import hidden_by_libraries
 from workbench.authoring.loading.reference import TaskName, named_file
 from workbench.authoring.problem import TaskError
@@ -111,7 +111,9 @@ def hidden_in_words(reference: TaskName) -> list[str]:
     """What lies beside the task's file and cannot be imported because a library has its name, in sentences."""
     file = named_file(reference)
     return (
-        [] if file is None else [named_like_library(hidden) for hidden in hidden_by_libraries(file.resolve())]
+        []
+        if file is None
+        else [named_like_library_text(hidden) for hidden in hidden_by_libraries(file.resolve())]
     )
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.camera_source.run_hooks import run_hooks
-from workbench.authoring.loading.load import LoadedTask, load_task, take_back
-from workbench.authoring.loading.reference import class_beside
+from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
+from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import module_of
 from workbench.authoring.source.text import plain_line_ends
@@ -123,12 +123,12 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> Ran:
     file, env, found = opened.loaded.file, opened.env.env, list[Ran]()
     if file is None:
         raise ValueError("the task has no file")
-    loaded = load_task(class_beside(question.task, file, opened.loaded.chosen), source=question.texts)
+    loaded = load_task(reference_to_class(question.task, file, opened.loaded.chosen), source=question.texts)
     try:
         with blamed("build", loaded, opened.env), _being(env, opened.loaded, loaded, question.texts):
             undone(env, lambda: found.append(run_hooks(env, question.texts)))
     finally:
-        take_back(loaded)
+        undo_load(loaded)
     return found[0]
 
 

@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from workbench.authoring.loading.reference import named_file
-from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
+from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.core.capture.inspect_env import inspect_env
 from workbench.core.env.step_result import StepResult
 from workbench.core.maniskill_private import mark_camera_configs
@@ -517,5 +517,5 @@ def work(connection: int, pulse: PulseWriter) -> None:
     # 16 PickCube envs ran 2.8 times faster with one thread than with two).
     torch.set_num_threads(1)
     mark_camera_configs()
-    nobody_presses_ctrl_c()
+    treat_ctrl_c_as_error()
     Worker(connection, pulse).run()

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, take_back, with_late_imports
+from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, undo_load, with_late_imports
 from workbench.authoring.loading.modules import read_source
-from workbench.authoring.loading.reference import class_beside
+from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.problem import Interrupted, TaskError
 from workbench.authoring.reload.call_graph import line_in
 from workbench.authoring.reload.inherited import inherited_by
@@ -115,16 +115,16 @@ def _another(request: Load, tried: LoadedTask, error: TaskError, opening: Openin
         return None
     for name in tried.alternatives:
         opening.on_activity(f"trying {name}")
-        loaded = load_task(class_beside(request.task, tried.file, name), source=request.source)
+        loaded = load_task(reference_to_class(request.task, tried.file, name), source=request.source)
         loaded = replace(loaded, in_place_of=RefusedClass(tried.chosen, str(error)))
         try:
             return build_task(loaded, request.options, replace(opening, clock=Clock()))
         except TaskError as further:
-            take_back(loaded)
+            undo_load(loaded)
             if isinstance(further.__cause__, Interrupted):
                 raise
         except BaseException:
-            take_back(loaded)
+            undo_load(loaded)
             raise
     return None
 
@@ -147,7 +147,7 @@ def _bring_in(
         return _build(request, running, loaded, change, opening)
     except BaseException:
         # The last good version must not go on with the new one's helper modules and registrations.
-        take_back(loaded)
+        undo_load(loaded)
         raise
 
 
