@@ -117,6 +117,7 @@ class ScriptedWorker:
             self._playing = request.playing
             self._tell(Status(self._playing, 1 / STEP_SECONDS, 1.0))
         elif isinstance(request, SingleStep):
+            self._playing = False
             self._step()
         elif isinstance(request, Reset):
             envs = range(count) if request.env_idx is None else request.env_idx

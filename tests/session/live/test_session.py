@@ -50,6 +50,22 @@ def test_playing_goes_on_until_paused(session: Session) -> None:
     assert after.step.elapsed_steps[1] == 0
 
 
+def test_a_single_step_ends_playing(session: Session) -> None:
+    settle(session)
+    session.change(speed=4.0)
+    session.play()
+    wait_until(session, lambda v: v.step.elapsed_steps.max() >= 3 and v.state == "running", "playing")
+    session.step()
+    serials = []
+    for _ in range(20):  # a worker that played on would take some ten steps meanwhile
+        before = session.view().inspection
+        session.inspect(("joints",))
+        wait_until(session, lambda v, before=before: v.inspection is not before, "an answer")
+        serials.append(session.view().step_serial)
+    session.change(speed=1.0)
+    assert len(set(serials)) == 1 and session.view().state == "paused"
+
+
 def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     settle(session)
     step(session, 3)

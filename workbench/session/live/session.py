@@ -183,17 +183,17 @@ class Session:
     def pause(self) -> None:
         self._set_playing(False)
 
-    def _set_playing(self, playing: bool) -> None:
-        with self._shared.changing() as state:
-            state.set(playing=playing)
-            state.wants_play = playing
-        self._send(Play(playing))
-
     def step(self) -> None:
         """One control step; pauses first."""
         self.past.seek(None)
-        self.pause()
-        self._send(SingleStep())
+        self._set_playing(False, SingleStep())
+
+    def _set_playing(self, playing: bool, request: Play | SingleStep | None = None) -> None:
+        """Note it and send `request`, or a plain `Play`."""
+        with self._shared.changing() as state:
+            state.set(playing=playing)
+            state.wants_play = playing
+        self._send(request or Play(playing))
 
     def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
         """All envs with the session's seed, or some with fresh seeds."""

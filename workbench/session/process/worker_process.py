@@ -32,7 +32,15 @@ from workbench.machine.processes.wire import MessageSocket
 from workbench.session.process.heartbeat import Beat, PulseReader, make_pulse
 from workbench.session.process.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.process.memory_limit import FamilyMemory
-from workbench.session.protocol.messages import Event, Load, PlaceCamera, Quit, Request, Settings, is_a_step
+from workbench.session.protocol.messages import (
+    Event,
+    Load,
+    PlaceCamera,
+    Quit,
+    Request,
+    Settings,
+    without_steps,
+)
 
 _WHOLE = (Load, Settings)
 """Of two of one kind that wait one behind the other only the second matters."""
@@ -186,7 +194,7 @@ class WorkerProcess:
     def interrupt(self) -> None:
         """Leave the author's code if Python runs it (see `interrupts`); control steps that wait are not taken."""
         with self._wake:
-            self._waiting = deque(request for request in self._waiting if not is_a_step(request))
+            self._waiting = deque(without_steps(self._waiting))
         if self.beat().number > 0 and self._process.poll() is None:
             signal_main_thread(self.pid, INTERRUPT_SIGNAL)
 

@@ -8,7 +8,7 @@ whatever crosses is numpy and plain data, so that a dying worker can take nothin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -62,7 +62,7 @@ class Play:
 
 @dataclass(frozen=True)
 class SingleStep:
-    """One control step, also while paused."""
+    """Pause, and make one control step."""
 
 
 @dataclass(frozen=True)
@@ -249,9 +249,13 @@ Request = (
 )
 
 
-def is_a_step(request: Request) -> bool:
-    """Whether it asks for control steps: an interrupt drops those that wait."""
-    return isinstance(request, SingleStep) or (isinstance(request, Play) and request.playing)
+def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
+    """What an interrupt leaves of the requests that wait: no control steps, but the pause that a `SingleStep` begins with."""
+    for request in requests:
+        if isinstance(request, SingleStep):
+            yield Play(False)
+        elif not (isinstance(request, Play) and request.playing):
+            yield request
 
 
 # --- events: worker to server --------------------------------------------------------------------

@@ -22,7 +22,7 @@ from workbench.jobs.open_task import OpenedTask
 from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.session.process.heartbeat import Doing, PulseWriter
 from workbench.session.process.interrupts import Interrupts
-from workbench.session.protocol.messages import Event, Load, LoadFailed, Request, is_a_step
+from workbench.session.protocol.messages import Event, Load, LoadFailed, Request, without_steps
 from workbench.session.protocol.questions import QUESTIONS
 from workbench.session.worker.step_events import StepEvents
 
@@ -66,7 +66,7 @@ class ServerLine:
         interrupt: what is pressed after that is meant."""
         with self._interrupts.shielded():
             waiting = [*self._queue, *self._requests(0.0)]
-            self._queue = deque(request for request in waiting if not is_a_step(request))
+            self._queue = deque(without_steps(waiting))
 
     def _requests(self, timeout: float) -> list[Request]:
         """What has come; of several loads only the last, since each replaces the one before."""

@@ -124,7 +124,7 @@ class Worker:
         self._handlers: dict[type, Callable[[Any], None]] = {
             Load: self._load,
             Play: self._play,
-            SingleStep: lambda request: self._control_step(),
+            SingleStep: self._single_step,
             Reset: self._reset,
             Settings: self._change,
             ReadPolicyAgain: self._read_policy_again,
@@ -364,6 +364,11 @@ class Worker:
 
     def _control_step(self) -> None:
         self._held.guarded(self._step_once)
+
+    def _single_step(self, request: SingleStep) -> None:
+        if self._playing:
+            self._pause()
+        self._control_step()
 
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
