@@ -24,7 +24,7 @@ from workbench.jobs.replay import arrive
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
-from workbench.session.review.events import curves
+from workbench.session.review.view import curves
 from workbench.ui.review.curves import step_of
 
 pytestmark = pytest.mark.usefixtures("child_process")

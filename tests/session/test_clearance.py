@@ -243,7 +243,7 @@ def test_arguments_from_elsewhere_name_no_files(
         assert refused.value.trust_helps
         Clearances(all_trusted=True).clear(wanted)
     with pytest.raises(SceneError, match="numbers and curves only"):
-        SceneProcess()._one(None, read_episode(foreign), lambda: None, print)  # type: ignore[arg-type]
+        SceneProcess()._make(None, read_episode(foreign), lambda: None, print)  # type: ignore[arg-type]
 
 
 def test_each_text_is_asked_about_once_and_all_can_be_refused_at_once(foreign: Path) -> None:

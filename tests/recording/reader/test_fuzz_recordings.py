@@ -32,7 +32,7 @@ from workbench.recording.reader import reading
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.scan import scan_folder
 from workbench.recording.writing.episode_writer import EpisodeWriter
-from workbench.session.review.events import happenings
+from workbench.session.review.view import find_events
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -180,7 +180,7 @@ def look_at(folder: Path) -> list[str]:
 
 def opened(episode: Episode) -> Iterator[str]:
     yield from (broken.sentence for broken in episode.unread)
-    happenings(episode)
+    find_events(episode)
     for camera in episode.cameras:
         for pictures in (camera.rgb, camera.depth, camera.segmentation):
             if pictures is not None and len(pictures):

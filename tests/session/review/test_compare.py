@@ -23,11 +23,11 @@ def test_the_first_body_that_moves_elsewhere_and_when() -> None:
     b.reward[3:] *= 2
     found = difference(a, b, (0, 0))
     assert found.bodies is not None and found.bodies.position == 6 and found.body == "arm/hand"
-    assert "2 cm" in found.bodies.first and "50 cm (cube)" in found.bodies.most
+    assert "2 cm" in found.bodies.values and "50 cm (cube)" in found.bodies.largest
     differing = [(p.name, p.position) for p in found.numbers if p.position is not None]
     assert differing == [("reward", 4), ("success", 9)]
     reward = found.numbers[0]
-    assert reward.first == "4 → 8" and reward.whole == "55 → 104"
+    assert reward.values == "4 → 8" and reward.totals == "55 → 104"
     assert found.same_seed and found.same_source and not found.source
     assert parts_at(difference(a, b, (0, 0), tolerance=0.1)) == 8
 
@@ -54,7 +54,7 @@ def test_other_bodies_lengths_and_entries_are_said() -> None:
     b.action = np.zeros((4, 3), np.float32)
     found = difference(a, b, (0, 0))
     assert found.not_in_both == ("cube (only in A)", "box (only in B)") and found.compared == 5
-    said = {p.name: p.first for p in found.numbers}
+    said = {p.name: p.values for p in found.numbers}
     assert said["distance"] == "only in A" and said["action"] == "shape (2,) → (3,)"
     b.geometry = None
     assert difference(a, b, (0, 0)).bodies is None

@@ -20,10 +20,17 @@ from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.source import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.review.events import ACTION, TERMS, curves, happenings, success_words
-from workbench.session.review.pictures import PictureReader
 from workbench.session.review.review import MOST_OPEN, Review
-from workbench.session.review.view import ReviewView, column_at
+from workbench.session.review.view import (
+    ACTION,
+    TERMS,
+    PictureReader,
+    ReviewView,
+    column_at,
+    curves,
+    find_events,
+    outcome_text,
+)
 
 
 @dataclass(frozen=True)
@@ -156,11 +163,11 @@ def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytes
     assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
     review.select(1)
     review.seek(3)
-    review.exchange(0, 1)
+    review.swap(0, 1)
     view = review.view()
     assert [one.id for one in view.opened] == ["new", "old"]
     assert view.chosen is not None and view.chosen.id == "new" and view.states == (3, 3)
-    review.exchange(0, 7)
+    review.swap(0, 7)
     assert [one.id for one in review.view().opened] == ["new", "old"]
 
 
@@ -222,12 +229,12 @@ def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
     shelf.extra["a"] = (changed, gone)
     opened(review, "a")
     shelf.now += 10
-    review.look_at_files()
+    review.check_files()
     assert review.view().problems == ()
     changed.write_text("another")
     gone.unlink()
     shelf.now += 10
-    review.look_at_files()
+    review.check_files()
     said = " ".join(review.view().problems)
     assert "a.rrd has changed" in said and "a.h5 was deleted" in said
     assert len(review.view().opened) == 1
@@ -341,7 +348,7 @@ def test_events_and_curves_of_an_episode() -> None:
     episode = made(10, success_from=4)
     episode.evaluate["grasped"] = np.array([0, 0, 1, 1, 0, 0, 1, 0, 0, 0, np.nan])
     episode.reward[8] = np.nan
-    found = [(h.state, h.name) for h in happenings(episode)]
+    found = [(h.state, h.name) for h in find_events(episode)]
     assert found == [
         (0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped"), (9, "reward is NaN or infinite"),
     ]  # fmt: skip
@@ -349,8 +356,8 @@ def test_events_and_curves_of_an_episode() -> None:
     assert list(lines[ACTION]) == ["arm/joint1", "gripper"] and list(lines[TERMS]) == ["reach"]
     states, values = lines["reward"]["reward"]
     assert states[0] == 1 and values[0] == 1
-    assert success_words(episode) == ("success", "good")
-    assert success_words(made(3)) == ("no success", "bad")
+    assert outcome_text(episode) == ("success", "good")
+    assert outcome_text(made(3)) == ("no success", "bad")
 
 
 @given(

@@ -9,8 +9,7 @@ import pytest
 import viser
 
 from tests.drive.episodes import made
-from workbench.session.review.events import happenings
-from workbench.session.review.view import Opened, ReviewView
+from workbench.session.review.view import Opened, ReviewView, find_events
 from workbench.ui.live.reward import NumberRow
 from workbench.ui.review.curves import ReviewCurves, compared, known
 from workbench.ui.widgets.templates import render
@@ -46,7 +45,7 @@ def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) 
     episodes = [made(steps) for steps, _ in recordings]
     anchors = tuple(anchor for _, anchor in recordings)
     return ReviewView(
-        opened=tuple(Opened(str(i), f"{i}.rrd", e, happenings(e)) for i, e in enumerate(episodes)),
+        opened=tuple(Opened(str(i), f"{i}.rrd", e, find_events(e)) for i, e in enumerate(episodes)),
         opened_serial=1,
         selected=selected,
         anchors=anchors,

@@ -8,14 +8,13 @@ import numpy as np
 
 from tests.drive.episodes import BODY, geometry_of, made, poses_of
 from workbench.recording.episode.episode import Episode
-from workbench.session.review.events import happenings
-from workbench.session.review.view import Opened
+from workbench.session.review.view import Opened, find_events
 from workbench.ui.review.scene import SEE_THROUGH, review_scene
 from workbench.ui.scene.glb import group_by_wearers
 
 
 def opened(*episodes: Episode) -> tuple[Opened, ...]:
-    return tuple(Opened(str(i), str(i), e, happenings(e)) for i, e in enumerate(episodes))
+    return tuple(Opened(str(i), str(i), e, find_events(e)) for i, e in enumerate(episodes))
 
 
 def test_side_by_side_shares_shapes_and_has_places() -> None:

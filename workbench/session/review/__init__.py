@@ -1,1 +1,1 @@
-"""Recordings that are open, along one time."""
+"""Recordings that are open, along one time axis."""

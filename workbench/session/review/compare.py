@@ -1,12 +1,4 @@
-"""Where two recordings part: the first state at which bodies stand elsewhere, and what was said otherwise.
-
-Two episodes of one seed under two versions of a task are the same simulation up to some step. That step, and the body
-that moved first, is the answer to "what did my change do"; after it everything differs a little. So each quantity is
-compared on its own, state by state from where the two are aligned, and its first difference is named.
-
-Distances are of positions in metres. Turning is compared too, as the angle between the quaternions, which is put on
-the same scale by an arm of `ARM`: a body that only turns has moved as well.
-"""
+"""Compares two recordings: the first step at which bodies and numbers differ."""
 
 from __future__ import annotations
 
@@ -24,49 +16,55 @@ from workbench.machine.text import length, number_text
 from workbench.recording.episode.episode import Episode
 
 ARM = 0.1
-"""Metres; a body of this size is thought at each pose, so that an angle is a way."""
+"""Metres: a rotation counts as the way of a point at this distance from the body's origin."""
 TOLERANCES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Metres. A replay on other threads or another machine differs by 1e-6 to 1e-5."""
 USUAL_TOLERANCE = 1e-4
 _LEAST = 1e-5
-"""What numbers of two recordings differ by at least: a replay elsewhere differs by less."""
+"""Smaller differences of numbers count as equal: a replay on another machine differs by less."""
 _MOST_LINES = 600
 
 
 @dataclass(frozen=True)
-class Parting:
-    """The first difference of one quantity, and how far apart it gets."""
+class FirstDifference:
+    """The first and the largest difference of one quantity, as text."""
 
     name: str
     position: int | None
-    """Counted from where the two are aligned; None while nothing differs."""
-    first: str
-    """Both values there, in words."""
-    most: str
-    """The largest difference, in words."""
-    whole: str = ""
-    """What each came to, for what adds up."""
+    """Relative to the alignment; None if nothing differs."""
+    values: str
+    """Both values there."""
+    largest: str
+    """The largest difference."""
+    totals: str = ""
+    """Both sums over the episode, where that makes sense."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    bodies: Parting | None
-    """None where one of them has no scene."""
+    """How a recording differs from another.
+
+    Two episodes of one seed under two versions of a task are the same simulation up to some step; after it everything
+    differs a little. So that step and the body that moved first are found, for each quantity on its own.
+    """
+
+    bodies: FirstDifference | None
+    """None if one of them has no scene."""
     body: str
-    """Which body is elsewhere first."""
+    """The body that differs first."""
     apart: NDArray[np.float64]
-    """(K,) metres that the body that is farthest off is away, from `begin` on."""
+    """(K,) metres between the two poses of the body that is farthest off, from `begin` on."""
     begin: int
     """Position of the first compared state."""
     compared: int
-    """How many states of the two lie at the same positions."""
+    """Number of compared states."""
     not_in_both: tuple[str, ...]
     """Bodies that only one has."""
-    numbers: tuple[Parting, ...]
-    """Action, reward, and the entries of ``evaluate``; those that differ first, by when."""
+    numbers: tuple[FirstDifference, ...]
+    """Action, reward, and the entries of ``evaluate``; those that differ come first, by position."""
     same_seed: bool
     same_source: bool | None
-    """None where one of them has no source."""
+    """None if one of them has no source."""
     source: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
     """File, and its changed lines as (``add``, ``del``, ``at`` or ``same``, text)."""
 
@@ -78,7 +76,7 @@ def difference(
 
     Args:
         anchors: The state of each that lies at position 0.
-        tolerance: Metres from which on a body counts as elsewhere.
+        tolerance: Metres above which a body's pose differs.
     """
     begin = max(-anchors[0], -anchors[1])
     end = min(len(a.reward) - anchors[0], len(b.reward) - anchors[1])
@@ -87,15 +85,19 @@ def difference(
         slice(begin + anchors[0], begin + anchors[0] + count),
         slice(begin + anchors[1], begin + anchors[1] + count),
     )
-    bodies, body, apart = _bodies(a, b, rows, begin, tolerance)
-    numbers = [_numbers("action", *_steps(a.action, b.action, rows), begin)]
-    numbers.append(_numbers("reward", *_steps(a.reward, b.reward, rows), begin, whole=(a.reward, b.reward)))
+    bodies, body, apart = _bodies_difference(a, b, rows, begin, tolerance)
+    numbers = [_first_difference("action", *_steps(a.action, b.action, rows), begin)]
+    numbers.append(
+        _first_difference("reward", *_steps(a.reward, b.reward, rows), begin, sum_of=(a.reward, b.reward))
+    )
     for name in dict.fromkeys([*a.evaluate, *b.evaluate]):
         if name in a.evaluate and name in b.evaluate:
-            numbers.append(_numbers(name, a.evaluate[name][rows[0]], b.evaluate[name][rows[1]], begin))
+            numbers.append(
+                _first_difference(name, a.evaluate[name][rows[0]], b.evaluate[name][rows[1]], begin)
+            )
         else:
-            numbers.append(Parting(name, None, f"only in {'A' if name in a.evaluate else 'B'}", ""))
-    numbers.sort(key=lambda parting: (parting.position is None, parting.position or 0))
+            numbers.append(FirstDifference(name, None, f"only in {'A' if name in a.evaluate else 'B'}", ""))
+    numbers.sort(key=lambda found: (found.position is None, found.position or 0))
     hashes = a.info.source_hash, b.info.source_hash
     return Difference(
         bodies=bodies,
@@ -114,10 +116,10 @@ def difference(
 def source_changes(
     before: Mapping[str, str], after: Mapping[str, str]
 ) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
-    """Of each file that is not the same in both: its name, and the changed lines with two around them."""
+    """Each file that differs: its name, and the changed lines with two lines of context."""
     found = []
     if not set(before) & set(after):
-        # Recorded from two folders: the same file all the same.
+        # Recorded from two folders: files are matched by name.
         before, after = (
             {PurePath(name).name: text for name, text in texts.items()} for texts in (before, after)
         )
@@ -135,9 +137,9 @@ def source_changes(
     return tuple(found)
 
 
-def _bodies(
+def _bodies_difference(
     a: Episode, b: Episode, rows: tuple[slice, slice], begin: int, tolerance: float
-) -> tuple[Parting | None, str, NDArray[np.float64]]:
+) -> tuple[FirstDifference | None, str, NDArray[np.float64]]:
     nothing = np.zeros(0)
     if a.geometry is None or b.geometry is None or a.poses is None or b.poses is None:
         return None, "", nothing
@@ -150,60 +152,60 @@ def _bodies(
     apart = away.max(axis=1, initial=0.0)
     off = np.flatnonzero(apart > tolerance)
     if not len(off):
-        return Parting("bodies", None, "", _apart(float(apart.max(initial=0.0)))), "", apart
+        return FirstDifference("bodies", None, "", _distance_text(float(apart.max(initial=0.0)))), "", apart
     first = int(off[0])
     body = names[int(away[first].argmax())]
     worst = int(apart.argmax())
-    parting = Parting(
+    found = FirstDifference(
         "bodies",
         begin + first,
-        f"{body}, {_apart(float(apart[first]))}",
-        f"{_apart(float(apart[worst]))} ({names[int(away[worst].argmax())]})",
+        f"{body}, {_distance_text(float(apart[first]))}",
+        f"{_distance_text(float(apart[worst]))} ({names[int(away[worst].argmax())]})",
     )
-    return parting, body, apart
+    return found, body, apart
 
 
 def distances(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """(..., ) metres between poses (..., 7), turning included; 0 where both lack the body, inf where one does."""
+    """(...,) metres between poses (..., 7), plus `ARM` times the angle; 0 if both lack the body, inf if one does."""
     metres, radians = pose_distances(a, b)
     return metres + ARM * radians
 
 
 def _steps(a: NDArray, b: NDArray, rows: tuple[slice, slice]) -> tuple[NDArray, NDArray]:
-    """What belongs to a step at the states of `rows`: NaN at a start, which no step led to."""
+    """Values of steps at the states of `rows`: NaN at the first state, which no step led to."""
     padded = [np.concatenate([np.full((1, *x.shape[1:]), np.nan), np.asarray(x, np.float64)]) for x in (a, b)]
     return padded[0][rows[0]], padded[1][rows[1]]
 
 
-def _numbers(
+def _first_difference(
     name: str,
     a: NDArray,
     b: NDArray,
     begin: int,
-    whole: tuple[NDArray, NDArray] | None = None,
-) -> Parting:
-    totals = "" if whole is None else " → ".join(number_text(float(np.sum(x))) for x in whole)
+    sum_of: tuple[NDArray, NDArray] | None = None,
+) -> FirstDifference:
+    totals = "" if sum_of is None else " → ".join(number_text(float(np.sum(x))) for x in sum_of)
     if a.shape[1:] != b.shape[1:]:
-        return Parting(name, begin, f"shape {a.shape[1:]} → {b.shape[1:]}", "", totals)
+        return FirstDifference(name, begin, f"shape {a.shape[1:]} → {b.shape[1:]}", "", totals)
     yes = a.dtype.kind == "b" and b.dtype.kind == "b"
     one, two = (np.asarray(x, np.float64).reshape(len(x), -1) for x in (a, b))
     differs = unlike(one, two, _LEAST)
     rows = np.flatnonzero(differs.any(axis=1))
     if not len(rows):
-        return Parting(name, None, "", "", totals)
+        return FirstDifference(name, None, "", "", totals)
     first = int(rows[0])
     column = int(np.flatnonzero(differs[first])[0])
-    said = [_said(x[first, column], yes, first) for x in (one, two)]
+    old, new = (_value_text(x[first, column], yes, first) for x in (one, two))
     label = "" if one.shape[1] == 1 else f"[{column}] "
     apart = gap(one, two)
-    most = "" if yes else number_text(float(apart[np.isfinite(apart)].max(initial=0.0)), ".3g")
-    return Parting(name, begin + first, f"{label}{said[0]} → {said[1]}", most, totals)
+    largest = "" if yes else number_text(float(apart[np.isfinite(apart)].max(initial=0.0)), ".3g")
+    return FirstDifference(name, begin + first, f"{label}{old} → {new}", largest, totals)
 
 
-def _said(value: float, yes: bool, row: int) -> str:
+def _value_text(value: float, yes: bool, row: int) -> str:
     if yes:
         return "yes" if value else "no"
-    # A start, which no step led to, has NaN for what belongs to a step, and is the first row of those compared.
+    # The first compared row may be an episode's first state, where values of steps are NaN (see `_steps`).
     return "—" if np.isnan(value) and row == 0 else number_text(value)
 
 
@@ -217,5 +219,5 @@ def _not_in_both(a: Episode, b: Episode) -> tuple[str, ...]:
     )
 
 
-def _apart(metres: float) -> str:
+def _distance_text(metres: float) -> str:
     return length(metres) if np.isfinite(metres) else "missing in one"

@@ -1,12 +1,4 @@
-"""The 3-D scene of recordings that hold none: the env that they name is made again, and put into each recorded state.
-
-ManiSkill's own recordings keep the states of actors and joints, but neither meshes nor the poses of links. Only the
-env knows those. So it is made once more, in a process of its own (it is somebody's code, it may be missing or
-broken, and this process is to know nothing of simulators), reset with the recorded seed so that what depends on it is
-there, and set to one recorded state after the other; what comes back is a geometry and poses.
-
-The process lives as long as there is something to make in one go: several episodes of one file share its env.
-"""
+"""Makes the 3-D scene of recordings without one (ManiSkill's own), from the env that they name."""
 
 from __future__ import annotations
 
@@ -29,11 +21,16 @@ _NOT_PASSED_ON = HOW_IT_IS_RUN | {
 
 
 class SceneError(RuntimeError):
-    """Why a recording's scene cannot be made, a sentence."""
+    """Why a recording's scene cannot be made, as a sentence."""
 
 
 class SceneProcess:
-    """Makes the scenes of recordings that have none."""
+    """Makes scenes in a process of its own, which ends with the call.
+
+    ManiSkill's own recordings hold the states of actors and joints, but neither meshes nor poses of links. So the env is
+    made, reset with the recorded seed, and set to each recorded state. Its code may be missing or broken, and the server
+    imports no simulator: hence the process. Several episodes of one file share its env.
+    """
 
     def __init__(self, files: Sequence[Path] = (), imports: tuple[str, ...] = ()) -> None:
         """
@@ -45,22 +42,24 @@ class SceneProcess:
         self._files = tuple(str(Path(file).absolute()) for file in files)
 
     def __call__(
-        self, episodes: Sequence[Episode], check: Callable[[], None], say: Callable[[int, str], None]
+        self, episodes: Sequence[Episode], check: Callable[[], None], on_progress: Callable[[int, str], None]
     ) -> Iterator[tuple[Episode, tuple[str, ...]] | SceneError]:
-        """Make the scenes of these, one after the other: each episode with its scene and what could not be put back, or
-        why there is none.
+        """Yield each episode with its scene and what could not be restored, or why it gets none.
 
         Args:
-            check: called a few times a second; what it raises ends it.
-            say: called with the place of an episode among `episodes` and what is being done for it.
+            check: called a few times a second; an exception in it ends the work.
+            on_progress: called with an index into `episodes` and what is being done for that one.
         """
         process = Background(niceness=0)
         try:
             for number, episode in enumerate(episodes):
-                say(number, "making its scene")
+                on_progress(number, "making its scene")
                 try:
-                    made = self._one(
-                        process, episode, check, lambda done, total, words, number=number: say(number, words)
+                    made = self._make(
+                        process,
+                        episode,
+                        check,
+                        lambda done, total, words, number=number: on_progress(number, words),
                     )
                 except SceneError as error:
                     yield error
@@ -69,18 +68,18 @@ class SceneProcess:
         finally:
             process.end()
 
-    def _one(
+    def _make(
         self, process: Background, episode: Episode, check: Callable[[], None], on_progress: OnProgress
     ) -> SceneMade:
         info = episode.info
         if named := files_named(info):
-            # This is done when a row is opened; an env would read them, and may do so in native code.
+            # Opening a row must not let an env read files that a recording names: native code may parse them.
             raise SceneError(
                 f"It names files for {info.task} to read ({', '.join(named[:3])}), which is not done for looking at it, so "
                 "there are numbers and curves only."
             )
         kwargs = {name: value for name, value in info.env_kwargs.items() if name not in _NOT_PASSED_ON}
-        wanted = MakeScene(
+        question = MakeScene(
             info.task,
             self._files,
             kwargs,
@@ -91,7 +90,7 @@ class SceneProcess:
         )
         try:
             process.start()
-            return process.ask(check, wanted, on_progress)
+            return process.ask(check, question, on_progress)
         except JobFailed as failure:
             if process.pid is not None:
                 raise SceneError(str(failure)) from failure

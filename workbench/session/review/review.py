@@ -1,14 +1,4 @@
-"""Recordings that are open: read in the background, and looked at along one time that all of them share.
-
-What a page shows of a recording is all in memory (only pictures stay encoded until one is looked at), so there is no
-worker here and nothing to wait for: to seek is to change a number. Playing is arithmetic as well. The position
-follows from the clock when somebody asks for it, and `wait` sleeps until it is another one; there is no thread that
-has to tick.
-
-What takes time is opening: reading files, and for recordings that hold no scene (ManiSkill's own) making the env
-that they were recorded in. Each opening has a thread for as long as that takes; one that comes later makes what an
-earlier one still brings worthless, which is how opening something else stops it.
-"""
+"""Opens recordings in the background and plays them along one time axis."""
 
 from __future__ import annotations
 
@@ -32,46 +22,51 @@ from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_source
 from workbench.session.process.job_lane import Stopped
 from workbench.session.process.memory_limit import in_words, total_memory
-from workbench.session.review.events import happenings
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
-from workbench.session.review.view import START, Opened, ReviewView
+from workbench.session.review.view import START, Opened, ReviewView, find_events
 
 log = logging.getLogger(__name__)
 
 MOST_COMPARED = 4
-"""Recordings that are drawn over each other; more cannot be told apart."""
+"""Recordings drawn over each other; more cannot be told apart."""
 MOST_OPEN = 64
 MEMORY_SHARE = 0.25
-"""Of the machine's memory, for the recordings that are open: the page is not to be ended for want of it."""
+"""Share of the machine's memory for open recordings: without a limit the system may kill the server."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 FIRST_SHOWN = 0.4
-"""Seconds after which the recordings that are read are shown while others are read; then after twice that, and so on:
-each time a scene is built."""
+"""Seconds after which the recordings read so far are shown, while others are read; doubled each time, since each time
+a scene is built."""
 _NEVER = datetime.datetime.min.replace(tzinfo=datetime.timezone.utc)
-_LOOK_EVERY = 2.0
-"""Seconds between two looks at whether the files are still what was read."""
+_CHECK_EVERY = 2.0
+"""Seconds between two checks whether files changed since they were read."""
 
 
 @dataclass(frozen=True)
 class _Stamp:
     """Of a file that was read."""
 
-    of: str
-    """The recording's name."""
-    was: tuple[int, int] | None
-    """Size and time of change then; None if it was not there."""
+    recording: str
+    """Its name."""
+    size_and_time: tuple[int, int] | None
+    """Bytes and mtime in ns; None if the file did not exist."""
 
 
 @dataclass
-class _Walk:
+class _Playback:
     """Where playing began."""
 
     position: int
     at: float
+    """Seconds of the clock."""
 
 
 class Review:
-    """Up to `MOST_OPEN` opened recordings and one position. All methods are thread-safe and return at once."""
+    """Up to `MOST_OPEN` opened recordings and one position. All methods are thread-safe and return at once.
+
+    Recordings are in memory (pictures encoded), so seeking changes a number. While playing, the position follows from
+    the clock when it is asked for; no thread ticks. Each opening has a thread of its own. A later opening, or `close`,
+    makes an earlier one stop: its number is no longer the newest.
+    """
 
     def __init__(
         self,
@@ -84,13 +79,13 @@ class Review:
     ) -> None:
         """
         Args:
-            library: knows recordings by their ids.
-            read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a
+            library: finds recordings by their ids.
+            read: reads the recording of a row, sharing shapes with others; raises OSError or UnreadableRecording with a
                 sentence. None for `read_source`.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
-            most_bytes: of memory that the recordings which are opened at once may take; None for `MEMORY_SHARE`.
-            memory: bytes that the process has filled.
+            most_bytes: of memory for the recordings of one opening; None for `MEMORY_SHARE`.
+            memory: bytes that the process has allocated.
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._make_scene, self._clock = library, make_scene, clock
@@ -98,18 +93,19 @@ class Review:
         self._memory = memory
         self._changed = threading.Condition()
         self._view = ReviewView()
-        self._walk: _Walk | None = None
+        self._playback: _Playback | None = None
         self._opening = 0
-        """Number of the newest opening: what an earlier one brings is dropped."""
-        self._begun = False
-        """It has shown something."""
+        """Number of the newest opening: results of earlier ones are dropped."""
+        self._partly_shown = False
+        """The newest opening has put something on the page."""
         self._closed: set[str] = set()
-        """What was closed again since then: the opening may still bring more."""
+        """Ids closed by the user while the opening still runs."""
         self._thread: threading.Thread | None = None
         self._files: dict[Path, _Stamp] = {}
-        """Those of the opened ones."""
-        self._unread: tuple[str, ...] = ()
-        self._looked = -math.inf
+        """Files of the open recordings."""
+        self._open_problems: tuple[str, ...] = ()
+        self._files_checked = -math.inf
+        """Seconds of the clock."""
 
     # --- what the page reads -------------------------------------------------------------------------
 
@@ -133,54 +129,54 @@ class Review:
     # --- opening -------------------------------------------------------------------------------------
 
     def open(self, ids: Sequence[str], state: int | None = None) -> None:
-        """Show these recordings instead of what is open; the one that was recorded first comes first.
+        """Show these recordings instead of the open ones, the oldest first.
 
         Args:
-            ids: rows of the library; more than `MOST_OPEN` are left out, and that is said.
-            state: of the first one, to begin at.
+            ids: rows of the library; those beyond `MOST_OPEN` are left out, with a message.
+            state: of the first recording, to begin at.
         """
         rows = {row.id: row for row in self._library.rows()}
         wanted = [rows[id] for id in dict.fromkeys(ids) if id in rows]
         missing = len(dict.fromkeys(ids)) - len(wanted)
-        said: list[str] = []
+        problems: list[str] = []
         if missing:
-            said.append(
+            problems.append(
                 "A recording that was asked for is not in the folder any more."
                 if missing == 1
                 else f"{missing} recordings that were asked for are not in the folder any more."
             )
         if len(wanted) > MOST_OPEN:
-            said.append(f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} are.")
+            problems.append(f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} are.")
             wanted = wanted[:MOST_OPEN]
         with self._changed:
             self._opening += 1
             number = self._opening
-            self._begun = False
+            self._partly_shown = False
             self._closed.clear()
             if not wanted:
-                self._change(problems=tuple(said), loading="")
+                self._change(problems=tuple(problems), loading="")
                 return
-            # A table is most often sorted by date, the newest at its top; but one asks what became of the older one. It is
-            # read first too: who sees one before the others are there looks at the first of them from then on.
+            # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first:
+            # the recording that is shown first stays selected when others arrive.
             wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
-            self._change(loading=_opening_words(wanted, 0), problems=tuple(said))
+            self._change(loading=_opening_text(wanted, 0), problems=tuple(problems))
             self._thread = threading.Thread(
-                target=self._open, args=(number, wanted, said, state), name="review-open", daemon=True
+                target=self._open, args=(number, wanted, problems, state), name="review-open", daemon=True
             )
             self._thread.start()
 
     def close_one(self, index: int) -> None:
-        """Take one of the opened recordings away."""
+        """Close one of the open recordings."""
         with self._changed:
             if 0 <= index < len(self._view.opened):
                 kept = [o for number, o in enumerate(self._view.opened) if number != index]
                 selected = self._view.selected - (self._view.selected > index)
-                if self._begun:
+                if self._partly_shown:
                     self._closed.add(self._view.opened[index].id)
-                self._put(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
+                self._set_opened(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
 
-    def exchange(self, index: int, other: int) -> None:
-        """Let two opened recordings change places; what each of them shows stays."""
+    def swap(self, index: int, other: int) -> None:
+        """Swap two open recordings in the order; the position stays."""
         with self._changed:
             view = self._view
             if not {index, other} <= set(range(len(view.opened))):
@@ -190,18 +186,18 @@ class Review:
             order[index], order[other] = other, index
             position = self._view.position
             self._opening += 1
-            self._put([view.opened[k] for k in order], order.index(view.selected), view.align)
+            self._set_opened([view.opened[k] for k in order], order.index(view.selected), view.align)
             self._seek(position)
 
     def close(self) -> None:
-        """Nothing is opened any more; returns when the thread that opens has ended."""
+        """Stop opening; returns when the thread has ended, or after 10 s."""
         with self._changed:
             self._opening += 1
             thread = self._thread
         if thread is not None:
             thread.join(timeout=10.0)
 
-    def _open(self, number: int, rows: list[LibraryRow], said: list[str], state: int | None) -> None:
+    def _open(self, number: int, rows: list[LibraryRow], problems: list[str], state: int | None) -> None:
         opened: list[Opened] = []
         shapes = SharedShapes()
         files: dict[Path, _Stamp] = {}
@@ -210,7 +206,7 @@ class Review:
         for done, row in enumerate(rows):
             if opened and self._memory() - held > self._most_bytes:
                 left = len(rows) - done
-                said.append(
+                problems.append(
                     f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "
                     f"{in_words(self._most_bytes)} of memory. Open fewer at once."
                 )
@@ -221,49 +217,49 @@ class Review:
                 if opened and time.monotonic() - shown_at > wait:
                     self._show(opened, files, state)
                     shown_at, wait = time.monotonic(), 2 * wait
-                self._change(loading=_opening_words(rows, done))
+                self._change(loading=_opening_text(rows, done))
             stamps = _stamps_of(row)
             try:
                 episode = _shared(self._read(row, shapes), shapes)
-                opened.append(Opened(row.id, row.name, episode, happenings(episode)))
+                opened.append(Opened(row.id, row.name, episode, find_events(episode)))
                 files.update(stamps)
-                said += [broken.sentence for broken in episode.unread]
+                problems += [broken.sentence for broken in episode.unread]
             except (OSError, UnreadableRecording) as error:
-                said.append(f"{row.name}: {error}")
+                problems.append(f"{row.name}: {error}")
             except Exception as error:
-                # A page that stays on "opening" says nothing; and the file is whatever somebody put there.
+                # The file may hold anything. Without this the page would stay on "opening" without a reason.
                 log.exception("%s could not be opened.", row.name)
-                said.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
+                problems.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
         opened.sort(key=lambda one: one.episode.info.written_at)
         with self._changed:
             if number != self._opening:
                 return
-            self._unread = tuple(said)
+            self._open_problems = tuple(problems)
             if opened:
                 self._show(opened, files, state)
-            self._change(loading="", problems=self._unread)
+            self._change(loading="", problems=self._open_problems)
         self._give_scenes(number, [one for one in opened if not one.has_scene], shapes)
 
     def _show(self, opened: Sequence[Opened], files: Mapping[Path, _Stamp], state: int | None) -> None:
-        """Put on the page what an opening has brought so far, less what was closed again; under the lock.
+        """Show the recordings read so far, without those closed again; under the lock.
 
-        Whoever has begun to look is left at what they look at.
+        Selection and position stay once something of this opening was shown.
         """
         self._files = dict(files)
         kept = [one for one in opened if one.id not in self._closed]
-        chosen = self._view.chosen if self._begun else None
+        chosen = self._view.chosen if self._partly_shown else None
         selected = next((index for index, one in enumerate(kept) if one is chosen), 0)
-        if self._begun:
-            self._put(kept, selected, self._view.align, stay=True)
+        if self._partly_shown:
+            self._set_opened(kept, selected, self._view.align, stay=True)
         else:
-            self._begun = True
-            self._put(kept, 0, START)
+            self._partly_shown = True
+            self._set_opened(kept, 0, START)
             if state is not None:
                 self._seek(state)
 
     def _give_scenes(self, number: int, without: Sequence[Opened], shapes: SharedShapes) -> None:
-        def say(one: Opened, words: str, making: bool = True) -> None:
-            self._replace_opened(number, one.id, lambda now: replace(now, scene=words, making=making))
+        def set_message(one: Opened, message: str, making: bool = True) -> None:
+            self._replace_opened(number, one.id, lambda now: replace(now, scene=message, making=making))
 
         def check() -> None:
             if number != self._opening or all(one.id in self._closed for one in without):
@@ -273,35 +269,37 @@ class Review:
         wanted = [] if make is None else [one for one in without if one.episode.env_states]
         for one in without:
             if one in wanted:
-                say(one, "its scene is made next")
+                set_message(one, "its scene is made next")
             else:
-                say(one, "This recording holds no scene to draw.", False)
+                set_message(one, "This recording holds no scene to draw.", False)
         if make is None or not wanted:
             return
-        scenes = make([one.episode for one in wanted], check, lambda index, words: say(wanted[index], words))
+        scenes = make(
+            [one.episode for one in wanted], check, lambda index, text: set_message(wanted[index], text)
+        )
         try:
             for one, made in zip(wanted, scenes, strict=True):
                 if isinstance(made, SceneError):
-                    say(one, str(made), False)
+                    set_message(one, str(made), False)
                     continue
-                episode, words = (
+                episode, message = (
                     _shared(made[0], shapes),
                     f"Not put back: {'; '.join(made[1])}." if made[1] else "",
                 )
                 self._replace_opened(
                     number,
                     one.id,
-                    lambda now, episode=episode, words=words: replace(
-                        now, episode=episode, scene=words, making=False
+                    lambda now, episode=episode, message=message: replace(
+                        now, episode=episode, scene=message, making=False
                     ),
                 )
         except Stopped:
             return
         except Exception as error:
-            # What that process sent may fit nothing; a page that stays on "making" says nothing.
+            # That process may send anything. Without this the page would stay on "making" without a reason.
             report_failure("Scenes of recordings could not be made", error)
             for one in wanted:
-                say(one, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
+                set_message(one, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
 
     def _replace_opened(self, number: int, id: str, change: Callable[[Opened], Opened]) -> None:
         with self._changed:
@@ -313,16 +311,16 @@ class Review:
                 got_scene &= opened[index].has_scene
                 self._change(opened=tuple(opened), opened_serial=self._view.opened_serial + got_scene)
 
-    def _put(self, opened: Sequence[Opened], selected: int, align: str, stay: bool = False) -> None:
-        """Show these, from the first position on, or where one is if one is to `stay`; under the lock."""
+    def _set_opened(self, opened: Sequence[Opened], selected: int, align: str, stay: bool = False) -> None:
+        """Show these at the first position, or at the present one if `stay`; under the lock."""
         if stay:
             self._advance()
         else:
-            self._walk = None
+            self._playback = None
             self._change(playing=False)
         stay = stay and bool(self._view.opened) and bool(opened)
         state = self._view.states[self._view.selected] if stay else None
-        names = dict.fromkeys(h.name for o in opened for h in o.happenings if h.style != "reset")
+        names = dict.fromkeys(h.name for o in opened for h in o.events if h.style != "reset")
         alignments = (START, *(f"first {name}" for name in names))
         self._change(
             opened=tuple(opened),
@@ -332,28 +330,28 @@ class Review:
         )
         self._align(align if align in alignments else START, position=state)
 
-    def say(self, sentence: str) -> None:
-        """Let the page say this, until something is opened."""
+    def add_problem(self, sentence: str) -> None:
+        """Show this among the problems, until something is opened."""
         with self._changed:
-            self._unread = (*self._unread, sentence)
+            self._open_problems = (*self._open_problems, sentence)
             self._change(problems=(*self._view.problems, sentence))
 
     # --- the position --------------------------------------------------------------------------------
 
     def seek(self, position: int) -> None:
-        """To a position, or the nearest that there is."""
+        """Go to a position, or the nearest in range."""
         with self._changed:
             self._seek(position)
 
     def seek_by(self, steps: int) -> None:
-        """Some states on, or back; that is frame by frame, and stops playing."""
+        """Go some states forward, or back if negative; pauses."""
         with self._changed:
             self._advance()
             self._pause()
             self._seek(self._view.position + steps)
 
     def seek_event(self, direction: int) -> None:
-        """To the next (1) or last (-1) event of any opened recording, of the selected one where there are many."""
+        """Go to the next (1) or previous (-1) event of any open recording; of the selected one if many are open."""
         with self._changed:
             self._advance()
             view = self._view
@@ -362,7 +360,7 @@ class Review:
                 h.state - view.anchors[index]
                 for index in several
                 if view.opened
-                for h in view.opened[index].happenings
+                for h in view.opened[index].events
             }
             places |= {view.last} if view.opened else set()
             ahead = [p for p in places if (p - view.position) * direction > 0]
@@ -380,7 +378,7 @@ class Review:
             self._seek(self._view.last)
 
     def show(self, index: int, state: int) -> None:
-        """That state of that recording, and that recording selected."""
+        """Select a recording and go to a state of it."""
         with self._changed:
             if 0 <= index < len(self._view.opened):
                 self._pause()
@@ -393,10 +391,10 @@ class Review:
                 self._change(selected=index)
 
     def align(self, how: str) -> None:
-        """At one of `ReviewView.alignments`. What is shown of the selected recording stays.
+        """Align at one of `ReviewView.alignments`. The shown state of the selected recording stays.
 
         Raises:
-            ValueError: it is none of them.
+            ValueError: unknown alignment.
         """
         with self._changed:
             if how not in self._view.alignments:
@@ -416,20 +414,20 @@ class Review:
             elif self._view.opened and self._view.last > self._view.first:
                 at_end = self._view.position >= self._view.last
                 position = self._view.first if at_end else self._view.position
-                self._walk = _Walk(position, self._clock())
+                self._playback = _Playback(position, self._clock())
                 self._change(playing=True, position=position)
 
     def set_speed(self, speed: float) -> None:
-        """Times real time.
+        """Set the speed, as a multiple of real time.
 
         Raises:
-            ValueError: it is no number above 0.
+            ValueError: not between 0 and 1000.
         """
         if not 0 < speed < 1000:
             raise ValueError("The speed is a number above 0.")
         with self._changed:
             self._advance()
-            self._restart_walk()
+            self._restart_playback()
             self._change(speed=speed)
 
     def set_loop(self, loop: bool) -> None:
@@ -438,17 +436,17 @@ class Review:
 
     # --- files ---------------------------------------------------------------------------------------
 
-    def look_at_files(self) -> None:
-        """Say of files that were deleted or changed since they were read; often called, and seldom done."""
+    def check_files(self) -> None:
+        """Report files that were deleted or changed since they were read; at most every `_CHECK_EVERY` seconds."""
         with self._changed:
-            if self._clock() - self._looked < _LOOK_EVERY:
+            if self._clock() - self._files_checked < _CHECK_EVERY:
                 return
-            self._looked = self._clock()
-            files, unread = dict(self._files), self._unread
-        said = tuple(dict.fromkeys((*unread, *_not_as_read(files))))
+            self._files_checked = self._clock()
+            files, problems = dict(self._files), self._open_problems
+        problems = tuple(dict.fromkeys((*problems, *_changed_files(files))))
         with self._changed:
-            if said != self._view.problems and files == self._files and not self._view.loading:
-                self._change(problems=said)
+            if problems != self._view.problems and files == self._files and not self._view.loading:
+                self._change(problems=problems)
 
     # --- under the lock ------------------------------------------------------------------------------
 
@@ -457,7 +455,7 @@ class Review:
         self._changed.notify_all()
 
     def _align(self, how: str, position: int | None) -> None:
-        """`position`: a state of the selected recording to stay at; None goes to the first position."""
+        """Align, and stay at a state of the selected recording (`position`); None goes to the first position."""
         opened = self._view.opened
         name = how.removeprefix("first ")
         anchors = tuple(0 if how == START else (o.first(name) or 0) for o in opened)
@@ -465,22 +463,22 @@ class Review:
         last = max((o.length - a for o, a in zip(opened, anchors, strict=True)), default=0)
         at = first if position is None else position - anchors[self._view.selected]
         self._change(align=how, anchors=anchors, first=first, last=last, position=min(max(at, first), last))
-        self._restart_walk()
+        self._restart_playback()
 
     def _seek(self, position: int) -> None:
         position = min(max(position, self._view.first), self._view.last)
         if position != self._view.position:
             self._change(position=position)
-        self._restart_walk()
+        self._restart_playback()
 
     def _pause(self) -> None:
-        self._walk = None
+        self._playback = None
         if self._view.playing:
             self._change(playing=False)
 
-    def _restart_walk(self) -> None:
-        if self._walk is not None:
-            self._walk = _Walk(self._view.position, self._clock())
+    def _restart_playback(self) -> None:
+        if self._playback is not None:
+            self._playback = _Playback(self._view.position, self._clock())
 
     def _rate(self) -> float:
         """Positions a second."""
@@ -488,55 +486,55 @@ class Review:
         return self._view.speed / max(chosen.episode.info.control_dt, 1e-4) if chosen is not None else 0.0
 
     def _advance(self) -> None:
-        """To where playing has come by now."""
-        walk, view = self._walk, self._view
-        if walk is None:
+        """Move the position to where playing is by now."""
+        playback, view = self._playback, self._view
+        if playback is None:
             return
-        position = walk.position + int((self._clock() - walk.at) * self._rate() + 1e-6)
+        position = playback.position + int((self._clock() - playback.at) * self._rate() + 1e-6)
         if position > view.last:
             if view.loop:
-                # Its last state is shown for as long as any other.
-                self._walk = _Walk(view.first, self._clock())
+                # The last state is shown for as long as any other.
+                self._playback = _Playback(view.first, self._clock())
                 self._change(position=view.first)
             else:
-                self._walk = None
+                self._playback = None
                 self._change(position=view.last, playing=False)
         elif position != view.position:
             self._change(position=position)
 
     def _next_position_in(self) -> float:
-        if self._walk is None:
+        if self._playback is None:
             return 3600.0
-        steps = (self._clock() - self._walk.at) * self._rate()
+        steps = (self._clock() - self._playback.at) * self._rate()
         return max((int(steps + 1e-6) + 1 - steps) / self._rate(), 1e-3)
 
 
 def _shared(episode: Episode, shapes: SharedShapes) -> Episode:
-    """The same recording, with shapes of others where they look the same."""
+    """The same recording, with equal shapes of other recordings reused."""
     return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
 
 
 def _stamps_of(row: LibraryRow) -> dict[Path, _Stamp]:
-    """Its files as they are now."""
+    """Stamps of its files as they are now."""
     return {path: _Stamp(row.name, _size_and_time(path)) for path in row.paths}
 
 
-def _not_as_read(files: Mapping[Path, _Stamp]) -> list[str]:
-    """A sentence for each file that was deleted or changed since it was read: what was read stays in memory."""
-    said = []
+def _changed_files(files: Mapping[Path, _Stamp]) -> list[str]:
+    """A sentence for each file that was deleted or changed since it was read."""
+    found = []
     for path, stamp in files.items():
         now = _size_and_time(path)
-        if now is None and stamp.was is not None:
-            said.append(f"{path.name} was deleted since it was opened; what was read of it is still shown.")
-        elif now != stamp.was:
-            said.append(
-                f"{path.name} has changed since it was opened; open {stamp.of} again to see what is in it now."
+        if now is None and stamp.size_and_time is not None:
+            found.append(f"{path.name} was deleted since it was opened; what was read of it is still shown.")
+        elif now != stamp.size_and_time:
+            found.append(
+                f"{path.name} has changed since it was opened; open {stamp.recording} again to see what is in it now."
             )
-    return said
+    return found
 
 
-def _opening_words(rows: Sequence[LibraryRow], done: int) -> str:
-    """What is being opened, and how far that is."""
+def _opening_text(rows: Sequence[LibraryRow], done: int) -> str:
+    """What is being opened, with a count if there are several."""
     name = rows[done].name
     return f"opening {name}" if len(rows) == 1 else f"opening {done + 1} of {len(rows)}: {name}"
 

@@ -1,37 +1,55 @@
-"""What the review page reads: one immutable snapshot of the opened recordings and of where one looks.
-
-Recordings are looked at one beside the other, and they differ in length and in when things happen in them. So there
-is one *position* for all, counted from the moment at which they are aligned (their starts, or the first success of
-each ...): position 0 is that moment in every one of them, and each shows its own state there. Before its start an
-episode shows its first state, after its end its last.
-"""
+"""Snapshots of the open recordings for the review page: position, events, curves and pictures."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.recording.episode.episode import Episode
-from workbench.session.review.events import Happening
+from workbench.core.camera_data import CameraInfo, CameraKey, Picture
+from workbench.recording.episode.encoded_pictures import Modality
+from workbench.recording.episode.episode import CameraTrack, Episode
+from workbench.recording.reader.processes import ReaderBusy
+from workbench.session.history.curves import PREFIX
+from workbench.session.protocol.messages import CameraRequest
 
 START = "start"
 """The alignment that every recording has."""
+Style = Literal["reset", "success", "fail", "limit", "odd", "other"]
+"""Colour of an event on the strip under the slider."""
+REWARD = "reward"
+TERMS = "terms of the reward"
+ACTION = "action"
+MOST_LINES = 12
+"""Columns of one entry; more cannot be told apart."""
+_MOST_RUNS = 40
+"""Events of one entry. One that flickers at every step is no event."""
+
+
+@dataclass(frozen=True)
+class EpisodeEvent:
+    """The first state of a run in which something is true."""
+
+    state: int
+    name: str
+    style: Style
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """One recording that is open. Two are equal only if they are the same one, opened once."""
+    """One open recording. Two are equal only if they are the same one, opened once."""
 
     id: str
     """Of the library's row."""
     name: str
-    """As people call it: its file."""
+    """Its file, as shown."""
     episode: Episode
-    happenings: tuple[Happening, ...]
+    events: tuple[EpisodeEvent, ...]
     scene: str = ""
-    """What there is to say of its 3-D scene while it has none: that it is being made, or why it cannot be."""
+    """Message about a missing 3-D scene: it is being made, or why it cannot be."""
     making: bool = False
     """Its scene is being made in the background."""
 
@@ -45,12 +63,19 @@ class Opened:
         return self.episode.geometry is not None and self.episode.poses is not None
 
     def first(self, name: str) -> int | None:
-        """The first state at which something began; None if it never did."""
-        return next((h.state for h in self.happenings if h.name == name), None)
+        """The first state with an event of this name; None without one."""
+        return next((event.state for event in self.events if event.name == name), None)
 
 
 @dataclass(frozen=True)
 class ReviewView:
+    """Immutable snapshot of the open recordings and of the position.
+
+    Recordings differ in length and in when things happen. So all share one *position*, counted from the moment at which
+    they are aligned (their starts, the first success of each, ...): position 0 is that moment in each. Before its start
+    an episode shows its first state, after its end its last.
+    """
+
     serial: int = 0
     """Grows with every change of anything here."""
     opened: tuple[Opened, ...] = ()
@@ -60,20 +85,20 @@ class ReviewView:
     """Whose cameras and numbers are shown: index into `opened`."""
     align: str = START
     alignments: tuple[str, ...] = (START,)
-    """At what the opened ones can be aligned."""
+    """What the open recordings can be aligned at."""
     anchors: tuple[int, ...] = ()
     """The state of each that lies at position 0."""
     position: int = 0
     first: int = 0
     last: int = 0
-    """Ends of what `position` can be."""
+    """Range of `position`, both included."""
     playing: bool = False
     speed: float = 1.0
     loop: bool = False
     loading: str = ""
     """What is being opened."""
     problems: tuple[str, ...] = ()
-    """What could not be opened, and what has become of files since, a sentence each."""
+    """Recordings that could not be opened, and files that changed since; a sentence each."""
 
     @property
     def states(self) -> tuple[int, ...]:
@@ -102,3 +127,170 @@ def column_at(
         inside = (places >= 0) & (places < len(axis))
         line[places[inside]] = values[inside]
     return line
+
+
+# --- events and curves ---------------------------------------------------------------------------------
+
+
+def find_events(episode: Episode) -> tuple[EpisodeEvent, ...]:
+    """Events in order of time, the start first: success, fail and every other bool of ``evaluate`` that turns true,
+    time limits, and rewards that are not finite."""
+    found = [EpisodeEvent(0, "reset", "reset")]
+    for name, values in episode.evaluate.items():
+        yes = None if name.startswith(PREFIX) else _flag(values)
+        if yes is not None:
+            style: Style = "success" if name == "success" else "fail" if name == "fail" else "other"
+            found += [EpisodeEvent(state, name, style) for state in _turns_true(yes)]
+    found += [
+        EpisodeEvent(state + 1, "time limit", "limit")
+        for state in _turns_true(np.asarray(episode.truncated, bool))
+    ]
+    found += [
+        EpisodeEvent(state + 1, "reward is NaN or infinite", "odd")
+        for state in _turns_true(~np.isfinite(np.asarray(episode.reward, np.float64)))
+    ]
+    return tuple(sorted(found, key=lambda event: (event.state, event.style == "other")))
+
+
+def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
+    """All numbers over time: by entry, then by line, the states (K,) and the numbers (K,) at them.
+
+    Entries with several numbers a state (an action, the terms of a reward) have a line each.
+    """
+    states = np.arange(len(episode.reward) + 1)
+    after = states[1:]
+    found: dict[str, dict[str, tuple[NDArray, NDArray]]] = {
+        REWARD: {REWARD: (after, _numbers(episode.reward))}
+    }
+    terms: dict[str, tuple[NDArray, NDArray]] = {}
+    for name, values in episode.evaluate.items():
+        if values.dtype.kind not in "fiub":
+            continue
+        if name.startswith(PREFIX):
+            if values.ndim == 1 and len(terms) < MOST_LINES:
+                terms[name.removeprefix(PREFIX)] = (after, _numbers(values)[1:])
+            continue
+        label = f"{name} (evaluate)" if name in (REWARD, TERMS, ACTION) else name
+        found[label] = dict(_lines(name, values, states))
+    for name, values in episode.batch.items():
+        label = f"{name} (not per env)"
+        found[label] = dict(_lines(label, values, states))
+    if terms:
+        found[TERMS] = terms
+    if episode.action.shape[1:] and episode.action.shape[1]:
+        action = np.asarray(episode.action, np.float64)[:, :MOST_LINES]
+        found[ACTION] = {
+            name: (after, action[:, index]) for index, name in enumerate(episode.action_names[:MOST_LINES])
+        }
+    return found
+
+
+def outcome_text(episode: Episode) -> tuple[str, str]:
+    """How it ended, and the colour for it: ``good``, ``bad``, ``warn`` or none."""
+    success, fail = (_flag(episode.evaluate.get(name)) for name in ("success", "fail"))
+    if fail is not None and len(fail) and fail[-1]:
+        return "failed", "bad"
+    if success is None or not len(success):
+        return "no success defined", ""
+    if success[-1]:
+        return "success", "good"
+    once = np.flatnonzero(success)
+    return (f"success lost (it was there at step {once[0]})", "warn") if len(once) else ("no success", "bad")
+
+
+def _lines(name: str, values: NDArray, states: NDArray) -> Iterator[tuple[str, tuple[NDArray, NDArray]]]:
+    flat = _numbers(values.reshape(len(values), -1))
+    for column in range(min(flat.shape[1], MOST_LINES)):
+        label = name if values.ndim == 1 else f"{name}[{column}]"
+        yield label, (states, flat[:, column])
+
+
+def _numbers(values: NDArray) -> NDArray[np.float64]:
+    return np.asarray(values, np.float64)
+
+
+def _flag(values: NDArray | None) -> NDArray[np.bool_] | None:
+    """(T + 1,) of a bool entry; None of any other."""
+    if values is None or not len(values) or values.size != len(values):
+        return None
+    flat = values.reshape(len(values))
+    if flat.dtype.kind == "b":
+        return flat
+    if flat.dtype.kind != "f":
+        return None
+    # An entry that only some states had is stored as 0.0 and 1.0, with NaN for the others.
+    known = flat[np.isfinite(flat)]
+    return np.nan_to_num(flat) != 0 if len(known) and np.isin(known, (0.0, 1.0)).all() else None
+
+
+def _turns_true(yes: NDArray[np.bool_]) -> list[int]:
+    before = np.concatenate([[False], yes[:-1]])
+    starts = np.flatnonzero(yes & ~before)
+    return starts[:1].tolist() if len(starts) > _MOST_RUNS else starts.tolist()
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+class PictureReader:
+    """Decodes the pictures of one recording at a time. Not thread-safe: the page's loop owns it.
+
+    A picture takes some milliseconds to decode and an episode of four cameras has thousands. So only the shown one of
+    each camera is decoded and kept: the page asks for the same one thirty times a second.
+    """
+
+    def __init__(self) -> None:
+        self._episode: Episode | None = None
+        self._cache: dict[CameraKey, tuple[int, tuple[Modality, ...], Picture]] = {}
+        self.problem = ""
+        """Why a picture cannot be shown, a sentence; else empty."""
+
+    def cameras(self, episode: Episode) -> tuple[CameraInfo, ...]:
+        """Its cameras, each with the modalities that were recorded."""
+        return tuple(
+            replace(track.info, modalities=tuple(track.pictures))
+            for track in episode.cameras
+            if track.pictures and len(track.frame)
+        )
+
+    def pictures(
+        self, episode: Episode, state: int, requests: Iterable[CameraRequest], env: int
+    ) -> dict[CameraKey, Picture]:
+        """By camera, the newest picture at or before `state`, labelled as of `env`.
+
+        A camera whose picture cannot be decoded has none; `problem` says why.
+        """
+        if episode is not self._episode:
+            self._episode, self._cache, self.problem = episode, {}, ""
+        tracks = {track.info.key: track for track in episode.cameras}
+        found: dict[CameraKey, Picture] = {}
+        for request in requests:
+            track = tracks.get((request.kind, request.name))
+            if track is None:
+                continue
+            index = int(np.searchsorted(track.frame, state, side="right")) - 1
+            modalities = tuple(m for m in track.pictures if m in request.modalities)
+            if index < 0 or not modalities:
+                continue
+            kept = self._cache.get(track.info.key)
+            if kept is None or kept[:2] != (index, modalities) or kept[2].env != env:
+                try:
+                    picture = decode_picture(track, index, modalities, env)
+                except ReaderBusy:
+                    # Another recording is being opened by the reader: the last picture stays until it is done.
+                    if kept is not None:
+                        found[track.info.key] = kept[2]
+                    continue
+                except (OSError, ValueError, EOFError, IndexError) as error:
+                    self.problem = f"A picture of {track.info.name} cannot be read: {error}."
+                    continue
+                kept = (index, modalities, picture)
+                self._cache[track.info.key] = kept
+            found[track.info.key] = kept[2]
+        return found
+
+
+def decode_picture(track: CameraTrack, index: int, modalities: tuple[Modality, ...], env: int) -> Picture:
+    """Picture `index` of a camera."""
+    planes = {modality: np.asarray(track.pictures[modality][index]) for modality in modalities}
+    return Picture(track.info.name, track.info.kind, env, track.pose[index], **planes)

@@ -13,10 +13,8 @@ from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
 from workbench.session.live.view import Seen
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.review.events import success_words
-from workbench.session.review.pictures import PictureReader
 from workbench.session.review.review import MOST_OPEN, Review
-from workbench.session.review.view import ReviewView, column_at
+from workbench.session.review.view import PictureReader, ReviewView, column_at, outcome_text
 from workbench.ui.app.go_live import GoLivePart
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
@@ -187,7 +185,7 @@ class ReviewPage:
         return self._framing.follow() > 0
 
     def _look_and_redraw(self) -> None:
-        self._review.look_at_files()
+        self._review.check_files()
         self.redraw()
 
     def redraw(self) -> None:
@@ -208,7 +206,7 @@ class ReviewPage:
             going=self._place.go_live.going(),
             # `library_keys.js` disables these while the library is folded.
             library_keys=" ".join(self._library.keys),
-            success_words=success_words,
+            outcome_text=outcome_text,
         )
         self._draw_cameras(view)
         self._parts.draw(view)
@@ -393,7 +391,7 @@ def walk(playing: bool) -> tuple[str, ...]:
 def fixed_values(view: ReviewView) -> dict[str, object]:
     """The values of the strip that do not depend on the position."""
     rows = [
-        (index, [h for h in view.opened[index].happenings if h.style != "reset"][:MOST_MARKS])
+        (index, [h for h in view.opened[index].events if h.style != "reset"][:MOST_MARKS])
         for index in shown_together(view)
     ]
     reward = np.asarray(view.opened[view.selected].episode.reward, np.float64)

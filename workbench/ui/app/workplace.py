@@ -109,12 +109,14 @@ class Workplace:
         try:
             mended = [str(file) for file in mend(self._recordings)]
         except OSError as error:
-            shelf.review.say(str(error))
+            shelf.review.add_problem(str(error))
             self._on_notice(str(error))
             return
         if mended:
             what = "An episode that was" if len(mended) == 1 else f"{len(mended)} episodes that were"
-            shelf.review.say(f"{what} left half written by a program that was killed can be seen again.")
+            shelf.review.add_problem(
+                f"{what} left half written by a program that was killed can be seen again."
+            )
             self._on_notice(recovered_in_words(mended))
             shelf.library.look_soon()
 

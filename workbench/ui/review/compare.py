@@ -6,7 +6,13 @@ import viser
 
 from workbench.machine.text import length
 from workbench.session.history.curves import PREFIX
-from workbench.session.review.compare import TOLERANCES, USUAL_TOLERANCE, Difference, Parting, difference
+from workbench.session.review.compare import (
+    TOLERANCES,
+    USUAL_TOLERANCE,
+    Difference,
+    FirstDifference,
+    difference,
+)
 from workbench.session.review.review import Review
 from workbench.session.review.view import Opened, ReviewView
 from workbench.ui.widgets.click_targets import Presses
@@ -43,7 +49,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
         )
         self._html = gui.add_html("")
         self._presses = Presses(server)
-        self._differing: list[Parting] = []
+        self._differing: list[FirstDifference] = []
         """By row of the table."""
 
     def key(self, view: ReviewView) -> object:
@@ -69,13 +75,13 @@ class ReviewComparePanel(PagePart[ReviewView]):
         self._html.content = self._content(a, b, other, found, view)
 
     def _content(self, a: Opened, b: Opened, other: int, found: Difference, view: ReviewView) -> str:
-        partings = [*([found.bodies] if found.bodies else []), *found.numbers]
-        self._differing = [p for p in partings if p.position is not None]
+        differences = [*([found.bodies] if found.bodies else []), *found.numbers]
+        self._differing = [p for p in differences if p.position is not None]
         presses = [
             self._presses.id_of(number, lambda _, number=number: self._go(number))
             for number in range(len(self._differing[:MOST_ROWS]))
         ]
-        one_sided = [f"{p.name} ({p.first})" for p in partings if p.position is None and p.first]
+        one_sided = [f"{p.name} ({p.values})" for p in differences if p.position is None and p.values]
         return render(
             "review_compare",
             a=a,
@@ -85,11 +91,11 @@ class ReviewComparePanel(PagePart[ReviewView]):
             found=found,
             headline=headline(found),
             notes=notes(a, b, found),
-            totals=next((p.whole for p in found.numbers if p.name == "reward"), ""),
+            totals=next((p.totals for p in found.numbers if p.name == "reward"), ""),
             rows=list(zip(self._differing, presses, strict=False)),
             more=len(self._differing) - len(presses),
             same=", ".join(
-                p.name.removeprefix(PREFIX) for p in partings if p.position is None and not p.first
+                p.name.removeprefix(PREFIX) for p in differences if p.position is None and not p.values
             ),
             one_sided=", ".join((*one_sided, *found.not_in_both)),
             prefix=PREFIX,
@@ -99,7 +105,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
         count = len(self._review.view().opened)
         letters = [letter(index) for index in range(count)]
         if self._other.value in letters[1:]:
-            self._review.exchange(0, letters.index(self._other.value))
+            self._review.swap(0, letters.index(self._other.value))
 
     def _go(self, number: int) -> None:
         place = self._differing[number].position if number < len(self._differing) else None
@@ -113,11 +119,9 @@ def headline(found: Difference) -> str:
     if found.bodies is None:
         return "One of them has no scene, so only numbers are compared."
     if found.bodies.position is None:
-        apart = "" if found.bodies.most == "0" else f", {found.bodies.most} apart at most"
+        apart = "" if found.bodies.largest == "0" else f", {found.bodies.largest} apart at most"
         return f"All bodies stay together{apart}."
-    return (
-        f"They part at step {found.bodies.position}: {found.bodies.first} apart. At most {found.bodies.most}."
-    )
+    return f"They part at step {found.bodies.position}: {found.bodies.values} apart. At most {found.bodies.largest}."
 
 
 def notes(a: Opened, b: Opened, found: Difference) -> list[str]:

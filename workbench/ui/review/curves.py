@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from workbench.core.env.step_result import StepResult
 from workbench.recording.episode.episode import Episode
-from workbench.session.review.events import ACTION, REWARD, TERMS, curves
-from workbench.session.review.view import ReviewView, column_at
+from workbench.session.review.view import ACTION, REWARD, TERMS, ReviewView, column_at, curves
 from workbench.ui.live.reward import COLOURS as LINE_COLOURS
 from workbench.ui.live.reward import NumberRow, number_rows
 from workbench.ui.review.scene import shown_together

@@ -10,9 +10,8 @@ import viser
 
 from workbench.jobs.from_recording import ChangesOnDisk, version_of
 from workbench.recording.episode.episode import acted_by_in_words
-from workbench.session.review.events import success_words
 from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
-from workbench.session.review.view import Opened, ReviewView
+from workbench.session.review.view import Opened, ReviewView, outcome_text
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
@@ -142,7 +141,7 @@ class ReviewPanel(PagePart[ReviewView]):
             )
             for index in range(len(view.opened))
         ]
-        return render("review_opened", view=view, presses=presses, success_words=success_words)
+        return render("review_opened", view=view, presses=presses, outcome_text=outcome_text)
 
 
 def never_words(view: ReviewView) -> str:

@@ -13,7 +13,7 @@ import viser
 from workbench.machine.files import new_file
 from workbench.recording.episode.episode import Episode
 from workbench.recording.films import Eye, usual_eye
-from workbench.session.review.events import success_words
+from workbench.session.review.view import outcome_text
 from workbench.ui.scene.bodies import SceneView
 from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.server.gated_server import ServerOptions, open_server
@@ -73,7 +73,7 @@ def seconds_a_step(episode: Episode) -> float:
 def _caption(episode: Episode) -> str:
     info = episode.info
     about = f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
-    ended, mood = success_words(episode)
+    ended, mood = outcome_text(episode)
     dt = seconds_a_step(episode)
     return render("scene_caption", about=about, ended=ended if mood else "", dt=dt, steps=episode.length)
 
