@@ -35,7 +35,7 @@ from workbench.machine.chromium import find_chromium, how_to_get_chromium
 GOLDEN = Path(__file__).parents[1] / "golden"
 PLACE = Path("/tmp/golden")
 LIVE_TABS = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Log")
-REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "PastRescorer", "Share")
+REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "Judge", "Share")
 STEPS = 6
 WIDTH, HEIGHT = 1280, 1000
 PATIENCE = 60.0

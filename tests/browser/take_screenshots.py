@@ -214,7 +214,7 @@ def shoot_camera_judged(page: Page) -> None:
     tab(page, "Studio")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="base_camera · sensor", exact=True).click()
-    page.get_by_text("PastRescorer", exact=True).click()
+    page.get_by_text("Judge", exact=True).click()
     page.get_by_role("button", name="Judge this camera").click()
     expect(page.locator(".wb-planes")).to_be_visible()
     page.get_by_role("button", name="Pictures of all envs").click()

@@ -21,7 +21,7 @@ ENVS = 2
 CAMERA = "base_camera"
 PICTURE = "img[src^='blob:']:visible"
 FOLDERS = {
-    "PastRescorer": "Judge this camera",
+    "Judge": "Judge this camera",
     "Compare": "Keep this placement as A",
     "Suggest a placement": "Search",
     "Matrices and files": "Download",

@@ -65,7 +65,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         live = page.get_by_role("button", name="Go on live from here")
         expect(live).to_be_visible(timeout=PATIENT)
 
-        page.get_by_role("tab", name="PastRescorer").click()
+        page.get_by_role("tab", name="Judge").click()
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
         page.get_by_role("button", name="Judge what is open").click()
         expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)

@@ -359,7 +359,7 @@ def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_b
     for step in range(1, 4):
         page.keyboard.press("s")
         expect(page.get_by_text(f"env 0: step {step}").first).to_be_visible()
-    unfold(page, "PastRescorer", page.get_by_role("button", name="Judge this camera", exact=True))
+    unfold(page, "Judge", page.get_by_role("button", name="Judge this camera", exact=True))
     option(page, "Over", "this env's steps so far")
     button(page, "Judge this camera")
     expect(page.get_by_text("4 moments of env 0's episode, step 0 to step 3")).to_be_visible()
@@ -380,4 +380,4 @@ def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_b
     page.keyboard.press("Enter")
     button(page, "Judge this camera")
     expect(page.get_by_text("2 fresh resets")).to_be_visible(timeout=120_000)
-    page.get_by_text("PastRescorer", exact=True).click()
+    page.get_by_text("Judge", exact=True).click()

@@ -37,7 +37,7 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         page.keyboard.press("Enter")
         live = page.get_by_role("button", name="Go on live from here")
         expect(live).to_be_visible(timeout=PATIENT)
-        page.get_by_role("tab", name="PastRescorer").click()
+        page.get_by_role("tab", name="Judge").click()
         rescore = page.get_by_role("button", name="Judge what is open")
         rescore.click()
         window = page.get_by_role("dialog")

@@ -122,7 +122,7 @@ class ReviewPage:
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
             compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
-        with tabs.add_tab("PastRescorer", viser.Icon.GAVEL):
+        with tabs.add_tab("Judge", viser.Icon.GAVEL):
             self._rescore = RescorePanel(
                 server, place.rescorer, review, library, place.rescore_choices, place.task_files
             )

@@ -33,7 +33,7 @@ class CameraReportPanel:
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        with server.gui.add_folder("PastRescorer", expand_by_default=False) as self.folder:
+        with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
                 OVERS,
