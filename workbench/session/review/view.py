@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, CameraKey, Picture
-from workbench.recording.episode.encoded_pictures import Modality
 from workbench.recording.episode.episode import CameraTrack, Episode
 from workbench.recording.reader.processes import ReaderBusy
 from workbench.session.history.curves import PREFIX
@@ -241,7 +240,7 @@ class PictureReader:
 
     def __init__(self) -> None:
         self._episode: Episode | None = None
-        self._cache: dict[CameraKey, tuple[int, tuple[Modality, ...], Picture]] = {}
+        self._cache: dict[CameraKey, tuple[int, tuple[str, ...], Picture]] = {}
         self.problem = ""
         """Why a picture cannot be shown, a sentence; else empty."""
 
@@ -290,7 +289,7 @@ class PictureReader:
         return found
 
 
-def decode_picture(track: CameraTrack, index: int, modalities: tuple[Modality, ...], env: int) -> Picture:
+def decode_picture(track: CameraTrack, index: int, modalities: tuple[str, ...], env: int) -> Picture:
     """Picture `index` of a camera."""
-    planes = {modality: np.asarray(track.pictures[modality][index]) for modality in modalities}
+    planes = {m: np.asarray(encoded[index]) for m, encoded in track.pictures.items() if m in modalities}
     return Picture(track.info.name, track.info.kind, env, track.pose[index], **planes)
