@@ -62,13 +62,12 @@ PROTECTED = {
     "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
     " authoring/camera_source/test_which_camera.py",
     "authoring/source/changes": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
-    " authoring/camera_source/test_which_camera.py",
+    " authoring/camera_source/test_which_camera.py authoring/camera_source/test_rotations.py"
+    " authoring/camera_source/test_members.py",
     "authoring/source/trace": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
     " authoring/camera_source/test_which_camera.py",
     "authoring/source/names": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
     " authoring/camera_source/test_which_camera.py",
-    "authoring/source/numbers": "authoring/camera_source/test_rotations.py authoring/camera_source/test_shapes.py"
-    " authoring/camera_source/test_members.py authoring/camera_source/test_which_camera.py",
     "authoring/camera_source/disk": "authoring/camera_source/test_disk.py",
     "authoring/camera_source/edit": "authoring/camera_source/test_which_camera.py"
     " authoring/camera_source/test_members.py",

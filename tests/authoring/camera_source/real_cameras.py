@@ -18,9 +18,9 @@ from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
 from mani_skill.utils import sapien_utils
 
 from workbench.authoring.camera_source.cameras import HOOKS as KINDS
-from workbench.authoring.camera_source.cameras import Ran, Run
+from workbench.authoring.camera_source.cameras import HookCameras, RunHooks
 from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls, owners
+from workbench.authoring.camera_source.run_hooks import camera_run, owners, recording_calls
 from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraKey, CameraSettings
 
@@ -93,10 +93,10 @@ def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[t
         }
 
 
-def run_class(sources: Mapping[str, str], class_name: str = "Task") -> Ran:
+def run_class(sources: Mapping[str, str], class_name: str = "Task") -> HookCameras:
     """As a worker runs the hooks of an env: of an object of the class, made by these texts."""
     try:
-        with noting_calls(sources) as noted, modules(sources) as names:
+        with recording_calls(sources) as recorded, modules(sources) as names:
             cls = names[class_name]
             task = cls.__new__(cls) if issubclass(cls, BaseEnv) else cls()
             configs: dict[CameraKey, CameraConfig] = {
@@ -105,12 +105,14 @@ def run_class(sources: Mapping[str, str], class_name: str = "Task") -> Ran:
                 if hasattr(task, hook)
                 for name, config in parse_camera_configs(getattr(task, hook)).items()
             }
-            return Ran({key: camera_run(config, noted) for key, config in configs.items()}, owners(cls))
+            return HookCameras(
+                {key: camera_run(config, recorded) for key, config in configs.items()}, owners(cls)
+            )
     except (SyntaxError, NameError, TypeError, AttributeError) as error:
         raise RefusedEdit(f"with it the file fails: {error}") from error
 
 
-def run_as(class_name: str) -> Run:
+def run_as(class_name: str) -> RunHooks:
     return lambda sources: run_class(sources, class_name)
 
 

@@ -133,9 +133,9 @@ def test_what_opencv_wrote_is_read(tmp_path: Path, suffix: str) -> None:
 def test_a_pasted_matrix_is_read_as_the_person_says(convention: Any, direction: Any, write: Any) -> None:
     matrix = frames.matrix_of(POSE, convention, direction)
     (found,) = find_poses(write(matrix))
-    assert found.said is None
+    assert found.stated is None
     assert_same_pose(camera_pose(found, convention, direction), POSE, atol=1e-6)
-    with pytest.raises(ValueError, match="say which way"):
+    with pytest.raises(ValueError, match="choose the direction"):
         camera_pose(found, convention)
 
 
@@ -187,7 +187,7 @@ def test_a_matrix_that_is_no_rotation_is_refused_in_words() -> None:
 
 
 def test_a_mounted_camera_says_where_it_is_only_when_its_mount_does() -> None:
-    with pytest.raises(ValueError, match="rides on panda/panda_hand"):
+    with pytest.raises(ValueError, match="mounted on panda/panda_hand"):
         cameras_as_json([CameraToExport(("sensor", "hand"), PLAIN, mount="panda/panda_hand")])
 
 

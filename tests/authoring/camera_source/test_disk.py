@@ -145,7 +145,7 @@ def test_a_save_while_the_edit_is_written_is_not_lost(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", saved_meanwhile)
-        assert "saved by somebody else just now" in refusal(apply, edit)
+        assert "saved by another program just now" in refusal(apply, edit)
     assert path.read_text() == SOURCE + "# more\n"
     assert os.listdir(tmp_path) == ["task.py"]
 

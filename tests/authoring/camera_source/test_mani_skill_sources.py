@@ -14,10 +14,10 @@ import pytest
 from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
 
 from tests.authoring.camera_source.real_cameras import close, looking, settings_of
-from workbench.authoring.camera_source.cameras import HOOKS, Ran
+from workbench.authoring.camera_source.cameras import HOOKS, HookCameras
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls
+from workbench.authoring.camera_source.run_hooks import camera_run, recording_calls
 from workbench.core.camera_data import CameraKey
 
 PACKAGE = Path(mani_skill.__file__).parent
@@ -72,11 +72,13 @@ def _constant(statement: ast.stmt) -> bool:
     return bool(targets) and all(isinstance(target, ast.Name) for target in targets)
 
 
-def ran(path: Path, text: str, hook: tuple[str, int]) -> Ran:
+def ran(path: Path, text: str, hook: tuple[str, int]) -> HookCameras:
     """What one hook makes, as a worker would tell of it."""
-    with noting_calls({TASK: text}) as noted:
+    with recording_calls({TASK: text}) as recorded:
         configs = hook_results(path, text)[hook]
-    return Ran({(HOOKS[hook[0]], uid): camera_run(config, noted) for uid, config in configs.items()}, {})
+    return HookCameras(
+        {(HOOKS[hook[0]], uid): camera_run(config, recorded) for uid, config in configs.items()}, {}
+    )
 
 
 def kinds_of_cameras() -> Iterator[Any]:

@@ -12,7 +12,8 @@ from mani_skill.utils import sapien_utils
 from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
-from workbench.authoring.source.numbers import look_at, quaternion_texts, same_side, to_euler
+from workbench.authoring.camera_source.write_pose import look_at, to_euler
+from workbench.authoring.source.changes import quaternion_texts, same_side
 from workbench.core.cameras.conventions import angle_between
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.authoring.camera_source.real_cameras import FILE, HEADER, planned, real_settings, run_as, run_class
-from workbench.authoring.camera_source.cameras import Ran, Run
+from workbench.authoring.camera_source.cameras import HookCameras, RunHooks
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.source.text import RefusedEdit
@@ -123,10 +123,10 @@ def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
     assert isinstance(plan, RefusedEdit) and "    mount=self.camera_link,\n" in plan.snippet
 
 
-def told(ran: Ran, **changes: Any) -> Run:
+def told(ran: HookCameras, **changes: Any) -> RunHooks:
     """A worker that says something else of the camera."""
     key: CameraKey = ("sensor", "cam")
-    return lambda sources: Ran(
+    return lambda sources: HookCameras(
         {**ran.cameras, key: dataclasses.replace(ran.cameras[key], **changes)}, ran.owners
     )
 
@@ -137,8 +137,8 @@ def told(ran: Ran, **changes: Any) -> Run:
         ({"site": CallSite("/usr/site-packages/x.py", 3, "f")}, "copy the task"),
         ({"site": CallSite("/other/x.py", 3, "f"), "trace": None}, "not one of your files"),
         ({"site": CallSite(FILE, 1, "f"), "trace": None}, "a function or class of its own"),
-        ({"site": None, "trace": None}, "is no CameraConfig"),
-        ({"made": None}, "cannot be said in numbers"),
+        ({"site": None, "trace": None}, "no CameraConfig(...) in your files"),
+        ({"made": None}, "cannot be read"),
     ],
 )
 def test_a_place_that_is_none_is_refused(changes: dict[str, Any], reason: str) -> None:
@@ -153,8 +153,8 @@ def test_a_place_that_is_none_is_refused(changes: dict[str, Any], reason: str) -
     ("place", "reason"),
     [
         (Place("/etc/passwd", 0, 10), "not one of your files"),
-        (Place(FILE, -5, 10**9), "another text"),
-        (Place(FILE, 3, 17), "another text"),
+        (Place(FILE, -5, 10**9), "differs from the text that ran"),
+        (Place(FILE, 3, 17), "differs from the text that ran"),
     ],
 )
 @pytest.mark.parametrize("of", ["call", "argument", "read", "part"])
@@ -441,5 +441,5 @@ def test_a_change_that_another_camera_would_make_too_is_refused() -> None:
     sources = {FILE: source, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
-    assert isinstance(plan, RefusedEdit) and "of the camera hand as well" in plan.reason
+    assert isinstance(plan, RefusedEdit) and "also change the camera hand" in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet

@@ -12,7 +12,7 @@ import pytest
 
 from tests.drive.session import wait_until
 from tests.session.studio import BASE, camera, moved, said
-from workbench.authoring.camera_source.cameras import Run
+from workbench.authoring.camera_source.cameras import RunHooks
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.camera_data import CallSite, CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskOptions
@@ -77,7 +77,7 @@ def there(session: Session, key: CameraKey) -> CameraSettings:
     return found
 
 
-def asking(session: Session) -> Run:
+def asking(session: Session) -> RunHooks:
     """The worker runs the hooks; what has to wait for it here is on the test's own thread."""
     return session.studio.file._run
 
@@ -205,7 +205,7 @@ class Inherits(PushCubeEnv):
         # A class with such a hook of its own is told whose the camera is, and gets the text for it.
         refused = plan(replace(before, class_name="Far"), info, Wish("edit", BASE, wanted), asking(session))
         assert refused.stage == "refused" and "base_camera is made by PushCubeEnv" in refused.message
-        assert "the _default_sensor_configs of Far (task.py) hands it on" in refused.message
+        assert "the _default_sensor_configs of Far (task.py) returns it" in refused.message
         assert refused.snippet.startswith("CameraConfig(")
         # An installed task is not written: the whole hook is there to be copied.
         installed = replace(before, source_files=(), file="/site-packages/their_task.py")
@@ -274,7 +274,7 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
 
 
 @pytest.mark.parametrize(
-    ("fov", "why"), [(0.2, "does not come out as what was asked for"), (0.05, "no lens at all")]
+    ("fov", "why"), [(0.2, "does not give the camera the requested settings"), (0.05, "no lens at all")]
 )
 def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_written(
     session: Session, task_file: Path, fov: float, why: str

@@ -1,15 +1,4 @@
-"""Cameras to and from the files of other programs: JSON, OpenCV's YAML, ROS's CameraInfo.
-
-Going out, every number is there under a name that says its convention, since whoever reads ``extrinsic`` alone has to
-guess between four matrices. The intrinsic matrix is ManiSkill's own ``intrinsic_cv``, whose pixels are counted from
-the outer edge of the first one, so that the middle of a picture is W / 2; OpenCV's calibration counts from the middle
-of the first pixel, half a pixel less, and the files say so.
-
-Coming in, a matrix cannot say what it is. World to camera and camera to world are both 4 x 4 and both look
-plausible; the same holds for the three ways to call a camera's axes. So a file is only searched for what may be a pose,
-and the person is asked for the rest; only our own JSON says it itself. What is read is untrusted text: it becomes
-numbers or a sentence that says why not, never a path or code.
-"""
+"""Reads and writes cameras as JSON, OpenCV YAML and ROS CameraInfo."""
 
 from __future__ import annotations
 
@@ -44,7 +33,9 @@ Floats = NDArray[np.float64]
 FORMAT = "workbench-cameras"
 MOST_CHARACTERS = 100_000
 MOST_YAML = 20_000
-"""Characters; a calibration has two thousand, and Python's YAML reads a thousand in 20 ms."""
+"""Characters; a calibration has about two thousand, and Python's YAML parser takes 20 ms for a thousand."""
+# `intrinsic_cv` of ManiSkill counts pixels from the outer edge of the first one (the middle of a picture is W / 2), OpenCV's
+# calibration from its middle. Files name every convention, since ``extrinsic`` alone may be one of four matrices.
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",
@@ -63,9 +54,9 @@ class CameraToExport:
     key: CameraKey
     settings: CameraSettings
     mount: str | None = None
-    """Body that it rides on; None where it stands still."""
+    """Body that the camera is mounted on; None if it is fixed."""
     mount_pose: ArrayLike | None = None
-    """(7,) where that body is, in the env's frame."""
+    """(7,) pose of that body in the env's frame."""
 
     @property
     def pose_in_env(self) -> Floats:
@@ -75,32 +66,36 @@ class CameraToExport:
             ValueError: it is mounted, and `mount_pose` is not given.
         """
         if self.mount is not None and self.mount_pose is None:
-            raise ValueError(f"camera {self.key[1]!r} rides on {self.mount}: say where that is")
+            raise ValueError(f"camera {self.key[1]!r} is mounted on {self.mount}: mount_pose is needed")
         return pose_in_env(self.settings, self.mount_pose)
 
 
 @dataclass(frozen=True)
 class FoundPose:
-    """Something in a text that may be a camera's pose."""
+    """A matrix in a text that may be a camera's pose.
+
+    A matrix does not tell its convention: camera to world and world to camera both look plausible, as do the three
+    conventions of camera axes. So a person is asked, except for our own JSON, which names it.
+    """
 
     label: str
-    """Where in the text it stands, for a person to choose by."""
+    """Its path in the text, for a person to choose."""
     matrix: Floats
     """(4, 4)"""
-    said: tuple[Convention, Direction] | None = None
-    """Which pose it is, where the text says it; None where the person has to."""
+    stated: tuple[Convention, Direction] | None = None
+    """Its convention, if the text names it; None: a person must choose."""
 
 
 # --- out ---------------------------------------------------------------------------------------------------------
 
 
 def cameras_as_json(cameras: Sequence[CameraToExport]) -> str:
-    """All cameras with all their numbers, and what each of them means."""
-    told = []
+    """All cameras with all their numbers and conventions, as JSON."""
+    entries = []
     for camera in cameras:
         s, pose = camera.settings, camera.pose_in_env
         k = intrinsic_of(s)
-        told.append(
+        entries.append(
             {
                 "name": camera.key[1],
                 "kind": camera.key[0],
@@ -121,14 +116,14 @@ def cameras_as_json(cameras: Sequence[CameraToExport]) -> str:
                 "model_matrix_opengl": opengl_model_matrix(pose).tolist(),
             }
         )
-    whole = {"format": FORMAT, "version": 1, "conventions": CONVENTIONS, "cameras": told}
-    # A matrix row a line: one number a line would make a file that nobody reads.
+    whole = {"format": FORMAT, "version": 1, "conventions": CONVENTIONS, "cameras": entries}
+    # One line per row of a matrix.
     text = json.dumps(whole, indent=2, allow_nan=False)
     return re.sub(r"\[\s+([^\[\]{}]*?)\s+\]", lambda m: "[" + re.sub(r",\s+", ", ", m[1]) + "]", text) + "\n"
 
 
 def cameras_as_opencv_yaml(cameras: Sequence[CameraToExport]) -> str:
-    """For ``cv2.FileStorage``: a map for each camera, by its kind and name."""
+    """YAML for ``cv2.FileStorage``: a map for each camera, named by kind and name."""
     lines = ["%YAML:1.0", "---", f"# Metres; {PIXELS}."]
     for camera, key in zip(cameras, _opencv_keys(cameras), strict=True):
         s, pose = camera.settings, camera.pose_in_env
@@ -145,10 +140,9 @@ def cameras_as_opencv_yaml(cameras: Sequence[CameraToExport]) -> str:
 
 
 def camera_as_ros_yaml(camera: CameraToExport) -> str:
-    """ROS's CameraInfo as ``camera_calibration_parsers`` and ``camera_info_manager`` read it; one camera a file.
+    """ROS CameraInfo of one camera, for ``camera_calibration_parsers`` and ``camera_info_manager``.
 
-    CameraInfo has no place for the extrinsic: that of the optical frame is in a comment, for
-    ``static_transform_publisher``.
+    CameraInfo has no extrinsic: that of the optical frame is in a comment, for ``static_transform_publisher``.
     """
     s, pose = camera.settings, camera.pose_in_env
     k = intrinsic_of(s)
@@ -199,7 +193,7 @@ def _ros_matrix(name: str, matrix: Floats) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """With a point in it: YAML 1.1 takes 1e-08 for a word."""
+    """A number with a decimal point: YAML 1.1 reads 1e-08 as a word."""
     text = repr(float(value) + 0.0)
     return re.sub(r"^(-?\d+)e", r"\1.0e", text)
 
@@ -212,10 +206,10 @@ def _one_line(text: str) -> str:
 
 
 def find_poses(text: str) -> tuple[FoundPose, ...]:
-    """What may be a camera's pose in a text: our JSON, anybody's JSON or YAML, or a pasted matrix.
+    """Candidates for a camera's pose in untrusted text: our JSON, other JSON or YAML, or a pasted matrix.
 
-    Found are matrices of 4 x 4 and 3 x 4, pairs of rotation and translation (``rvec`` and ``tvec``, ``R`` and
-    ``t``), in maps of any depth. Whether one of them is a rotation at all is said by `camera_pose`.
+    Finds 4 x 4 and 3 x 4 matrices and pairs of rotation and translation (``rvec`` and ``tvec``, ``R`` and ``t``) in maps
+    of any depth. `camera_pose` checks that one is a rotation.
 
     Raises:
         ValueError: nothing is found, or the text cannot be read; says what was expected.
@@ -227,7 +221,7 @@ def find_poses(text: str) -> tuple[FoundPose, ...]:
         raise ValueError("there is nothing to read: paste a 4 x 4 matrix, or choose a JSON or YAML file")
     tree = _parsed(stripped)
     if isinstance(tree, Mapping) and tree.get("format") == FORMAT:
-        found = list(_ours(tree))
+        found = list(_workbench_poses(tree))
     else:
         try:
             found = list(_search(tree, ""))
@@ -250,18 +244,18 @@ def camera_pose(
     """(7,) the camera's pose in the env's frame (or in its mount's, if that is what was calibrated).
 
     Args:
-        convention: how the calibration calls the camera's axes. Needed where the text does not say it.
-        direction: which way its matrix goes. Needed likewise.
-        metres_per_unit: of its translation; 0.001 for millimetres. Left alone where the text itself says what it is.
+        convention: camera axes of the calibration. Needed unless the text names it.
+        direction: of the matrix, camera to world or world to camera. Needed likewise.
+        metres_per_unit: of the translation; 0.001 for millimetres. Ignored if the text names its convention.
 
     Raises:
-        ValueError: one of them is needed and missing, or the matrix is no rotation; says why.
+        ValueError: an argument is needed and missing, or the matrix is no rotation.
     """
-    if found.said is not None:
-        (convention, direction), metres_per_unit = found.said, 1.0
+    if found.stated is not None:
+        (convention, direction), metres_per_unit = found.stated, 1.0
     if convention is None or direction is None:
         raise ValueError(
-            "say which way the matrix goes, and how it calls the camera's axes: it does not say so"
+            "choose the direction of the matrix and its camera axes: the text does not name them"
         )
     if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise ValueError(f"a unit of length is a positive number of metres, not {metres_per_unit}")
@@ -271,10 +265,10 @@ def camera_pose(
 
 
 class _CalibrationLoader(yaml.SafeLoader):
-    """YAML's plain data and OpenCV's matrices, nothing that makes objects."""
+    """Loads YAML's plain data and OpenCV's matrices; constructs no objects."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        # Nine lines of aliases to aliases are a tree of a billion leaves, and one to itself has no end.
+        # Nine lines of nested aliases expand to a billion leaves, and an alias to itself has no end.
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("a YAML alias (*name) is not read here: write the value out")
         return super().compose_node(parent, index)
@@ -298,7 +292,7 @@ def _parsed(text: str) -> Any:
             return json.loads(text)
         except (ValueError, RecursionError) as error:
             if text[0] == "{":
-                raise ValueError(f"it begins like JSON and is none: {error}") from None
+                raise ValueError(f"it begins like JSON but is not valid: {error}") from None
     bare = _WORDS.sub(" ", text)
     if not re.sub(r"[\s,;|()\[\]]", "", _NUMBER.sub("", bare)):
         return _pasted([float(number) for number in _NUMBER.findall(bare)])
@@ -320,7 +314,7 @@ def _pasted(numbers: list[float]) -> list[list[float]]:
     return [numbers[i : i + 4] for i in range(0, len(numbers), 4)]
 
 
-def _ours(tree: Mapping[Any, Any]) -> Iterator[FoundPose]:
+def _workbench_poses(tree: Mapping[Any, Any]) -> Iterator[FoundPose]:
     cameras = tree.get("cameras")
     for camera in cameras if isinstance(cameras, list) else []:
         if not isinstance(camera, Mapping):
@@ -337,13 +331,13 @@ def _ours(tree: Mapping[Any, Any]) -> Iterator[FoundPose]:
 _ROTATIONS = ("rvec", "rotation_vector", "r", "rotation", "rotation_matrix", "rot", "rot_mat", "rmat")
 _TRANSLATIONS = ("tvec", "translation_vector", "t", "translation", "trans", "position", "tvecs")
 _NO_POSE = ("projection_matrix", "p", "p1", "p2", "q")
-"""3 x 4 and 4 x 4 matrices of calibration files that are none (ROS, OpenCV's stereo calibration)."""
+"""3 x 4 and 4 x 4 matrices of calibration files that are not poses (ROS, OpenCV's stereo calibration)."""
 
 
 def _search(tree: Any, path: str) -> Iterator[FoundPose]:
     array = _array(tree)
     if array is not None:
-        matrix = _whole(array)
+        matrix = _as_4x4(array)
         if matrix is not None:
             yield FoundPose(path or "the matrix", matrix)
         return
@@ -375,7 +369,7 @@ def _first(values: Mapping[str, Any], names: Sequence[str], read: Any) -> Floats
 
 
 def _array(value: Any) -> Floats | None:
-    """A list of numbers, one of rows of numbers, or a map of rows, cols and data; None for all else."""
+    """An array of a list of numbers, a list of rows, or a map of rows, cols and data; None for other values."""
     if isinstance(value, Mapping) and {"rows", "cols", "data"} <= set(value):
         data = _array(value["data"])
         rows, columns = value["rows"], value["cols"]
@@ -390,7 +384,7 @@ def _array(value: Any) -> Floats | None:
         return None
     flat = [number for row in nested for number in row] if nested else value
     try:
-        # YAML 1.1 reads 1e-08 as a word; booleans and None are no numbers.
+        # YAML 1.1 reads 1e-08 as a word; booleans and None are not numbers.
         numbers = [float(n) for n in flat if isinstance(n, (int, float, str)) and not isinstance(n, bool)]
     except (ValueError, OverflowError):
         return None
@@ -399,7 +393,7 @@ def _array(value: Any) -> Floats | None:
     return np.array(numbers).reshape(len(nested), -1) if nested else np.array(numbers)
 
 
-def _whole(array: Floats) -> Floats | None:
+def _as_4x4(array: Floats) -> Floats | None:
     if array.shape in ((12,), (16,)):
         array = array.reshape(-1, 4)
     if array.shape == (4, 4):
@@ -412,7 +406,7 @@ def _translation(array: Floats) -> Floats | None:
 
 
 def _rotation(array: Floats) -> Floats | None:
-    """(3, 3) of a matrix, or of OpenCV's rotation vector: along the axis, as long as the angle (Rodrigues)."""
+    """(3, 3) rotation of a matrix, or of OpenCV's rotation vector (Rodrigues: axis times angle)."""
     if array.size == 9:
         return array.reshape(3, 3)
     if array.size != 3:

@@ -1,4 +1,4 @@
-"""The cameras that a text of the author's files makes, as a worker tells of them, and the calls that make them."""
+"""The cameras that the author's camera hooks make, as a worker reports them, and the calls that make them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PARAMETERS = (
     *("uid", "pose", "width", "height", "fov", "near", "far", "intrinsic", "entity_uid", "mount"),
     *("shader_pack", "shader_config"),
 )
-"""Of mani_skill 3.0.1's ``CameraConfig``, in order."""
+"""Parameters of mani_skill 3.0.1's ``CameraConfig``, in order."""
 HOOKS: dict[str, CameraKind] = {
     "_default_sensor_configs": "sensor",
     "_sensor_configs": "sensor",
@@ -26,35 +26,35 @@ _SAME = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class CameraRun:
-    """One camera, as its hook gave it."""
+    """One camera that a hook made."""
 
     made: CameraSettings | None
-    """As the call made it; None where it was not noted, or cannot be said in these words."""
+    """As its ``CameraConfig`` call made it; None if the call was not recorded or has other settings."""
     settings: CameraSettings | None
-    """As the hook gave it in the end."""
+    """As the hook returned it."""
     mount: str
-    """What it rides on, in words that differ for different things."""
+    """Text that identifies the body it is mounted on."""
     site: CallSite | None
     trace: Trace | None
-    """Of the call; None where that stands in none of the author's files."""
+    """Of the call; None if that is in none of the author's files."""
 
 
 @dataclass(frozen=True, eq=False)
-class Ran:
-    """What the camera hooks of the open task gave, with a text of the author's files."""
+class HookCameras:
+    """What the camera hooks of the open task return for given texts of the author's files."""
 
     cameras: Mapping[CameraKey, CameraRun]
     owners: Mapping[str, tuple[str, str]]
-    """Hook of the task's class to the name and the file of the class that has it; ManiSkill's empty ones are left out."""
+    """Hook to name and file of the class that defines it; ManiSkill's empty hooks are left out."""
 
 
-Run = Callable[[Mapping[str, str]], Ran]
-"""Runs the hooks with these texts in place of the author's files, by path. Raises RefusedEdit with the reason."""
+RunHooks = Callable[[Mapping[str, str]], HookCameras]
+"""Runs the hooks with these texts by path in place of the author's files. Raises RefusedEdit with the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCall:
-    """The ``CameraConfig(...)`` in the text that made a camera."""
+    """The ``CameraConfig(...)`` call that made a camera."""
 
     file: SourceFile
     node: ast.Call
@@ -69,12 +69,12 @@ class CameraCall:
 
     @property
     def hook(self) -> str | None:
-        """The hook of ManiSkill's that it is in."""
+        """Name of ManiSkill's hook that contains it."""
         return next((name for name in reversed(self.trace.function.split(".")) if name in HOOKS), None)
 
     @property
     def key(self) -> ast.expr | ast.keyword | None:
-        """The key, where it stands in a dict."""
+        """Its key, if it is a value of a dict."""
         outer = self.file.parents[self.node]
         if isinstance(outer, ast.Dict):
             return outer.keys[outer.values.index(self.node)]
@@ -84,20 +84,20 @@ class CameraCall:
 
     @property
     def container(self) -> ast.AST:
-        """What it stands in."""
+        """The expression or statement that directly contains it."""
         outer = self.file.parents[self.node]
         return self.file.parents[outer] if isinstance(outer, ast.keyword) else outer
 
     @property
     def loop(self) -> ast.AST | None:
-        """The loop that it is in, within its function."""
+        """The loop within its function that contains it."""
         scope = self.file.scopes(self.node)[0]
         outers = self.file.ancestors(self.node)
         return next((o for o in outers if isinstance(o, LOOPS) and scope in self.file.ancestors(o)), None)
 
 
 def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
-    """Which of `FIELDS` are not the same."""
+    """Those of `FIELDS` that differ."""
     apart = differences(a, b, _SAME)
     return [
         name
@@ -107,6 +107,6 @@ def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
 
 
 def with_fields(settings: CameraSettings, other: CameraSettings, names: list[str]) -> CameraSettings:
-    """`settings` with those fields from `other`."""
+    """`settings` with the fields `names` of `other`."""
     fields = [f for name in names for f in (("position", "quaternion") if name == "pose" else (name,))]
     return replace(settings, **{name: getattr(other, name) for name in fields})

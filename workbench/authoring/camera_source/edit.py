@@ -1,4 +1,4 @@
-"""A plan of an edit: the cameras that the author's files make as they stand, the call to change, and the proof."""
+"""An edit of a camera while it is planned: finds the call to change, and verifies the new text by running it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePath
 
-from workbench.authoring.camera_source.cameras import PARAMETERS, CameraCall, Run
+from workbench.authoring.camera_source.cameras import PARAMETERS, CameraCall, RunHooks
 from workbench.authoring.camera_source.disk import FileChange, SourceEdit, check_own
 from workbench.authoring.camera_source.hooks import snippet
 from workbench.authoring.source.changes import Changes
@@ -17,27 +17,27 @@ from workbench.core.camera_data import CameraKey, CameraSettings, differences, w
 
 
 class CameraEdit(Changes):
-    """Raises RefusedEdit for a file that is not Python, and for hooks that fail."""
+    """Plans an edit of the author's files. Raises RefusedEdit if a file is not Python or the hooks fail."""
 
-    def __init__(self, sources: Mapping[str, str], run: Run) -> None:
+    def __init__(self, sources: Mapping[str, str], run: RunHooks) -> None:
         super().__init__(Project(sources))
         for path in sources:
             self.project.file(path)
-        self._run, self.ran = run, run(sources)
+        self._run, self.hook_cameras = run, run(sources)
 
     def call(self, key: CameraKey) -> CameraCall:
-        """What makes a camera. Raises RefusedEdit where that is not to be found in the author's files."""
+        """The call that makes a camera. Raises RefusedEdit if it is not in the author's files."""
         uid = key[1]
-        if key not in self.ran.cameras:
+        if key not in self.hook_cameras.cameras:
             raise RefusedEdit(
-                f"as the files stand they make no {key[0]} camera {uid!r}: another makes it, or they were edited since"
+                f"the files make no {key[0]} camera {uid!r}: other code makes it, or they were edited since"
             )
-        run = self.ran.cameras[key]
+        run = self.hook_cameras.cameras[key]
         if run.site is not None:
             check_own(run.site.file)
         if run.trace is None:
             if run.site is None:
-                raise RefusedEdit(f"what makes the camera {uid!r} is no CameraConfig(...) in your files")
+                raise RefusedEdit(f"no CameraConfig(...) in your files makes the camera {uid!r}")
             if run.site.file not in self.project.texts:
                 raise RefusedEdit(
                     f"the camera {uid!r} is made in {run.site.file}, line {run.site.line}, which is not one of your files"
@@ -48,18 +48,19 @@ class CameraEdit(Changes):
             )
         file, node = self.find(run.trace.at)
         if not isinstance(node, ast.Call):
-            raise RefusedEdit(f"what makes the camera {uid!r} is no call")
+            raise RefusedEdit(f"the camera {uid!r} is not made by a call")
         return CameraCall(file, node, key, arguments(node, PARAMETERS), run, run.trace)
 
-    def proven(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:
-        """The edit with all replacements, run: it leaves all cameras as they were but `key`, in whose place there is
-        `expected`, of which the edit says what it came out as.
+    def verified(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:
+        """The edit with all replacements, verified by running it: only `key` changes, and becomes `expected`.
 
         Args:
-            first: what the author thinks of, where several files change.
+            first: the file to name first if several change.
+            key: the camera to change; None to add one.
+            expected: what replaces it; None to remove it.
 
         Raises:
-            RefusedEdit: another camera is changed, or there is another one more or less.
+            RefusedEdit: another camera would change, appear or disappear.
         """
         files = {file.path: file for file, _ in self.replacements}
         if not files:
@@ -69,18 +70,18 @@ class CameraEdit(Changes):
             check_own(file.path)
             mine = [change for of, change in self.replacements if of is file]
             made.append(FileChange(file.path, file.text, file.replaced(mine)))
-        before = self.ran.cameras
+        before = self.hook_cameras.cameras
         after = self._run({**self.project.texts, **{change.file: change.new_text for change in made}}).cameras
         for other in before.keys() - {key}:
             old, new = before[other], after.get(other)
             if new is None or new.mount != old.mount or (old.settings is None) != (new.settings is None):
-                raise RefusedEdit(f"the change would be one of the camera {other[1]} as well")
+                raise RefusedEdit(f"the change would also change the camera {other[1]}")
             if (
                 old.settings is not None
                 and new.settings is not None
                 and differences(old.settings, new.settings)
             ):
-                raise RefusedEdit(f"the change would be one of the camera {other[1]} as well")
+                raise RefusedEdit(f"the change would also change the camera {other[1]}")
         if after.keys() != before.keys() - {key} | ({expected} if expected is not None else set()):
             raise RefusedEdit("the file could not be changed without changing what else it does")
         found = None if expected is None else after[expected]
@@ -93,12 +94,12 @@ class CameraEdit(Changes):
 @contextmanager
 def planning(
     sources: Mapping[str, str],
-    run: Run,
+    run: RunHooks,
     uid: str = "",
     settings: CameraSettings | None = None,
     more: Sequence[str] = (),
 ) -> Iterator[CameraEdit]:
-    """What is refused within it comes with the camera as text to copy, where there are `settings` for one."""
+    """A `CameraEdit`; a RefusedEdit within the context gets the camera of `settings` as text to copy."""
     try:
         yield CameraEdit(sources, run)
     except RefusedEdit as refused:
@@ -107,7 +108,7 @@ def planning(
 
 
 def check_camera(settings: CameraSettings) -> None:
-    """Raises RefusedEdit for what is no camera: it never reaches a file, nor a text to copy."""
+    """Raises RefusedEdit if `settings` are not valid for a camera."""
     why = why_no_camera(settings)
     if why is not None:
         raise RefusedEdit(why)

@@ -1,4 +1,4 @@
-"""A camera as text, to copy or to put into what a hook returns: its list or dict, beside its one config, a hook of its own."""
+"""A camera as Python text, and edits that add it to a camera hook or add the hook."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import ast
 import json
 from collections.abc import Callable, Sequence
 
-from workbench.authoring.camera_source.cameras import HOOKS, Ran
-from workbench.authoring.source.names import Project
-from workbench.authoring.source.numbers import (
+from workbench.authoring.camera_source.cameras import HOOKS, HookCameras
+from workbench.authoring.source.changes import (
     list_text,
     matrix_text,
     number_text,
     quaternion_texts,
 )
+from workbench.authoring.source.names import Project
 from workbench.authoring.source.text import Function, RefusedEdit, Replacement, SourceFile, walk
 from workbench.core.camera_data import CameraKind, CameraSettings
 
 HOOK_OF: dict[CameraKind, str] = {kind: hook for hook, kind in HOOKS.items() if hook.startswith("_default")}
 
 
-def imports_of(settings: CameraSettings, pose: str = "") -> dict[str, str]:
-    """What the text of a `snippet` needs, by the name that each line brings."""
+def needed_imports(settings: CameraSettings, pose: str = "") -> dict[str, str]:
+    """Imports that a `snippet` needs, by the name that each binds."""
     lines = {"CameraConfig": "from mani_skill.sensors.camera import CameraConfig"}
     if not pose:
         lines["sapien"] = "import sapien"
@@ -30,14 +30,14 @@ def imports_of(settings: CameraSettings, pose: str = "") -> dict[str, str]:
     return lines
 
 
-def returned(file: SourceFile, function: Function) -> ast.expr:
-    """The one expression that a hook returns."""
+def returned_expression(file: SourceFile, function: Function) -> ast.expr:
+    """The single expression that a hook returns. Raises RefusedEdit."""
     found = [
         node for node in walk(function) if isinstance(node, ast.Return) and file.scopes(node)[0] is function
     ]
     if len(found) != 1 or found[0].value is None:
         raise RefusedEdit(
-            f"{function.name} (line {file.line(function)}) has {len(found)} returns; one is needed to add to"
+            f"{function.name} (line {file.line(function)}) has {len(found)} returns; exactly one is needed"
         )
     value = found[0].value
     if isinstance(value, ast.Name):
@@ -52,13 +52,15 @@ def returned(file: SourceFile, function: Function) -> ast.expr:
     return value
 
 
-def appended(file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], str]) -> list[Replacement]:
-    """`text(indent)` as one more of what `value` holds."""
+def append_camera(
+    file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], str]
+) -> list[Replacement]:
+    """Adds `text(indent)` to the cameras of `value`. Raises RefusedEdit."""
     start, end = file.inner_span(value)
     indent = file.indent(start)
     called = file.code(value.func) if isinstance(value, ast.Call) else ""
     if isinstance(value, ast.Tuple) and (file.text[start] != "(" or file.items(value)[0][0] == start):
-        # It has no brackets to put one more into.
+        # A tuple without brackets.
         own = indent + "    "
         held = [file.code(element).replace("\n", "\n    ") for element in value.elts]
         lines = "".join(f"{own}{line},\n" for line in (*held, text(own)))
@@ -80,17 +82,22 @@ def appended(file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], s
 
 
 def new_hook(
-    project: Project, ran: Ran, file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
+    project: Project,
+    hook_cameras: HookCameras,
+    file: SourceFile,
+    cls: ast.ClassDef,
+    hook: str,
+    text: Callable[[str], str],
 ) -> Replacement:
-    """The hook, which returns the one camera that `text(indent)` is."""
-    owner, where = ran.owners.get(hook, ("", ""))
+    """Adds the hook, which returns the camera `text(indent)`. Raises RefusedEdit."""
+    owner, where = hook_cameras.owners.get(hook, ("", ""))
     if where in project.texts:
         raise RefusedEdit(
             f"{cls.name} inherits {hook} from {owner} ({project.file(where).name}); add the camera there"
         )
     if owner:
         raise RefusedEdit(
-            f"{cls.name} inherits from {owner}, whose cameras a {hook} of its own would take away"
+            f"{cls.name} inherits the cameras of {owner}, which a {hook} of its own would remove"
         )
 
     def whole(indent: str) -> str:
@@ -104,7 +111,7 @@ def new_hook(
 
 
 def class_named(file: SourceFile, name: str) -> ast.ClassDef:
-    """The class of that name at the top level of the file. Raises RefusedEdit."""
+    """The class `name` at the top level of the file. Raises RefusedEdit."""
     for node in file.module.body:
         if isinstance(node, ast.ClassDef) and node.name == name:
             return node
@@ -114,7 +121,7 @@ def class_named(file: SourceFile, name: str) -> ast.ClassDef:
 def at_end_of_class(
     file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
 ) -> Replacement:
-    """`text(indent)`, the whole hook, as the last of the class."""
+    """Adds `text(indent)`, the whole hook, at the end of the class. Raises RefusedEdit."""
     first = file.inner_span(cls.body[0])[0]
     if file.line_at(first) == file.line(cls):
         raise RefusedEdit(f"the class {cls.name} has no body to add {hook} to")
@@ -127,9 +134,9 @@ def at_end_of_class(
 def snippet(
     uid: str, settings: CameraSettings, indent: str = "", more: Sequence[str] = (), pose: str = ""
 ) -> str:
-    """``CameraConfig(...)``, an argument a line, with `more` of them as they are.
+    """``CameraConfig(...)`` with one argument per line and the further arguments `more`.
 
-    It needs ``import sapien`` unless the `pose` is given as a text of its own, and numpy as np for an intrinsic.
+    Needs ``import sapien`` unless `pose` is given, and numpy as np for an intrinsic.
     """
     quaternion = ", ".join(quaternion_texts(settings.quaternion))
     pose = pose or f"sapien.Pose(p={list_text(settings.position, 4)}, q=[{quaternion}])"
@@ -152,5 +159,5 @@ def snippet(
 
 
 def repr_text(text: str) -> str:
-    """A Python string in double quotes, whatever is in it: JSON's escapes are all Python's too."""
+    """`text` as a Python string in double quotes: JSON's escapes are all valid in Python."""
     return json.dumps(text, ensure_ascii=False)

@@ -1,22 +1,21 @@
-"""From "this camera should be so" to the smallest change of the author's file that makes it so.
-
-The way: run the files as they stand, and find the ``CameraConfig(...)`` that made the camera; refuse unless it makes what
-the running env has, since otherwise something else decides and an edit would not do what it seems to; change the
-arguments that differ; then run the new text, and let it go only if this camera is what was asked for and every other
-camera is what it was.
-"""
+"""Plans the smallest edit of the author's file that gives a camera new settings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 
-from workbench.authoring.camera_source.cameras import FIELDS, CameraCall, Run, changed_fields, with_fields
+from workbench.authoring.camera_source.cameras import (
+    FIELDS,
+    CameraCall,
+    RunHooks,
+    changed_fields,
+    with_fields,
+)
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.edit import CameraEdit, check_camera, planning
 from workbench.authoring.camera_source.write_pose import ANGLE_STEP, POSITION_STEP, why_not_a_pose, write_pose
-from workbench.authoring.source.changes import Changes
-from workbench.authoring.source.numbers import matrix_text, number_text
+from workbench.authoring.source.changes import Changes, matrix_text, number_text
 from workbench.authoring.source.text import RefusedEdit, Replacement
 from workbench.core.camera_data import CameraKey, CameraSettings, setting_text
 from workbench.core.cameras.conventions import angle_between
@@ -27,11 +26,18 @@ def plan_edit(
     key: CameraKey,
     before: CameraSettings,
     after: CameraSettings,
-    run: Run,
+    run: RunHooks,
 ) -> SourceEdit:
-    """The edit that turns a camera from `before`, which the running env has, into `after`.
+    """The edit that changes a camera from `before`, which the running env has, to `after`. Nothing is written.
 
-    `sources` are the author's files by path, as they are on disk. Nothing is written. Raises RefusedEdit.
+    Runs the files and finds the ``CameraConfig(...)`` call of the camera; changes the arguments that differ; runs the new
+    text and checks that this camera has the new settings and no other camera changed.
+
+    Args:
+        sources: the author's files on disk, by path.
+
+    Raises:
+        RefusedEdit: also if the call does not give `before`: other code decides then, and an edit would have no effect.
     """
     check_camera(after)
     mount: list[str] = []
@@ -40,7 +46,7 @@ def plan_edit(
         if not fields:
             raise RefusedEdit("nothing of this camera was changed")
         call = edit.call(key)
-        # Without its mount the pose of a copy is one of another frame.
+        # The pose is relative to the mount, so the text to copy needs it.
         names = [name for name in ("entity_uid", "mount") if name in call.arguments]
         mount += [f"{name}={call.file.code(call.arguments[name])}" for name in names]
         return _plan(edit, call, fields, before, after)
@@ -52,25 +58,25 @@ def _plan(
     if call.loop is not None:
         raise RefusedEdit(
             f"the camera is made in a loop or comprehension (line {call.file.line(call.loop)} of {call.file.name}), "
-            "and a change there would be one of all its cameras"
+            "and a change there would change all its cameras"
         )
     made = call.run.made
     if made is None:
-        raise RefusedEdit(f"what {call.where} makes cannot be said in numbers")
+        raise RefusedEdit(f"the settings of the camera at {call.where} cannot be read")
     apart = changed_fields(made, before)
     for name in fields:
         why = call.trace.unknown.get(name) or _why_not(edit, call, name)
         if name in apart and not why:
-            why = _differs(name, made, before)
+            why = _difference_text(name, made, before)
         if why:
             raise RefusedEdit(f"{why} ({call.where})")
     if call.hook is None:
-        edit.note(f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along")
+        edit.note(f"the camera is made outside of a hook ({call.where}): other users of it change too")
     _write_fields(edit, call, fields, after)
     for name in FIELDS:
         if name in call.trace.parts:
             edit.emit(call.trace.parts[name])
-    planned = edit.proven(call.file, call.camera, call.camera)
+    planned = edit.verified(call.file, call.camera, call.camera)
     left = [name for name in apart if name not in fields]
     settings = with_fields(_check_asked(planned.settings, fields, made, after), before, left)
     if planned.others:
@@ -84,7 +90,7 @@ def _plan(
 
 
 def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
-    """Why an argument cannot be changed as it is written."""
+    """Why an argument cannot be edited in its form; None if it can."""
     part = call.trace.parts.get(name)
     if part is None:
         return "it is given no pose" if name == "pose" else None
@@ -127,7 +133,7 @@ def _write_fields(changes: Changes, call: CameraCall, fields: list[str], after: 
 
 
 def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> list[str]:
-    """`fov` or `intrinsic`, of which ManiSkill wants exactly one. Returns arguments to add."""
+    """Write `fov` or `intrinsic`, of which ManiSkill needs exactly one. Returns arguments to add."""
     file = call.file
     if after.intrinsic is None:
         assert after.fov is not None
@@ -162,12 +168,12 @@ def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> li
 def _check_asked(
     found: CameraSettings | None, fields: list[str], made: CameraSettings, after: CameraSettings
 ) -> CameraSettings:
-    """The proof's other half: the camera came out as asked, and in all else as it was."""
+    """Check that the edited camera has the new `fields` of `after`, and the others of `made`."""
     if found is None:
-        raise RefusedEdit("what was to be written is no camera whose settings can be said in numbers")
+        raise RefusedEdit("the settings of the edited camera cannot be read")
     right = not set(changed_fields(made, found)) - set(fields)
     for name in fields:
-        was, wanted = getattr(found, name, None), getattr(after, name, None)
+        was, requested = getattr(found, name, None), getattr(after, name, None)
         if name == "pose":
             moved = max(abs(a - b) for a, b in zip(found.position, after.position, strict=True))
             turned = angle_between(found.quaternion, after.quaternion)
@@ -175,16 +181,16 @@ def _check_asked(
         elif name == "intrinsic" and found.intrinsic is not None and after.intrinsic is not None:
             flat = [[x for row in matrix for x in row] for matrix in (found.intrinsic, after.intrinsic)]
             right = right and max(abs(a - b) for a, b in zip(*flat, strict=True)) <= 1e-3
-        elif isinstance(was, (int, float)) and isinstance(wanted, (int, float)):
-            right = right and abs(was - wanted) <= 2e-4
+        elif isinstance(was, (int, float)) and isinstance(requested, (int, float)):
+            right = right and abs(was - requested) <= 2e-4
         else:
-            right = right and was == wanted
+            right = right and was == requested
     if not right:
-        raise RefusedEdit("what was to be written does not come out as what was asked for")
+        raise RefusedEdit("the edited file does not give the camera the requested settings")
     return found
 
 
-def _differs(name: str, written: CameraSettings, has: CameraSettings) -> str:
+def _difference_text(name: str, written: CameraSettings, has: CameraSettings) -> str:
     there, here = (
         (*s.position, *s.quaternion) if name == "pose" else getattr(s, name) for s in (written, has)
     )

@@ -1,32 +1,34 @@
-"""What is to be changed in traced values, and where in the text that is done.
-
-A value is changed where it stands if nobody else reads it there. If somebody does (one ``pose`` for two cameras, a
-constant that the scene is built with), changing it would change more than was asked for: then the new value is written
-in place of the name, for this use alone, and the author is told.
-"""
+"""Edits of traced values: where in the source each is written, and the text of the new value."""
 
 from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+import numpy as np
 
 from workbench.authoring.source.names import Project
-from workbench.authoring.source.numbers import number_text
 from workbench.authoring.source.text import RefusedEdit, Replacement, SourceFile, arguments
 from workbench.authoring.source.trace import DEGREE, Part, Place
+from workbench.core.cameras.conventions import normalised
 
 
 class Changes:
-    """Places come from the process that runs the author's code: one that is no expression of a text that is here raises
-    RefusedEdit."""
+    """Collects edits of traced values and turns them into replacements of text.
+
+    A value is edited where it is written if nothing else reads it there. Otherwise (one ``pose`` for two cameras, a
+    constant that the scene uses) the new value is written in place of the name, for this use alone, with a note.
+
+    Places come from the worker, whose texts may differ: one that is not an expression of these files raises RefusedEdit.
+    """
 
     def __init__(self, project: Project) -> None:
         self.project = project
         self.texts: dict[Part, str] = {}
-        """New text of an expression."""
+        """New texts of expressions."""
         self.added: dict[Part, list[str]] = {}
-        """Arguments that a call gets."""
+        """New arguments of calls."""
         self.notes: list[str] = []
         self.replacements: list[tuple[SourceFile, Replacement]] = []
 
@@ -35,17 +37,17 @@ class Changes:
             self.notes.append(text)
 
     def find(self, place: Place) -> tuple[SourceFile, ast.expr]:
-        file = self.project.given(place.file)
+        file = self.project.own_file(place.file)
         return file, file.expression((place.start, place.end))
 
     def code(self, place: Place) -> str:
         file, node = self.find(place)
         return file.code(node)
 
-    def short(self, place: Place) -> str:
-        """On one line, for a sentence."""
+    def one_line(self, place: Place) -> str:
+        """The code of an expression on one line, for messages."""
         file, node = self.find(place)
-        return file.short(node)
+        return file.one_line(node)
 
     def change(self, file: SourceFile, *replacements: Replacement) -> None:
         self.replacements += [(file, replacement) for replacement in replacements]
@@ -53,14 +55,14 @@ class Changes:
     def replace(self, file: SourceFile, node: ast.AST, text: str) -> None:
         self.change(file, Replacement(*file.span(node), text))
 
-    def importing(self, file: SourceFile, lines: Mapping[str, str]) -> None:
-        """Add what is missing at the top of a file.
+    def add_imports(self, file: SourceFile, lines: Mapping[str, str]) -> None:
+        """Add missing imports at the top of a file.
 
         Args:
-            lines: by the name that each brings.
+            lines: import statements by the name that each binds.
 
         Raises:
-            RefusedEdit: a name means something else there.
+            RefusedEdit: the file uses a name for something else.
         """
         bindings = self.project.bindings(file, file.module)
         for name in lines:
@@ -75,29 +77,29 @@ class Changes:
             text = "".join(f"{line}\n" for line in sorted(missing, key=lambda line: line.startswith("from")))
             self.change(file, Replacement(place, place, text))
 
-    # --- wanted -------------------------------------------------------------------------------------
+    # --- new values ---------------------------------------------------------------------------------
 
-    def number(self, value: Part, wanted: float, decimals: int) -> None:
-        """`wanted`, unless what stands there is as good."""
-        if settled(value, wanted, decimals) == value.value:
+    def number(self, value: Part, requested: float, decimals: int) -> None:
+        """Edit `value` to `requested`, unless it is the same to so many decimals."""
+        if written_value(value, requested, decimals) == value.value:
             return
-        inner, wanted, decimals = _innermost(value, wanted, decimals)
+        inner, requested, decimals = _inner_target(value, requested, decimals)
         code = self.code(inner.at)
-        text = number_text(wanted, decimals, code)
+        text = number_text(requested, decimals, code)
         self.texts[inner] = text
         named = {node.id for node in ast.walk(self.find(inner.at)[1]) if isinstance(node, ast.Name)}
         names = sorted(named - {"np", "math", "pi", "torch", "numpy"})
         if names:
             self.note(f"`{code}` became {text}: it no longer follows {' and '.join(names)}")
 
-    # --- where --------------------------------------------------------------------------------------
+    # --- replacements -------------------------------------------------------------------------------
 
-    def touches(self, value: Part) -> bool:
+    def is_edited(self, value: Part) -> bool:
         return any(part in self.texts or part in self.added for part in value.walk())
 
     def emit(self, value: Part, known: int = 0) -> None:
-        """Turn what is changed in `value` into replacements. `known` of its reads are followed already."""
-        if not self.touches(value):
+        """Turn the edits within `value` into replacements. The first `known` of its reads are followed already."""
+        if not self.is_edited(value):
             return
         for index, read in enumerate(value.reads[known:], known):
             if read.others is not None:
@@ -119,17 +121,17 @@ class Changes:
             self.change(file, *file.added_arguments(node, self.added[value]))
 
     def rendered(self, value: Part, known: int, into: SourceFile) -> str:
-        """`value` as a text of its own, to be written in `into`."""
+        """The code of `value` as a standalone expression in the file `into`."""
         if value in self.texts:
             return self.texts[value]
         file, node = self.find(value.at)
-        if not self.touches(value):
+        if not self.is_edited(value):
             home, named = self.find(value.reads[known].at) if value.reads[known:] else (file, node)
             if home is into and not isinstance(home.scopes(named)[0], ast.ClassDef):
-                # Not what stands in the body of a class, whose names a method does not see.
+                # Not a name of a class body, which its methods do not see.
                 return home.code(named)
         if isinstance(value.value, float):
-            if self.touches(value):
+            if self.is_edited(value):
                 return self._with_part(value, into)
             return file.code(node) if value.literal else number_text(value.value, 7)
         if value.function:
@@ -153,24 +155,24 @@ class Changes:
         return f"{file.code(node.func)}({', '.join([*texts, *self.added.get(value, [])])})"
 
     def _with_part(self, value: Part, into: SourceFile) -> str:
-        """An expression of which only a part is changed, in the middle of its text."""
+        """The code of an expression whose inner number is edited."""
         chain = _chain(value)
         inner = chain[-1]
         file, node = self.find(value.at)
         where, within = self.find(inner.at)
         if len(inner.reads) > len(value.reads) or file is not into or where is not file:
-            return number_text(_outward(chain, float(self.texts[inner])), 7)
+            return number_text(_outer_value(chain, float(self.texts[inner])), 7)
         (start, end), (a, b) = file.span(node), file.span(within)
         return file.text[start:a] + self.texts[inner] + file.text[b:end]
 
 
-def settled(value: Part, wanted: float, decimals: int) -> float:
-    """What a number will be when `wanted` has been written with so many decimals."""
+def written_value(value: Part, requested: float, decimals: int) -> float:
+    """The number that results from writing `requested` with so many decimals."""
     assert isinstance(value.value, float)
-    if abs(value.value - wanted) <= 0.5000001 * 10**-decimals:
+    if abs(value.value - requested) <= 0.5000001 * 10**-decimals:
         return value.value
-    _, new, places = _innermost(value, wanted, decimals)
-    return _outward(_chain(value), round(new, places))
+    _, new, places = _inner_target(value, requested, decimals)
+    return _outer_value(_chain(value), round(new, places))
 
 
 def _chain(value: Part) -> list[Part]:
@@ -180,18 +182,58 @@ def _chain(value: Part) -> list[Part]:
     return found
 
 
-def _outward(chain: list[Part], innermost: float) -> float:
-    """What the first is when the last is that."""
+def _outer_value(chain: list[Part], innermost: float) -> float:
+    """The value of the first part of `chain` if the last one is `innermost`."""
     for outer in reversed(chain[:-1]):
         innermost = innermost * outer.slope + outer.offset
     return innermost
 
 
-def _innermost(value: Part, wanted: float, decimals: int) -> tuple[Part, float, int]:
-    """The number to be changed, what it has to be, and to how many decimals."""
+def _inner_target(value: Part, requested: float, decimals: int) -> tuple[Part, float, int]:
+    """The number to edit within `value`, its new value, and its decimals."""
     *outer, last = _chain(value)
     for part in outer:
-        wanted = (wanted - part.offset) / part.slope
+        requested = (requested - part.offset) / part.slope
         if math.isclose(part.slope, DEGREE):
             decimals = max(2, decimals - 2)
-    return last, wanted, decimals
+    return last, requested, decimals
+
+
+# --- numbers as text ------------------------------------------------------------------------------
+
+
+def number_text(value: float, decimals: int, like: str = "0.0") -> str:
+    """`value` rounded to `decimals`, without trailing zeros. A whole number is an integer if the old text `like` is one."""
+    rounded = round(value, decimals)
+    if rounded == int(rounded):
+        whole = str(int(rounded))
+        return whole if decimals == 0 or like.lstrip("+-").isdigit() else f"{whole}.0"
+    return f"{rounded:.{decimals}f}".rstrip("0")
+
+
+def list_text(values: Sequence[float], decimals: int) -> str:
+    return "[" + ", ".join(number_text(value, decimals) for value in values) + "]"
+
+
+def matrix_text(rows: Sequence[Sequence[float]]) -> str:
+    """Rows of pixels, to a thousandth."""
+    return "[" + ", ".join(list_text(row, 3) for row in rows) + "]"
+
+
+def quaternion_texts(quaternion: Sequence[float]) -> list[str]:
+    """The four numbers of `quaternion` (wxyz), as short as they are within 1e-7 of a unit quaternion.
+
+    SAPIEN does not normalise: 0.7071 in place of 0.7071068 gives the camera a frame that is no rotation.
+    """
+    exact = same_side(quaternion, quaternion)
+    for decimals in (1, 2, 3, 4, 5, 6):
+        rounded = [round(part, decimals) for part in exact]
+        if max(abs(a - b) for a, b in zip(rounded, exact, strict=True)) < 1e-7:
+            return [number_text(part, decimals) for part in rounded]
+    return [number_text(part, 7) for part in exact]
+
+
+def same_side(quaternion: Sequence[float], old: Sequence[float]) -> list[float]:
+    """The unit quaternion of this orientation whose sign matches `old`."""
+    found = normalised(quaternion)
+    return (found if found @ np.asarray(old) >= 0 else -found).tolist()

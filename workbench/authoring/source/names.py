@@ -1,9 +1,4 @@
-"""Where a name gets its value, and who else reads it there, as far as the text of the author's files tells.
-
-Branches depend on what only the running task knows, so what stands in them may hold afterwards and may not. Who else
-reads a definition is asked before it is changed, and there any file that has the name counts, since too many readers
-only means that the value is written elsewhere.
-"""
+"""Finds the definition of a name and its other readers, from the text of the author's files."""
 
 from __future__ import annotations
 
@@ -12,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from workbench.authoring.source.text import FUNCTIONS, LOOPS, RefusedEdit, Scope, SourceFile, parsed, walk
+from workbench.authoring.source.text import FUNCTIONS, LOOPS, RefusedEdit, Scope, SourceFile, parse_file, walk
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,22 +17,26 @@ class Binding:
     node: ast.AST
     """The statement or argument that binds it."""
     value: ast.expr | None
-    """The expression of its value; None where reading does not tell it."""
+    """The expression of its value; None if the text does not determine it."""
     why: str = ""
-    """What it is, where `value` is None."""
+    """Reason if `value` is None."""
     imported: tuple[str, str] | None = None
-    """Of an import: the module, with its leading dots, and the name in it, empty for the module itself."""
+    """For an import: the module, with its leading dots, and the name in it (empty for the module itself)."""
     attribute: bool = False
-    """Of an object."""
+    """An attribute of an object, not a variable."""
 
     @property
     def dotted(self) -> str:
-        """What an import binds it to; empty for anything else."""
+        """The imported module or name; empty if it is not an import."""
         return "" if self.imported is None else ".".join(filter(None, self.imported))
 
 
 class Project:
-    """The author's files, parsed as they are asked for."""
+    """The author's files, parsed on demand.
+
+    Branches depend on the running task, so a definition in one may or may not hold. Readers are over-counted rather than
+    missed: any file that has the name counts, and too many readers only mean that a value is written elsewhere.
+    """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
         self.texts = texts
@@ -46,20 +45,19 @@ class Project:
         self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
 
     def file(self, path: str) -> SourceFile:
-        if (
-            path not in self._files
-        ):  # kept here too: nodes are told apart by identity, however many files there are
-            self._files[path] = parsed(path, self.texts[path])
+        # Kept here too: nodes are compared by identity, and `parse_file` keeps only the last files.
+        if path not in self._files:
+            self._files[path] = parse_file(path, self.texts[path])
         return self._files[path]
 
-    def given(self, path: str) -> SourceFile:
-        """Raises RefusedEdit for what is none of them."""
+    def own_file(self, path: str) -> SourceFile:
+        """The file at `path`. Raises RefusedEdit if it is not one of the author's."""
         if path not in self.texts:
             raise RefusedEdit(f"{path} is not one of your files")
         return self.file(path)
 
-    def mentioning(self, word: str) -> Iterator[SourceFile]:
-        """The files in which `word` stands as a word."""
+    def files_with_word(self, word: str) -> Iterator[SourceFile]:
+        """The files that contain `word` as a whole word."""
         for path, text in self.texts.items():
             if path not in self._words:
                 self._words[path] = frozenset(re.findall(r"\w+", text))
@@ -67,7 +65,7 @@ class Project:
                 yield self.file(path)
 
     def bindings(self, file: SourceFile, scope: Scope) -> dict[str, list[Binding]]:
-        """What `scope` itself binds, in the order of the text."""
+        """Names bound by `scope` itself, in the order of the text."""
         if scope not in self._bindings:
             found: dict[str, list[Binding]] = {}
             for binding in _bound_in(file, scope):
@@ -75,8 +73,8 @@ class Project:
             self._bindings[scope] = found
         return self._bindings[scope]
 
-    def of_name(self, file: SourceFile, node: ast.Name) -> list[Binding]:
-        """The bindings that may hold where `node` is read; none for a builtin or a starred import's name."""
+    def bindings_of(self, file: SourceFile, node: ast.Name) -> list[Binding]:
+        """The bindings that may hold where `node` is read; empty for a builtin or a name of ``import *``."""
         for outer in file.ancestors(node):
             for inside in getattr(outer, "generators", ()):
                 if any(isinstance(n, ast.Name) and n.id == node.id for n in walk(inside.target)):
@@ -92,15 +90,18 @@ class Project:
     # --- readers ------------------------------------------------------------------------------------
 
     def readers(self, binding: Binding, reader: SourceFile, read: ast.AST) -> str | None:
-        """Who reads what a name is bound to, other than `read` in `reader`: of an attribute, whosever it is."""
+        """The place of another reader of a binding than `read` in the file `reader`, as text; None if there is none.
+
+        An attribute counts on any object.
+        """
         home, name = binding.file, binding.name
         scope = home.scopes(binding.node)[0]
         attribute = binding.attribute or isinstance(scope, ast.ClassDef)
         everywhere = binding.imported is None and (attribute or isinstance(scope, ast.Module))
-        for file in dict.fromkeys((home, *(self.mentioning(name) if everywhere else ()))):
+        for file in dict.fromkeys((home, *(self.files_with_word(name) if everywhere else ()))):
             for node in file.nodes:
                 if isinstance(node, ast.Name) and node.id == name:
-                    loads = isinstance(node.ctx, ast.Load) and binding in self.of_name(file, node)
+                    loads = isinstance(node.ctx, ast.Load) and binding in self.bindings_of(file, node)
                     found = loads or (file is not home and not attribute)
                 elif isinstance(node, ast.Attribute) and node.attr == name:
                     found = not isinstance(node.ctx, ast.Store) if attribute else file is not home
@@ -109,14 +110,14 @@ class Project:
                 else:
                     found = attribute and isinstance(node, ast.Constant) and node.value == name
                 if found and node is not read and not _other_element(file, node, read):
-                    return _where(file, node, reader)
+                    return _location(file, node, reader)
         return None
 
     def attribute_stores(self, name: str) -> list[Binding]:
-        """Everything that sets an attribute of that name, of whatever object."""
+        """All assignments to an attribute of that name, on any object."""
         return [
             _stored(file, node)
-            for file in self.mentioning(name)
+            for file in self.files_with_word(name)
             for node in file.nodes
             if isinstance(node, ast.Attribute) and node.attr == name and _is_set(file, node)
         ]
@@ -135,7 +136,7 @@ def _bound_in(file: SourceFile, scope: Scope) -> Iterator[Binding]:
         if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
             yield from _bound_name(file, node)
         elif isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
-            # NAME[0] = ...: what the name stands for is no longer what was assigned to it.
+            # NAME[0] = ... changes the value that was assigned.
             base = _base(node)
             if isinstance(base, ast.Name):
                 yield Binding(file, base.id, _statement(file, node), None, "a part of it is set")
@@ -160,7 +161,7 @@ def _bound_name(file: SourceFile, node: ast.Name) -> Iterator[Binding]:
 
 
 def _assigned(file: SourceFile, target: ast.AST) -> ast.expr | None:
-    """The expression that a target gets, where it can be told."""
+    """The expression assigned to `target`; None if the text does not determine it."""
     outer = file.parents[target]
     if isinstance(outer, (ast.Assign, ast.AnnAssign, ast.NamedExpr)):
         return outer.value
@@ -212,7 +213,7 @@ def _stored(file: SourceFile, node: ast.Attribute) -> Binding:
 
 
 def reaching(file: SourceFile, bindings: list[Binding], use: ast.AST | None, scope: Scope) -> list[Binding]:
-    """Those of one name's `bindings` that may hold at `use`; at the end of their scope for None."""
+    """The `bindings` of one name that may hold at `use`; None: at the end of their scope."""
     found: list[Binding] = []
     around = [scope] if use is None else list(file.ancestors(use))
     for binding in bindings:
@@ -225,14 +226,14 @@ def reaching(file: SourceFile, bindings: list[Binding], use: ast.AST | None, sco
                 continue  # the right-hand side of its own assignment
         if use is not None and _exclusive(file, binding.node, use):
             continue
-        # What holds for certain hides what was there before.
+        # A binding that certainly ran replaces the earlier ones.
         certain = isinstance(binding.node, ast.arg) or _block(file, binding.node) in _blocks(file, use, scope)
         found = [binding] if certain else [*found, binding]
     return found
 
 
 def _block(file: SourceFile, node: ast.AST) -> tuple[ast.AST, str]:
-    """The statement, and the part of it, whose list of statements `node` is in."""
+    """The statement and the part of it ("body", "orelse" ...) that contain `node`."""
     inner = node
     for outer in file.ancestors(node):
         for part in ("body", "orelse", "finalbody"):
@@ -273,6 +274,6 @@ def _other_element(file: SourceFile, node: ast.AST, mine: ast.AST) -> bool:
     return keys[0] != keys[1]
 
 
-def _where(file: SourceFile, node: ast.AST, reader: SourceFile) -> str:
+def _location(file: SourceFile, node: ast.AST, reader: SourceFile) -> str:
     line = f"line {file.line(node)}"
     return line if file is reader else f"{file.name}, {line}"

@@ -1,34 +1,36 @@
-"""Where the values that a running call was given stand in the author's files.
-
-The frame that makes the call knows every name's value, and its code the call's exact place. A name is followed to the
-assignment that it has its value from, by the text alone where only one can hold, else to the one whose value is the
-running one. What is not understood is said to be unknown, with the reason; that is the answer wherever there is doubt,
-since on it rests whether a line of somebody's file is changed.
-"""
+"""Finds where in the author's files the arguments of a running call are written."""
 
 from __future__ import annotations
 
 import ast
 import copy
 import importlib.util
+import inspect
 import math
 import operator
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from types import FrameType, ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
+import sapien
+import torch
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.structs.pose import Pose
+from transforms3d import euler
 
-from workbench.authoring.source.library import Known, known_functions, plain
 from workbench.authoring.source.names import Binding, Project, reaching
 from workbench.authoring.source.text import FUNCTIONS, Scope, SourceFile, arguments, is_starred
 from workbench.authoring.source.trace import DEGREE, Part, Place, Plain, Read, Trace
+from workbench.core import maniskill_private
 
 _DEPTH = 40
-"""Names defined by names: beyond this they go in a circle."""
-_TESTS = (
+"""Longest chain of names; a longer one is a circle."""
+_CONDITION_NODES = (
     ast.Name,
     ast.Attribute,
     ast.Constant,
@@ -38,15 +40,15 @@ _TESTS = (
     ast.boolop,
     ast.UnaryOp,
     ast.Not,
+    ast.expr_context,
 )
-_TESTS += (ast.expr_context,)
-_READ = (ast.Name, ast.Attribute, ast.Subscript)
+_NAME_NODES = (ast.Name, ast.Attribute, ast.Subscript)
 Reads = tuple[Read, ...]
 _Made = TypeVar("_Made")
 
 
 class Unknown(Exception):
-    """It is not understood; the reason is for the author."""
+    """A value cannot be followed; the message is the reason for the author."""
 
 
 def trace_call(
@@ -55,11 +57,11 @@ def trace_call(
     """The call that `frame` is making.
 
     Args:
-        parameters: of what is called, in their order.
-        values: what it came to have, by parameter, of those that are wanted.
+        parameters: parameters of the called function, in order.
+        values: the values of the requested parameters.
 
     Returns:
-        None where the call stands in none of the project's files.
+        None if the call is in none of the project's files.
     """
     code = frame.f_code
     place = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,) * 4)
@@ -81,7 +83,7 @@ def trace_call(
             continue
         try:
             parts[name] = part = reader.part(file, given[name])
-            if not _same(part.value, plain(value)):
+            if not _same(part.value, plain_value(value)):
                 raise reader.computed(file, given[name])
         except Unknown as exc:
             parts.pop(name, None)
@@ -90,7 +92,7 @@ def trace_call(
 
 
 def _same(a: Plain, b: Plain) -> bool:
-    """But for what single precision takes away."""
+    """Equal within single precision."""
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
     if isinstance(a, float) and isinstance(b, float):
@@ -99,23 +101,28 @@ def _same(a: Plain, b: Plain) -> bool:
 
 
 class ValueReader:
-    """Follows the arguments of one call while its frame stands."""
+    """Follows the arguments of one call while its frame exists.
+
+    The frame has the value of every name, and its code the exact position of the call. A name is followed to its
+    assignment: by the text alone if only one can hold, else to the one that has the running value. Any doubt is `Unknown`,
+    since the answer decides whether a line of the author's file is edited.
+    """
 
     def __init__(self, project: Project, file: SourceFile, call: ast.expr, frame: FrameType) -> None:
         self._project, self._frame = project, frame
         self._around = file.scopes(call)
 
     def computed(self, file: SourceFile, node: ast.AST) -> Unknown:
-        return Unknown(f"`{file.short(node)}` is computed when the task runs")
+        return Unknown(f"`{file.one_line(node)}` is computed when the task runs")
 
     def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> Part:
-        """What an expression is made of. Raises Unknown."""
+        """The parts of an expression. Raises Unknown."""
         if len(reads) > _DEPTH:
             raise Unknown(f"`{file.code(node)}` is defined by itself")
         if isinstance(node, ast.IfExp):
             return self.part(file, node.body if self._test(file, node.test) else node.orelse, reads)
-        if isinstance(node, _READ) and not self._is_a_librarys(file, node):
-            where, value, others = self._followed(file, node)
+        if isinstance(node, _NAME_NODES) and not self._is_from_library(file, node):
+            where, value, others = self._follow(file, node)
             return self.part(where, value, (*reads, Read(Place(file.path, *file.inner_span(node)), others)))
         place = Place(file.path, *file.inner_span(node))
         if isinstance(node, ast.Call):
@@ -127,21 +134,21 @@ class ValueReader:
             return Part(place, reads, value, parts=parts, literal=True)
         if _is_number(node) or not isinstance(value, float):
             return Part(place, reads, value, literal=_is_number(node))
-        return self._with_a_number_in_it(file, node, Part(place, reads, value))
+        return self._with_editable_number(file, node, Part(place, reads, value))
 
     # --- values -------------------------------------------------------------------------------------
 
     def _value(self, file: SourceFile, node: ast.expr) -> Plain:
-        """What an expression that is allowed is worth."""
-        return self._known(file, node, node, plain)
+        """The value of a checked expression."""
+        return self._evaluate(file, node, node, plain_value)
 
-    def _known(
+    def _evaluate(
         self, file: SourceFile, node: ast.expr, whole: ast.expr, made: Callable[[Any], _Made]
     ) -> _Made:
-        """What is made of an expression's value. Raises Unknown, of the `whole` that it is of."""
+        """`made(value of node)`. Raises Unknown that names the expression `whole`."""
         try:
             return made(self._run(file, node))
-        except Exception as exc:  # whatever the author's classes raise
+        except Exception as exc:  # the author's classes may raise anything
             raise self.computed(file, whole) from exc
 
     def _run(self, file: SourceFile, node: ast.expr, at: ast.AST | None = None) -> Any:
@@ -149,7 +156,7 @@ class ValueReader:
         return eval(compile(ast.Expression(node), file.path, "eval"), names, own)
 
     def _namespace(self, file: SourceFile, scope: Scope) -> tuple[dict[str, Any], Mapping[str, Any]]:
-        """Globals and locals of code in a scope, as they are now."""
+        """Current globals and locals of code in a scope."""
         running = self._frame
         names = running.f_globals if file.path == running.f_code.co_filename else vars(module_of(file.path))
         if scope in self._around and isinstance(scope, FUNCTIONS):
@@ -160,9 +167,9 @@ class ValueReader:
         return names, {name: running.f_locals[name] for name in ("self", "cls") if name in running.f_locals}
 
     def _check(self, file: SourceFile, node: ast.AST) -> None:
-        """Raises Unknown for what is more than numbers, names that can be followed, and known functions."""
-        if isinstance(node, _READ):
-            if not self._is_a_librarys(file, node):
+        """Raises Unknown unless `node` is made of numbers, names that can be followed, and known functions."""
+        if isinstance(node, _NAME_NODES):
+            if not self._is_from_library(file, node):
                 self.part(file, node)
         elif isinstance(node, ast.Call):
             self._function(file, node)
@@ -178,27 +185,27 @@ class ValueReader:
             raise self.computed(file, node)
 
     def _test(self, file: SourceFile, node: ast.expr) -> bool:
-        """Which way a choice went."""
-        if not all(isinstance(inner, _TESTS) for inner in ast.walk(node)):
+        """The value of a condition."""
+        if not all(isinstance(inner, _CONDITION_NODES) for inner in ast.walk(node)):
             raise self.computed(file, node)
-        return self._known(file, node, node, bool)
+        return self._evaluate(file, node, node, bool)
 
-    def _with_a_number_in_it(self, file: SourceFile, node: ast.expr, whole: Part) -> Part:
-        """With the number of the expression that is best changed, if there is one.
+    def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: Part) -> Part:
+        """`whole` with the number within it that is best edited, if there is one.
 
-        That is the 60 of ``60 * np.pi / 180`` and the 0.2 of ``HEIGHT + 0.2``, which goes on following HEIGHT.
+        That is the 60 of ``60 * np.pi / 180`` and the 0.2 of ``HEIGHT + 0.2``, which still follows HEIGHT.
         """
         leaves = list(_leaves(node))
-        named = any(not _is_number(leaf) and not self._is_a_librarys(file, leaf) for leaf in leaves)
+        named = any(not _is_number(leaf) and not self._is_from_library(file, leaf) for leaf in leaves)
         best: tuple[bool, ast.expr, float, float] | None = None
         for leaf in leaves:
-            if self._is_a_librarys(file, leaf):
+            if self._is_from_library(file, leaf):
                 continue
             at = self._value(file, leaf)
             literal = _is_number(leaf)
             if not isinstance(at, float):
                 continue
-            values = [self._with(file, node, leaf, at + step) for step in (0.0, 1.0, 2.0)]
+            values = [self._value_with(file, node, leaf, at + step) for step in (0.0, 1.0, 2.0)]
             slope, further = values[1] - values[0], values[2] - values[1]
             offset = values[0] - slope * at
             of_degrees = math.isclose(slope, DEGREE, rel_tol=1e-9)
@@ -212,35 +219,35 @@ class ValueReader:
         parts = {"of": self.part(file, leaf, whole.reads)}
         return Part(whole.at, whole.reads, whole.value, parts=parts, slope=slope, offset=offset)
 
-    def _with(self, file: SourceFile, node: ast.expr, leaf: ast.expr, value: float) -> float:
-        """What the expression is with another number in place of `leaf`."""
+    def _value_with(self, file: SourceFile, node: ast.expr, leaf: ast.expr, value: float) -> float:
+        """The value of the expression with `value` in place of `leaf`."""
         try:
             with np.errstate(all="ignore"):
-                found = plain(self._run(file, _put(node, leaf, value), node))
+                found = plain_value(self._run(file, _substitute(node, leaf, value), node))
         except (ValueError, ArithmeticError):  # math.acos(1.5)
             return math.nan
         return found if isinstance(found, float) else math.nan
 
     # --- calls --------------------------------------------------------------------------------------
 
-    def _function(self, file: SourceFile, node: ast.Call) -> Known:
-        """The function that it calls; Raises Unknown for any that is not known, and for arguments by ``*``."""
+    def _function(self, file: SourceFile, node: ast.Call) -> KnownFunction:
+        """The function that `node` calls. Raises Unknown for an unknown one, and for arguments by ``*``."""
         if not is_starred(node) and _is_named(node.func):
-            found = self._known(file, node.func, node, known_functions().get)
+            found = self._evaluate(file, node.func, node, known_functions().get)
             if found is not None:
                 return found
         raise self.computed(file, node)
 
     def _call(self, file: SourceFile, node: ast.Call, place: Place, reads: Reads) -> Part:
         known = self._function(file, node)
-        if known.same and (node.args or node.keywords):
+        if known.converts and (node.args or node.keywords):
             inner = self.part(file, node.args[0] if node.args else node.keywords[0].value, reads)
             if inner.function or isinstance(inner.value, float) or (inner.literal and inner.reads == reads):
-                return inner  # what is within is changed, and the call around it stays
+                return inner  # the argument is edited, the call stays
             return Part(place, reads, inner.value, parts=inner.parts, literal=inner.literal)
         if not known.parameters:
             self._check(file, node)
-            return self._with_a_number_in_it(file, node, Part(place, reads, self._value(file, node)))
+            return self._with_editable_number(file, node, Part(place, reads, self._value(file, node)))
         given = arguments(node, known.parameters)
         if len(given) != len(node.args) + len(node.keywords) or not set(given) <= set(known.parameters):
             raise self.computed(file, node)
@@ -250,8 +257,8 @@ class ValueReader:
 
     # --- names --------------------------------------------------------------------------------------
 
-    def _is_a_librarys(self, file: SourceFile, node: ast.AST) -> bool:
-        """True for ``np.pi``, and for ``pi`` that was imported."""
+    def _is_from_library(self, file: SourceFile, node: ast.AST) -> bool:
+        """True for ``np.pi``, and for an imported ``pi``."""
         if isinstance(node, ast.Attribute):
             owner = self._object(file, node.value)
             return (
@@ -259,26 +266,28 @@ class ValueReader:
             )
         if not isinstance(node, ast.Name):
             return False
-        found = self._project.of_name(file, node)
+        found = self._project.bindings_of(file, node)
         if not found:  # by ``from x import *``
             return node.id in self._namespace(file, file.module)[0]
         imported = [b for b in found if b.imported is not None and b.imported[1]]
         return (
-            bool(imported) and len(imported) == len(found) and all(self._beside(b) is None for b in imported)
+            bool(imported)
+            and len(imported) == len(found)
+            and all(self._imported_file(b) is None for b in imported)
         )
 
     def _object(self, file: SourceFile, node: ast.expr) -> Any:
-        """What a name or a module's attribute means now; None for anything else."""
+        """The object that a name or a module's attribute is bound to; None for other expressions."""
         if isinstance(node, ast.Attribute):
             owner = self._object(file, node.value)
             return vars(owner).get(node.attr) if isinstance(owner, ModuleType) else None
         try:
             return self._run(file, node) if isinstance(node, ast.Name) else None
-        except (NameError, AttributeError):  # of a class that is not there yet
+        except (NameError, AttributeError):  # a class that is not defined yet
             return None
 
-    def _beside(self, binding: Binding) -> SourceFile | None:
-        """The author's file that an import is from."""
+    def _imported_file(self, binding: Binding) -> SourceFile | None:
+        """The author's file that an import is from; None for a library."""
         assert binding.imported is not None
         names = self._namespace(binding.file, binding.file.module)[0]
         try:
@@ -288,30 +297,30 @@ class ValueReader:
         path = str(getattr(sys.modules.get(name), "__file__", None))
         return self._project.file(path) if path in self._project.texts else None
 
-    def _followed(self, file: SourceFile, node: ast.expr) -> tuple[SourceFile, ast.expr, str | None]:
-        """The expression that a name stands for, and who else reads it there. Raises Unknown."""
+    def _follow(self, file: SourceFile, node: ast.expr) -> tuple[SourceFile, ast.expr, str | None]:
+        """File and expression that a name stands for, and another reader of it. Raises Unknown."""
         project = self._project
         if isinstance(node, ast.Subscript):
             return self._element(file, node)
         if isinstance(node, ast.Name):
-            return self._bound(file, node, project.of_name(file, node))
+            return self._follow_bindings(file, node, project.bindings_of(file, node))
         assert isinstance(node, ast.Attribute)
         owner = self._object(file, node.value)
         if isinstance(owner, ModuleType):
             beside = project.file(owner.__file__ or "")
             inside = project.bindings(beside, beside.module).get(node.attr, [])
-            return self._bound(file, node, inside)
-        return self._bound(file, node, self._of_attribute(file, node))
+            return self._follow_bindings(file, node, inside)
+        return self._follow_bindings(file, node, self._attribute_bindings(file, node))
 
-    def _bound(
+    def _follow_bindings(
         self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]
     ) -> tuple[SourceFile, ast.expr, str | None]:
         code = file.code(node)
         if not bindings:
             raise Unknown(f"where `{code}` gets its value cannot be read in the file")
-        binding = bindings[0] if len(bindings) == 1 else self._of_this_run(file, node, bindings)
+        binding = bindings[0] if len(bindings) == 1 else self._binding_of_run(file, node, bindings)
         if binding.imported is not None:
-            beside = self._beside(binding) if binding.imported[1] else None
+            beside = self._imported_file(binding) if binding.imported[1] else None
             inside = (
                 []
                 if beside is None
@@ -320,7 +329,7 @@ class ValueReader:
             if not inside:
                 raise Unknown(f"`{code}` comes from {binding.dotted}, which is not one of your files")
             others = self._project.readers(binding, file, node)
-            where, value, more = self._bound(file, node, inside)
+            where, value, more = self._follow_bindings(file, node, inside)
             return where, value, others or more
         if binding.value is None:
             home = "the file" if binding.file is file else binding.file.name
@@ -330,8 +339,8 @@ class ValueReader:
             others = others or f"line {binding.file.line(binding.node)} gives it to several names"
         return binding.file, binding.value, others
 
-    def _of_this_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
-        """Of several the one whose value is the running one."""
+    def _binding_of_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
+        """The binding that has the running value."""
         fitting = []
         for binding in bindings:
             try:
@@ -340,7 +349,7 @@ class ValueReader:
                 ):
                     fitting.append(binding)
             except (Unknown, LookupError, AttributeError):
-                continue  # of that one nothing can be said, so it is not the one
+                continue  # its value is unknown
         if len(fitting) == 1:
             return fitting[0]
         lines = " and ".join(str(b.file.line(b.node)) for b in fitting or bindings)
@@ -351,16 +360,16 @@ class ValueReader:
         )
         raise Unknown(f"`{file.code(node)}` is given {why} in lines {lines}")
 
-    def _of_attribute(self, file: SourceFile, node: ast.Attribute) -> list[Binding]:
+    def _attribute_bindings(self, file: SourceFile, node: ast.Attribute) -> list[Binding]:
         """The bindings of ``self.NAME``, ``cls.NAME`` or ``Class.NAME``."""
         if not _is_named(node.value):
-            raise self.computed(file, node)  # it would be made again
+            raise self.computed(file, node)  # evaluating it again may have effects
         owner = self._run(file, node.value)
         stores = self._project.attribute_stores(node.attr)
         own: list[Binding] = []
         for cls in (owner if isinstance(owner, type) else type(owner)).__mro__:
             if node.attr in vars(cls):
-                own = self._in_class(cls, node.attr)
+                own = self._class_bindings(cls, node.attr)
                 break
         if not stores:
             return own
@@ -370,7 +379,7 @@ class ValueReader:
         why = f"it is set again at line {first.file.line(first.node)}"
         return [Binding(first.file, node.attr, first.node, None, why)]
 
-    def _in_class(self, cls: type, name: str) -> list[Binding]:
+    def _class_bindings(self, cls: type, name: str) -> list[Binding]:
         path = str(getattr(sys.modules.get(cls.__module__), "__file__", None))
         if path not in self._project.texts:
             return []
@@ -381,15 +390,15 @@ class ValueReader:
         return []
 
     def _element(self, file: SourceFile, node: ast.Subscript) -> tuple[SourceFile, ast.expr, str | None]:
-        code = file.short(node)
+        code = file.one_line(node)
         try:
             key = self.part(file, node.slice).value
         except Unknown as exc:
             raise Unknown(f"`{code}` depends on what only the running task knows") from exc
         where, base, others = file, node.value, None
         for _ in range(_DEPTH):
-            if isinstance(base, _READ):
-                where, base, more = self._followed(where, base)
+            if isinstance(base, _NAME_NODES):
+                where, base, more = self._follow(where, base)
                 others = others or more
         found = _entry(where, base, key)
         if found is None:
@@ -398,7 +407,7 @@ class ValueReader:
 
 
 def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:
-    """The element of a list, a dict or a ``dict(...)`` as it is written."""
+    """The expression of an element of a list, a dict or a ``dict(...)``."""
     if isinstance(base, (ast.List, ast.Tuple)) and isinstance(key, float) and key == int(key):
         if -len(base.elts) <= key < len(base.elts) and not any(isinstance(e, ast.Starred) for e in base.elts):
             return base.elts[int(key)]
@@ -413,20 +422,20 @@ def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:
 
 
 def _is_named(node: ast.AST) -> bool:
-    """A name, or one within another: nothing that does something when it is asked again."""
+    """A name or attribute: evaluating it again has no effect."""
     return all(isinstance(inner, (ast.Name, ast.Attribute, ast.Load)) for inner in ast.walk(node))
 
 
 def _is_number(node: ast.AST) -> bool:
-    """Written as nothing but a number, perhaps with a sign."""
+    """A plain number, perhaps with a sign."""
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
         node = node.operand
     return isinstance(node, ast.Constant) and type(node.value) in (int, float)
 
 
 def _leaves(node: ast.AST) -> Iterator[ast.expr]:
-    """The numbers and names that an expression is made of."""
-    if _is_number(node) or isinstance(node, _READ):
+    """The numbers and names of an expression."""
+    if _is_number(node) or isinstance(node, _NAME_NODES):
         assert isinstance(node, ast.expr)
         yield node
         return
@@ -435,22 +444,85 @@ def _leaves(node: ast.AST) -> Iterator[ast.expr]:
         yield from _leaves(child)
 
 
-def _put(node: ast.AST, leaf: ast.AST, value: float) -> Any:
-    """A copy with a number in place of `leaf`."""
+def _substitute(node: ast.AST, leaf: ast.AST, value: float) -> Any:
+    """A copy of `node` with a number in place of `leaf`."""
     if node is leaf:
         return ast.copy_location(ast.Constant(value), node)
     made = copy.copy(node)
     for name, held in ast.iter_fields(node):
         if isinstance(held, ast.AST):
-            setattr(made, name, _put(held, leaf, value))
+            setattr(made, name, _substitute(held, leaf, value))
         elif isinstance(held, list):
-            setattr(made, name, [_put(h, leaf, value) if isinstance(h, ast.AST) else h for h in held])
+            setattr(made, name, [_substitute(h, leaf, value) if isinstance(h, ast.AST) else h for h in held])
     return made
 
 
 def module_of(path: str) -> ModuleType:
-    """The one that was made of a file. Raises LookupError."""
+    """The module of a file. Raises LookupError."""
     for module in list(sys.modules.values()):
         if getattr(module, "__dict__", {}).get("__file__") == path:
             return module
     raise LookupError(f"{path} was not imported")
+
+
+# --- functions and values of libraries ------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class KnownFunction:
+    """A library function whose value depends on its arguments alone, so that a call may be evaluated again."""
+
+    name: str = ""
+    """Name for `Part.function`; empty if it needs none."""
+    parameters: tuple[str, ...] = ()
+    """Parameters in order, of a function whose arguments may be edited."""
+    converts: bool = False
+    """It only converts the type of its first argument, which is edited instead."""
+
+
+@cache
+def known_functions() -> dict[Callable[..., Any], KnownFunction]:
+    """Known functions by identity, whatever name a file gives them."""
+    maniskill_private.mark_camera_configs()  # wraps look_at; the original may have been imported before: both are known
+    converts, number, look_at = (
+        KnownFunction(converts=True),
+        KnownFunction(),
+        KnownFunction("look_at", ("eye", "target", "up", "device")),
+    )
+    table: dict[Callable[..., Any], KnownFunction] = {
+        sapien_utils.look_at: look_at,
+        inspect.unwrap(sapien_utils.look_at): look_at,
+        sapien.Pose: KnownFunction("pose", ("p", "q")),
+        Pose.create_from_pq: KnownFunction("pose", ("p", "q", "device")),
+        euler.euler2quat: KnownFunction("euler", ("ai", "aj", "ak", "axes")),
+    }
+    for function in (Pose.create, float, list, tuple, np.array, np.asarray, torch.tensor, torch.as_tensor):
+        table[function] = converts
+    for name in ("sin", "cos", "tan", "sqrt", "radians", "degrees"):
+        table[getattr(np, name)] = table[getattr(math, name)] = number
+    for name in ("deg2rad", "rad2deg", "arctan", "arcsin", "arccos"):
+        table[getattr(np, name)] = number
+    for name in ("atan", "asin", "acos"):
+        table[getattr(math, name)] = number
+    return table
+
+
+def plain_value(value: Any) -> Plain:
+    """`value` with numbers as floats, sequences and arrays as tuples, a pose as seven numbers.
+
+    Raises:
+        ValueError: it is not made of numbers.
+    """
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, sapien.Pose):
+        return plain_value([*value.p, *value.q])
+    if isinstance(value, Pose):
+        return plain_value(value.raw_pose[0])
+    if isinstance(value, (list, tuple)):
+        return tuple(plain_value(item) for item in value)
+    if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(value, (np.ndarray, torch.Tensor)):
+        return plain_value(value.tolist())
+    raise ValueError(f"a {type(value).__name__} is not a number")

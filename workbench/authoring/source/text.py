@@ -1,7 +1,4 @@
-"""One file as a syntax tree whose nodes know their place in the text, and edits that replace spans of that text.
-
-Whatever is not replaced is the same to the last character, without anything having to be printed again.
-"""
+"""A parsed source file whose nodes have text offsets, and edits that replace only their own spans."""
 
 from __future__ import annotations
 
@@ -17,11 +14,11 @@ from functools import cached_property, lru_cache
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Scope = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 Span = tuple[int, int]
-"""First character and the one behind the last."""
+"""Offsets of the first character and of the end."""
 LOOPS = (ast.For, ast.AsyncFor, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 _LINE_END = re.compile(r"\r\n?|\n")
-"""Python's own idea of a line; str.splitlines has more."""
+"""Line ends of Python; str.splitlines splits at more."""
 _BLANK = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -33,12 +30,12 @@ _BLANK = {
 
 
 class RefusedEdit(Exception):
-    """Ends a plan from anywhere inside, with the reason; its callers make a sentence for the author of it."""
+    """An edit cannot be made; raised from anywhere while it is planned."""
 
     def __init__(self, reason: str, snippet: str = "") -> None:
         super().__init__(reason)
         self.reason, self.snippet = reason, snippet
-        """Why the file is left alone, and what the author can copy into it themselves."""
+        """The end of a sentence for the author, and text that they can copy into the file themselves."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class Replacement:
 
 
 class SourceFile:
-    """A parsed file. Raises `RefusedEdit` for a text that is not Python."""
+    """A parsed file. Raises `RefusedEdit` if the text is not Python."""
 
     def __init__(self, path: str, text: str) -> None:
         self.path = path
@@ -57,11 +54,11 @@ class SourceFile:
         try:
             self.module = ast.parse(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as exc:
-            said = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
-            raise RefusedEdit(f"{self.name} is not valid Python as it stands: {said}") from exc
+            reason = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
+            raise RefusedEdit(f"{self.name} is not valid Python as it stands: {reason}") from exc
         self._starts = [0, *(m.end() for m in _LINE_END.finditer(text))]
         self.nodes = list(walk(self.module))
-        """All, nearly in the order of the text."""
+        """All nodes, nearly in the order of the text."""
         self.parents = {child: node for node in self.nodes for child in ast.iter_child_nodes(node)}
 
     @property
@@ -71,7 +68,7 @@ class SourceFile:
     # --- places -------------------------------------------------------------------------------------
 
     def inner_span(self, node: ast.AST) -> Span:
-        """Offsets of a node that has a place of its own, without parentheses around it."""
+        """Offsets of an expression, statement or argument, without parentheses around it."""
         place: ast.expr = node  # type: ignore[assignment]
         assert place.end_lineno is not None and place.end_col_offset is not None
         return self._offset(place.lineno, place.col_offset), self._offset(
@@ -79,14 +76,14 @@ class SourceFile:
         )
 
     def _offset(self, line: int, column: int) -> int:
-        """Of a column in bytes of UTF-8, as Python counts them."""
+        """Offset of a column that is counted in bytes of UTF-8, as Python's nodes do."""
         start = self._starts[line - 1]
         if self.text.isascii():
             return start + column
         return start + len(self.line_text(line).encode()[:column].decode())
 
     def span(self, node: ast.AST) -> Span:
-        """Offsets with the parentheses around it."""
+        """Offsets of a node with the parentheses around it."""
         start, end = self.inner_span(node)
         low, high = self._room(node)
         while True:
@@ -100,12 +97,12 @@ class SourceFile:
             start, end = opens, closes
 
     def _room(self, node: ast.AST) -> Span:
-        """Where the parentheses of a node must lie: those of a call around it are not its own."""
+        """The span that may hold the parentheses of a node: those of the call around it are not its own."""
         outer = self.parents.get(node)
         if isinstance(outer, ast.keyword):
             node, outer = outer, self.parents[outer]
         if isinstance(outer, ast.Call) and node is not outer.func:
-            return self.inside(outer)
+            return self.content_span(outer)
         return self.inner_span(outer) if isinstance(outer, (ast.expr, ast.stmt)) else (0, len(self.text))
 
     @cached_property
@@ -118,26 +115,26 @@ class SourceFile:
         ]
 
     def token_after(self, start: int, string: str) -> int:
-        """Where the first of these words or signs begins, from `start` on."""
+        """Offset of the first token `string` from `start` on."""
         following = self._tokens[bisect_left(self._tokens, (start,)) :]
         return next(begin for begin, _, token in following if token == string)
 
     def after_comma(self, end: int) -> int | None:
-        """Behind the comma that follows; None where none does."""
+        """Offset after the comma that follows `end`; None if no comma follows."""
         following = bisect_left(self._tokens, (end,))
         if following < len(self._tokens) and self._tokens[following][2] == ",":
             return self._tokens[following][1]
         return None
 
-    def inside(self, node: ast.AST) -> Span:
-        """What is between the brackets of a call, list, dict or tuple."""
+    def content_span(self, node: ast.AST) -> Span:
+        """The span between the brackets of a call, list, dict or tuple."""
         start, end = self.inner_span(node)
         if isinstance(node, ast.Call):
             start = self._tokens[bisect_left(self._tokens, (self.span(node.func)[1],))][0]
         return start + 1, end - 1
 
     def items(self, node: ast.AST) -> list[Span]:
-        """The arguments of a call, or the elements of a list, tuple or dict."""
+        """Spans of the arguments of a call, or of the elements of a list, tuple or dict."""
         if isinstance(node, ast.Dict):
             pairs = zip(node.keys, node.values, strict=True)
             return [
@@ -163,15 +160,15 @@ class SourceFile:
         return found
 
     def expression(self, span: Span) -> ast.expr:
-        """The one that is exactly there. Raises RefusedEdit where none is."""
+        """The expression with exactly this span. Raises RefusedEdit if there is none."""
         if span not in self._expressions:
             raise RefusedEdit(
-                f"{self.name} is another text than the one that ran; save it, let it load and ask again"
+                f"{self.name} differs from the text that ran; save it, let it load and ask again"
             )
         return self._expressions[span]
 
     def at(self, line: int, end_line: int, column: int, end_column: int) -> ast.expr | None:
-        """The expression at a place as code objects have it (``co_positions``)."""
+        """The expression at a position of a code object (``co_positions``)."""
         if not 0 < line <= end_line <= len(self._starts):
             return None
         return self._expressions.get((self._offset(line, column), self._offset(end_line, end_column)))
@@ -183,7 +180,7 @@ class SourceFile:
         return bisect_right(self._starts, offset)
 
     def line_text(self, line: int) -> str:
-        """One line without its end; of the line behind the last, nothing."""
+        """One line without its end; empty after the last line."""
         start = self.line_start(line)
         match = _LINE_END.search(self.text, start)
         return self.text[start : match.start() if match else len(self.text)]
@@ -192,7 +189,7 @@ class SourceFile:
         return self._starts[line - 1] if line <= len(self._starts) else len(self.text)
 
     def indent(self, offset: int) -> str:
-        """Of the line at an offset."""
+        """Indentation of the line at an offset."""
         line = self.line_text(self.line_at(offset))
         return line[: len(line) - len(line.lstrip())]
 
@@ -200,23 +197,23 @@ class SourceFile:
         start, end = self.span(node)
         return self.text[start:end]
 
-    def short(self, node: ast.AST) -> str:
-        """On one line, for a sentence."""
+    def one_line(self, node: ast.AST) -> str:
+        """The code of a node on one line, for messages."""
         line = " ".join(self.code(node).split())
         return line if len(line) <= 60 else line[:57] + "..."
 
-    # --- what is around -----------------------------------------------------------------------------
+    # --- parents and scopes -------------------------------------------------------------------------
 
     def ancestors(self, node: ast.AST) -> Iterator[ast.AST]:
-        """From its parent outwards."""
+        """Enclosing nodes, from its parent outwards."""
         while node in self.parents:
             node = self.parents[node]
             yield node
 
     def scopes(self, node: ast.AST) -> list[Scope]:
-        """What `node` is inside of, innermost first, the module last.
+        """Scopes that contain `node`, innermost first, the module last.
 
-        What stands in the head of a function (defaults, decorators) is not inside of it.
+        Defaults and decorators of a function are not inside its scope.
         """
         found: list[Scope] = []
         inner = node
@@ -228,7 +225,7 @@ class SourceFile:
         return found
 
     def qualname(self, scope: ast.AST) -> str:
-        """Of a class or function, as Python has it; of the code that any other node is in."""
+        """``__qualname__`` of a class or function, or of the one that contains another node."""
         scopes = (
             [scope, *self.scopes(scope)]
             if isinstance(scope, (ast.ClassDef, *FUNCTIONS))
@@ -253,14 +250,14 @@ class SourceFile:
         for change in sorted(replacements, key=lambda change: (change.start, change.end)):
             if change.start < at:
                 raise RefusedEdit("two changes fall on the same place of the file")
-            # The file's own line ends, whatever was composed here.
+            # With the file's own line ends.
             parts += [self.text[at : change.start], plain_line_ends(change.text).replace("\n", newline)]
             at = change.end
         return "".join([*parts, self.text[at:]])
 
     def added_arguments(self, call: ast.Call, texts: Sequence[str]) -> list[Replacement]:
-        """`texts` (``near=0.01``) after the last argument: on lines of their own where the others have that."""
-        start, close = self.inside(call)
+        """Adds `texts` (``near=0.01``) after the last argument, on lines of their own if the others have."""
+        start, close = self.content_span(call)
         items = self.items(call)
         if not texts or not items:
             return [Replacement(close, close, ", ".join(texts))] if texts else []
@@ -278,8 +275,8 @@ class SourceFile:
         return [Replacement(end, end, "".join(f", {text}" for text in texts))]
 
     def added_item(self, node: ast.AST, indent: str, text: Callable[[str], str]) -> list[Replacement]:
-        """`text(indent)` as one more item between the brackets, on lines of its own; `indent` is the statement's."""
-        start, close = self.inside(node)
+        """Adds the item `text(indent)` between the brackets, on lines of its own; `indent` is the statement's."""
+        start, close = self.content_span(node)
         items = self.items(node)
         own = indent + "    "
         if not items:
@@ -295,7 +292,7 @@ class SourceFile:
             return found if comma else [Replacement(end, end, ","), *found]
         found = []
         if one_line:
-            # What stood on one line gets a line each, or the first would share one with the bracket.
+            # Each item gets its own line, else the first would share one with the bracket.
             gaps = [start, *(self.after_comma(item[1]) or item[1] for item in items[:-1])]
             found = [Replacement(gap, item[0], f"\n{own}") for gap, item in zip(gaps, items, strict=True)]
         return [
@@ -304,7 +301,7 @@ class SourceFile:
         ]
 
     def without_item(self, node: ast.AST, index: int) -> Replacement:
-        """One item fewer between the brackets; a line that it has for itself goes with it, and a remark at its end."""
+        """Removes one item between the brackets, with its line and comment if it is alone on the line."""
         items = self.items(node)
         start, end = items[index]
         end = self.after_comma(end) or end
@@ -319,7 +316,7 @@ class SourceFile:
         return Replacement(items[index - 1][1] if index else start, end, "")
 
     def import_place(self) -> int:
-        """Where an import can be added: before all that may use it, behind what has to come before any."""
+        """Offset for a new import: after the docstring and ``__future__`` imports."""
         documented = ast.get_docstring(self.module, clean=False) is not None
         for statement in self.module.body[documented:]:
             if not isinstance(statement, ast.ImportFrom) or statement.module != "__future__":
@@ -329,19 +326,19 @@ class SourceFile:
 
 
 def plain_line_ends(text: str) -> str:
-    """As Python reads it: every line ends with ``\\n``."""
+    """`text` with ``\\n`` as line ends, as Python reads it."""
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def arguments(call: ast.Call, parameters: Sequence[str]) -> dict[str, ast.expr]:
-    """What a call gives, by parameter, but for what comes by ``*`` and ``**``."""
+    """The arguments of a call by parameter, without those of ``*`` and ``**``."""
     first = next((i for i, arg in enumerate(call.args) if isinstance(arg, ast.Starred)), len(call.args))
     given = dict(zip(parameters, call.args[:first], strict=False))
     return given | {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg is not None}
 
 
 def is_starred(call: ast.Call) -> bool:
-    """Whether arguments come by ``*`` or ``**``."""
+    """Whether a call has arguments by ``*`` or ``**``."""
     return any(isinstance(a, ast.Starred) for a in call.args) or any(k.arg is None for k in call.keywords)
 
 
@@ -358,6 +355,6 @@ def walk(node: ast.AST) -> Iterator[ast.AST]:
 
 
 @lru_cache(maxsize=8)
-def parsed(path: str, text: str) -> SourceFile:
-    """A `SourceFile`, which is never changed: edit after edit is one of the same few files."""
+def parse_file(path: str, text: str) -> SourceFile:
+    """A cached `SourceFile`, which is never modified: successive edits are of the same few files."""
     return SourceFile(path, text)

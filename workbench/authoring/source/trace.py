@@ -1,4 +1,4 @@
-"""Where the values of a call that ran stand in the source, as plain data: what a worker tells of its author's files."""
+"""Source positions of the values of a call that ran, as plain data from a worker."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DEGREE = math.pi / 180
 
 @dataclass(frozen=True)
 class Place:
-    """An expression in a text: its first character and the one behind its last, without parentheses around it."""
+    """An expression in a file: offsets of its first character and of its end, without parentheses around it."""
 
     file: str
     start: int
@@ -21,47 +21,47 @@ class Place:
 
 @dataclass(frozen=True)
 class Read:
-    """A name (``EYE``, ``self.eye``, ``EYES[0]``) that was followed to where it gets its value."""
+    """A name (``EYE``, ``self.eye``, ``EYES[0]``) that was followed to the assignment of its value."""
 
     at: Place
     others: str | None
-    """Who else reads it there, in words; None if nobody does."""
+    """Text: the place of another reader of that value; None if there is no other."""
 
 
 if TYPE_CHECKING:
     Plain = float | str | None | tuple["Plain", ...]
-else:  # what reads it off a line knows no type that names itself: numbers, vectors, matrices and lists of these
+else:  # the decoder of messages has no recursive types: numbers, vectors, matrices and lists of these
     _One = float | str | None
     Plain = _One | tuple[_One | tuple[_One | tuple[_One | tuple[_One, ...], ...], ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """An expression that is no name, what it was worth, and what may be changed within it."""
+    """An expression that is not a name, its value in the run, and its parts that may be edited."""
 
     at: Place
     reads: tuple[Read, ...]
-    """The names that were read to come to it, the call's own first."""
+    """The names that lead to it, the call's own first."""
     value: Plain
-    """A pose is its seven numbers: p, then q as wxyz."""
+    """A pose is seven numbers: p, then q as wxyz."""
     function: str = ""
-    """Of a call: what it calls, by the name that `Library` has for it."""
+    """Name (`KnownFunction.name`) of the called function; empty for other expressions."""
     parts: Mapping[str, Part] = field(default_factory=dict)
-    """The elements of what is written as a list, by index; the arguments of a call, by parameter; ``of`` is the number
-    within an expression that may be changed in its place."""
+    """Elements of a list by index; arguments of a call by parameter; ``of``: the number within an expression that may be
+    edited instead of it."""
     slope: float = 1.0
     offset: float = 0.0
-    """value = slope * ``of`` + offset"""
+    """value = slope * `parts["of"].value` + offset"""
     literal: bool = False
-    """Written as nothing but a number, perhaps with a sign, or as a list of its items."""
+    """Written as a plain number, perhaps with a sign, or as a list of its items."""
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All of them, in order."""
+        """All numbers of the value, in order."""
         return tuple(_numbers(self.value))
 
     def walk(self) -> Iterator[Part]:
-        """It and all within it."""
+        """This part and all parts within it."""
         yield self
         for part in self.parts.values():
             yield from part.walk()
@@ -73,11 +73,11 @@ class Trace:
 
     at: Place
     function: str
-    """Qualified name of the code that it is in."""
+    """Qualified name of the function that contains it."""
     parts: Mapping[str, Part]
-    """Those that can be followed."""
+    """Arguments that could be followed."""
     unknown: Mapping[str, str]
-    """Why the others cannot."""
+    """Reasons for the other arguments."""
 
 
 def _numbers(value: Plain) -> Iterator[float]:

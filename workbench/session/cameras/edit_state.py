@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from workbench.authoring.camera_source import members
-from workbench.authoring.camera_source.cameras import Run
-from workbench.authoring.camera_source.disk import SourceEdit, not_writable
+from workbench.authoring.camera_source.cameras import RunHooks
+from workbench.authoring.camera_source.disk import SourceEdit, why_not_writable
 from workbench.authoring.camera_source.hooks import HOOK_OF, snippet
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.loading.copy_task import CannotCopy, copy_task
@@ -49,7 +49,7 @@ def said(wish: Wish, when: int, file: str = "") -> str:
     return SENTENCES[wish.what][when].format(old=wish.key[1], new=wish.result[1], file=file)
 
 
-def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -> Writing:
+def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: RunHooks) -> Writing:
     """The edit that fulfils a wish, or why there is none.
 
     Args:
@@ -72,7 +72,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
             )
         else:
             edit = _made(task, texts, info, wish, run)
-        blocked = next(filter(None, (not_writable(change.file) for change in edit.changes)), None)
+        blocked = next(filter(None, (why_not_writable(change.file) for change in edit.changes)), None)
         if blocked is not None:
             raise RefusedEdit(blocked, text)
     except RefusedEdit as refused:
@@ -103,7 +103,7 @@ def _is_a_robots(info: CameraInfo) -> bool:
 
 
 def _made_of_a_parents(
-    task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str, run: Run
+    task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str, run: RunHooks
 ) -> SourceEdit:
     """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
     if wish.settings is None or wish.what == "remove":
@@ -130,7 +130,7 @@ def _could_be_copied(task: TaskDescription) -> bool:
     """Whether the task's file is one that is not to be edited, and is all that the task is made of."""
     if task.file is None or len(task.source_files) > 1:
         return False
-    return not task.source_files or not_writable(task.file) is not None
+    return not task.source_files or why_not_writable(task.file) is not None
 
 
 def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
@@ -147,7 +147,7 @@ def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
 
 
 def _made(
-    task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish, run: Run
+    task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish, run: RunHooks
 ) -> SourceEdit:
     kind, uid = wish.key
     if wish.what == "add":

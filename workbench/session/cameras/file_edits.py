@@ -15,7 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.camera_source.disk import SourceEdit, apply, revert
 from workbench.authoring.source.text import RefusedEdit, plain_line_ends
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
@@ -123,7 +123,7 @@ class StudioFile:
                     self.view = replace(self.view, picture=picture)
         self._note()
 
-    def _run(self, texts: Mapping[str, str]) -> Ran:
+    def _run(self, texts: Mapping[str, str]) -> HookCameras:
         stopped = self._stopped = threading.Event()
         load, deadline = self._load(), time.monotonic() + self._patience
         if load is None or self._closing:

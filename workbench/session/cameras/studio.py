@@ -220,7 +220,7 @@ class CameraStudio:
             labels = ", ".join(pose.label for pose in chosen)
             raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
         pose = calibration_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
-        if chosen[0].said is not None and info.mount is not None:
+        if chosen[0].stated is not None and info.mount is not None:
             if mount is None:
                 raise ValueError(f"where {info.mount} is, on which {info.name} rides, is not known yet")
             pose = relative_to(mount, pose)  # ours is of the env's frame

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture
@@ -68,7 +68,7 @@ class SuggestCameras(Question[tuple[OfferedPlacement, ...]]):
 
 
 @dataclass(frozen=True)
-class RunCameras(Question[Ran]):
+class RunCameras(Question[HookCameras]):
     """Run the camera hooks with other texts of the author's files."""
 
     task: TaskName

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.camera_source.run_hooks import run_hooks
 from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
 from workbench.authoring.loading.reference import reference_to_class
@@ -114,13 +114,13 @@ def _measured(opened: OpenedTask, question: MeasureCamera) -> CameraReport:
 # --- the hooks of another text ---------------------------------------------------------------------
 
 
-def run_cameras(opened: OpenedTask, question: RunCameras) -> Ran:
+def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
     """The hooks are called on the live env, which is given the new text's classes meanwhile.
 
     Raises:
         TaskError: the text does not load, or a hook fails.
     """
-    file, env, found = opened.loaded.file, opened.env.env, list[Ran]()
+    file, env, found = opened.loaded.file, opened.env.env, list[HookCameras]()
     if file is None:
         raise ValueError("the task has no file")
     loaded = load_task(reference_to_class(question.task, file, opened.loaded.chosen), source=question.texts)
