@@ -43,7 +43,7 @@ ENOUGH = 85
 PROTECTED = {
     "recording/writing/journal": "recording/writing/test_journal.py",
     "recording/reader/episode_wire": "recording/episode/test_episode_wire.py",
-    "recording/writing/recover": "recording/writing/test_recover.py",
+    "recording/writing/finish": "recording/writing/test_recover.py recording/writing/test_finish.py",
     "recording/library/trash": "recording/library/test_trash.py",
     "recording/episode/document": "recording/episode/test_document.py recording/episode/test_checksums.py",
     "recording/reader/reading": "recording/reader/test_sources.py",

@@ -30,7 +30,6 @@ SHORT_FOR_A_REASON = {
     "machine/processes/current_folder": "whatever calls a task's code holds the folder by it",
     "machine/processes/own_path": "it is imported before anything else, so that nothing else is imported from the wrong place",
     "machine/web_assets": "it says where the page's files lie, to parts that may not import each other",
-    "recording/episode/source": "what lies below the readers names a recording by it",
 }
 """Modules below `FEWEST_LINES` lines, each with why it stays apart."""
 

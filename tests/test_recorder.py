@@ -19,7 +19,7 @@ import workbench
 from tests.drive.envs import CPU
 from workbench.recording.episode.episode import NO_SEED, Episode
 from workbench.recording.reader.read_episode import read_episode, read_maniskill, trajectories
-from workbench.recording.writing.recover import recover
+from workbench.recording.writing.finish import recover
 
 TASKS = Path(__file__).parents[1] / "tasks"
 

@@ -21,7 +21,7 @@ from tests.drive.waiting import until
 from tests.golden.make import GOLDEN
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import sources_among
+from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances
 from workbench.session.rescore.recordings import Rescorer
 from workbench.ui.share.make import MakeRequest, Making
@@ -63,7 +63,7 @@ class Rescoring:
     process = "the process in the background"
 
     def __init__(self, place: Path) -> None:
-        self._files = sources_among((place / "v1",))
+        self._files = find_all_sources((place / "v1",))
         self._rescorer = Rescorer(Clearances(all_trusted=True))
 
     def start(self) -> None:
@@ -90,7 +90,7 @@ class Filming:
     process = "a process that makes it"
 
     def __init__(self, place: Path) -> None:
-        self._wanted = MakeRequest("film", sources_among([place / "v1"]), place / "films", "eye")
+        self._wanted = MakeRequest("film", find_all_sources([place / "v1"]), place / "films", "eye")
         self._making = Making()
 
     def start(self) -> None:

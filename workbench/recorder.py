@@ -45,11 +45,11 @@ from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpis
 from workbench.jobs.open_task import describe
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.recording.episode.episode import NO_SEED
-from workbench.recording.reader.reading import recovered_in_words
+from workbench.recording.reader.reading import recovered_text
 from workbench.recording.writing.episode_writer import EpisodeFiles
+from workbench.recording.writing.finish import recover
 from workbench.recording.writing.journal import before_writing
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.recover import recover
 
 logger = logging.getLogger(__name__)
 _MOST_HELD = 2048
@@ -111,7 +111,7 @@ class Recorder(gym.Wrapper):
         self._acted_by = acted_by
         if self._folder.is_dir():
             mended = [str(files.rrd) for files in recover(self._folder)]
-            if said := recovered_in_words(mended):
+            if said := recovered_text(mended):
                 logger.warning("%s", said)
         self._task = TaskEnv(base)
         self._finisher = EpisodeFinisher()

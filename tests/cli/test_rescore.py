@@ -10,7 +10,7 @@ from rich.console import Console
 
 from workbench.cli.rescore import print_verdicts
 from workbench.jobs.verdict import Verdict
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 
 NAME = "WorkbenchPushCube-v1_seed626610453_env00_2026-11-22T01-07-22"
 VERDICTS = [

@@ -18,7 +18,7 @@ from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.writing.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
 from workbench.recording.writing.from_journal import Header, read_header
-from workbench.recording.writing.journal import Entry, Journal, JournalReader, read_visuals
+from workbench.recording.writing.journal import Journal, JournalEntry, JournalReader, read_visuals
 
 BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
 
@@ -92,7 +92,7 @@ def header_of(journal: Path) -> Header:
     return header
 
 
-def entries_of(journal: Path) -> list[Entry]:
+def entries_of(journal: Path) -> list[JournalEntry]:
     """All that can be read of it."""
     with contextlib.closing(JournalReader(journal)) as reader:
         return [entry for _, entries in reader for entry in entries]

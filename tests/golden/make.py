@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from workbench.recording.episode.episode import Episode
 from workbench.recording.library.library import Library
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import mend
+from workbench.recording.reader.reading import recover_confined
 
 GOLDEN = Path(__file__).parent
 PLACE = Path("/tmp/golden")
@@ -114,7 +114,7 @@ def main() -> None:
     damage(made / "damaged")
     kill_while_recording(made / "unfinished")
     shutil.copytree(made / "unfinished", made / "recovered")
-    assert len(mend(made / "recovered")) == 1
+    assert len(recover_confined(made / "recovered")) == 1
     for kind in ("cameras", "several", "tagged", "recovered"):
         expected[kind] = read_folder(made / kind)
     (made / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")

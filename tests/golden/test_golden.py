@@ -19,7 +19,7 @@ from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.cli.main import main
 from workbench.cli.terminal import Exit
 from workbench.jobs.from_recording import run_of
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
@@ -111,7 +111,7 @@ def test_of_a_damaged_one_the_file_is_named_and_the_rest_is_read(
         (turned, ".h5", ("env_states/",)),
     ):
         episode = read_episode(path)
-        assert [unread.file for unread in episode.unread] == [f"{path.stem}{broken}"]
+        assert [broken_files.file for broken_files in episode.broken_files] == [f"{path.stem}{broken}"]
         columns = whole[path.stem]["columns"]
         left = {name: digest for name, digest in columns.items() if not name.startswith(lost)}
         assert len(left) < len(columns) and expected_of(episode)["columns"] == left

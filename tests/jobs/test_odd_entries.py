@@ -95,7 +95,7 @@ def test_it_is_recorded_and_read_back(recordings: Path) -> None:
         verify_rrd(path.with_suffix(".rrd"))
         episode = read_episode(path)
         check_recorded(episode, episode.info.env_index)
-        assert episode.unread == ()
+        assert episode.broken_files == ()
 
 
 def test_an_rrd_alone_says_the_same(recordings: Path, tmp_path: Path) -> None:

@@ -29,10 +29,10 @@ from workbench.jobs.from_recording import run_of
 from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.replay import arrive
 from workbench.jobs.task import TaskOptions
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
 from workbench.recording.reader.read_episode import read_episode, read_maniskill
-from workbench.recording.reader.reading import sources_among
+from workbench.recording.reader.reading import find_all_sources
 from workbench.session.rescore import verdict_text as words
 from workbench.session.rescore.recordings import Rescorer
 
@@ -134,7 +134,7 @@ def test_another_file_can_be_judged_with(author: Path, tmp_path: Path) -> None:
 
 
 def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
-    found = sources_among((foreign,))
+    found = find_all_sources((foreign,))
     assert [source.part for source in found] == ["traj_0", "traj_1"]
     for use_env_states in (False, True):
         verdicts, _ = rescore_all(RescoreOptions((foreign.parent,), use_env_states=use_env_states))
@@ -172,19 +172,19 @@ def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
 
 def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nothing at"):
-        sources_among((tmp_path / "gone",))
+        find_all_sources((tmp_path / "gone",))
     with pytest.raises(UnreadableRecording, match="no recording in"):
-        sources_among((tmp_path,))
+        find_all_sources((tmp_path,))
     (tmp_path / "x.json").write_text("{}")
     with pytest.raises(UnreadableRecording, match="no recording in"):
-        sources_among((tmp_path / "x.json",))
+        find_all_sources((tmp_path / "x.json",))
 
 
 def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
     write(tmp_path / "made", made(6, seed=1), pictures=False)
     dataset = tmp_path / "set"
     assert export_in_terminal([tmp_path / "made"], dataset, ExportOptions()) == 0
-    assert {source.kind for source in sources_among([dataset])} == {"lerobot"}
+    assert {source.kind for source in find_all_sources([dataset])} == {"lerobot"}
     with pytest.raises(UnreadableRecording, match="LeRobot dataset cannot be judged again"):
         rescore_all(RescoreOptions((dataset,)))
     verdicts, _ = rescore_all(RescoreOptions((dataset, author / "recordings")))
@@ -261,26 +261,26 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
     rescorer = Rescorer()
     try:
         edit(author, REWARD, f"{REWARD} * 2")
-        rescorer.start(sources_among((author / "recordings",)))
+        rescorer.start(find_all_sources((author / "recordings",)))
         view = rescored(rescorer, "done", "failed")
         assert view.why == "" and len(view.verdicts) == view.total == EPISODES
         assert view.steps == EPISODES * STEPS and all(verdict.differs for verdict in view.verdicts)
         assert words.summary(view.verdicts).startswith("3 of 3 episodes differ")
 
         edit(author, REWARD, "return 1 / 0")
-        rescorer.start(sources_among((author / "recordings",)))
+        rescorer.start(find_all_sources((author / "recordings",)))
         view = rescored(rescorer, "failed", "done")
         assert "could not be opened" in view.why and "ZeroDivisionError" in view.problem.message
-        rescorer.start(sources_among((author / "recordings", foreign)))
+        rescorer.start(find_all_sources((author / "recordings", foreign)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done"
         assert ["ZeroDivisionError" in v.why_not for v in view.verdicts] == [True] * EPISODES + [False] * 2
-        rescorer.start(sources_among((author / "recordings",)), recorded_source=True)
+        rescorer.start(find_all_sources((author / "recordings",)), recorded_source=True)
         view = rescored(rescorer, "done", "failed")
         assert view.why == "" and not any(verdict.differs for verdict in view.verdicts)
 
         edit(author, REWARD, "import time; time.sleep(1000)")
-        rescorer.start(sources_among((author / "recordings",)))
+        rescorer.start(find_all_sources((author / "recordings",)))
         rescored(rescorer, "loading")
         rescorer.rescoring.stop()
         rescored(rescorer, "stopped")

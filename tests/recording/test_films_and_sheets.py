@@ -24,9 +24,9 @@ from workbench.recording.films import (
     cameras_by_name,
     chosen_states,
     contact_sheet,
+    default_eye,
     enlarged,
     frames,
-    usual_eye,
     write_mp4,
 )
 from workbench.recording.reader.read_episode import read_episode
@@ -168,7 +168,7 @@ def test_an_eye_looks_where_it_is_told(eye: Eye) -> None:
 
 
 def test_the_usual_eye_has_in_view_what_moves(episode: Episode) -> None:
-    eye = usual_eye(replace(episode, cameras=[]))
+    eye = default_eye(replace(episode, cameras=[]))
     assert episode.poses is not None
     to = episode.poses[:, :, :3].reshape(-1, 3) - np.array(eye.position)
     ahead = np.subtract(eye.look_at, eye.position)

@@ -21,12 +21,12 @@ from workbench.authoring.loading.trust import STORE_FILE, TrustStore
 from workbench.jobs.from_recording import recorded_source, reference_of
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.user_folder import user_folder
+from workbench.recording.episode.document import write_into_description
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.made_here import KEY_FILE, MadeHere, made_here
-from workbench.recording.episode.source import UnreadableRecording
-from workbench.recording.episode.tags import write_into_description
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.recover import recover
+from workbench.recording.writing.finish import recover
 from workbench.session.clearance import Clearances, CodeToRun, Consent, NotCleared, Since, TrustQuestion
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 

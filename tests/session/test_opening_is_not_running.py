@@ -28,7 +28,7 @@ from workbench.cli.terminal import Exit
 from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.library.library import Library
-from workbench.recording.reader.reading import sources_among
+from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances, Consent, NotTrusted, TrustQuestion
 from workbench.session.protocol.questions import MakeScene
 from workbench.session.rescore.recordings import Rescorer
@@ -251,10 +251,10 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
     (foreign / "numpy.py").write_text("A = 1\n")
     rescorer = Rescorer(Clearances(ask=ask))
     try:
-        rescorer.start(sources_among((foreign / "recordings",)))
+        rescorer.start(find_all_sources((foreign / "recordings",)))
         view = rescored(rescorer, "failed")
         assert "is not trusted" in view.why and not ran(foreign)
-        rescorer.start(sources_among((foreign / "recordings",)))
+        rescorer.start(find_all_sources((foreign / "recordings",)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view
         (said,) = view.warnings
@@ -276,7 +276,7 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
 
     rescorer = Rescorer(Clearances(ask=ask))
     try:
-        rescorer.start(sources_among((foreign / "recordings",)))
+        rescorer.start(find_all_sources((foreign / "recordings",)))
         until(lambda: asking, "the question")
         assert rescorer.rescoring.view.state == "asking"
         rescorer.rescoring.stop()

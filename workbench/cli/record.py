@@ -16,7 +16,7 @@ from workbench.cli.terminal import err, print_finding, print_problem, progress_b
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, record, with_given_actions
-from workbench.recording.reader.reading import mend
+from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 from workbench.session.rescore.recordings import hidden_in_words
 
@@ -61,7 +61,7 @@ def record_in_terminal(what: RecordOptions) -> int:
     try:
         try_folder(what.out)
         asked, _ = with_given_actions(what)
-        if mended := mend(what.out):
+        if mended := recover_confined(what.out):
             err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
         for notice in hidden_in_words(what.task):
             warn(notice)

@@ -29,8 +29,8 @@ from workbench.jobs.verdict import Verdict
 from workbench.machine.files import replace_file
 from workbench.machine.processes.current_folder import CurrentFolder
 from workbench.machine.text import plain_text
-from workbench.recording.episode.source import Source, UnreadableRecording
-from workbench.recording.reader.reading import sources_among
+from workbench.recording.episode.row import Source, UnreadableRecording
+from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.rescore import verdict_text as words
 from workbench.session.rescore.recordings import (
@@ -78,7 +78,7 @@ def rescore_all(
     """
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     here = CurrentFolder()
-    files = [s for s in sources_among([place.absolute() for place in what.places]) if s.kind != "lerobot"]
+    files = [s for s in find_all_sources([place.absolute() for place in what.places]) if s.kind != "lerobot"]
     if not files:
         raise UnreadableRecording(
             f"A LeRobot dataset cannot be judged again: {', '.join(map(str, what.places))}."

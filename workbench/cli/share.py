@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.progress import TimeRemainingColumn
 
 from workbench.cli.terminal import progress_bar, refuse, say
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 from workbench.recording.lerobot.export import DoesNotFit, ExportOptions
-from workbench.recording.reader.reading import sources_among
+from workbench.recording.reader.reading import find_all_sources
 from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, make
 
 SCENE, CAMERAS = "scene", "cameras"
@@ -50,7 +50,7 @@ def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptio
 
 def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
     try:
-        wanted = wanted_of(sources_among(files))
+        wanted = wanted_of(find_all_sources(files))
     except (OSError, ValueError) as error:
         return refuse(str(error))
     made: list[Made] = []

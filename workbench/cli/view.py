@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from workbench.cli.terminal import refuse, say, say_addresses, warn
-from workbench.recording.rerun.viewer import has_screen, open_window, recordings_among, web_viewer_folder
+from workbench.recording.rerun.viewer import has_screen, open_window, resolve_recordings, web_viewer_folder
 
 
 def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
     """Show them until the window is closed or Ctrl-C comes; returns the exit code."""
     try:
         if web or not has_screen(os.environ):
-            return _in_page(recordings_among(files), host, port)
+            return _in_page(resolve_recordings(files), host, port)
         viewer = open_window(files)
     except (OSError, ValueError, RuntimeError) as error:
         return refuse(str(error))

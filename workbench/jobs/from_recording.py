@@ -33,7 +33,7 @@ from workbench.authoring.reload.call_graph import TwoVersions
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN, RecordedRun
 from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.recording.episode.episode import Episode, EpisodeInfo
-from workbench.recording.episode.side_files import folder_of, place_of
+from workbench.recording.episode.side_files import folder_of, side_file_path
 
 
 class NoText(ValueError):
@@ -272,7 +272,7 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
     for name in info.side_files:
         if name.endswith(_IMPORTED):
             continue  # it could be imported, and is none of the texts that were agreed to
-        there, here = place_of(folder_of(info.source_file), name), place_of(folder, name)
+        there, here = side_file_path(folder_of(info.source_file), name), side_file_path(folder, name)
         if there is not None and here is not None and there.is_file() and not here.exists():
             here.parent.mkdir(parents=True, exist_ok=True)
             here.symlink_to(there)

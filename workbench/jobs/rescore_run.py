@@ -26,7 +26,7 @@ from workbench.jobs.open_task import OpenedTask, blamed, step_checked
 from workbench.jobs.replay import begin_again, put_there, why_not_replayed
 from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, single_numbers
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.source import Source, UnreadableRecording
+from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_source
 
 _TELL_EVERY = 0.2
@@ -164,9 +164,9 @@ def _ready(
     elif use_env_states and not run.env_states:
         why_not = "it holds no env states"
     if why_not:
-        why_not = ". ".join((why_not, *(broken.sentence for broken in episode.unread)))
+        why_not = ". ".join((why_not, *(broken.sentence for broken in episode.broken_files)))
         return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
-    return _Seat(file, info.task, run, {broken.file: broken.what for broken in episode.unread})
+    return _Seat(file, info.task, run, {broken.file: broken.what for broken in episode.broken_files})
 
 
 def _begin(opened: OpenedTask, seats: dict[int, _Seat]) -> None:

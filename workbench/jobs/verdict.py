@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
 from workbench.machine.processes.wire import Question
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
 """Numbers that differ by no more than this share of the largest recorded one, or by no more than this, are the same."""

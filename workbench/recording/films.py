@@ -38,7 +38,7 @@ from workbench.core.cameras.conventions import quaternion_from_axes, quaternion_
 from workbench.machine.files import new_file, open_regular_file
 from workbench.recording.episode.encoded_pictures import MOST_PIXELS, encode_jpeg
 from workbench.recording.episode.episode import CameraTrack, Episode, box_of_moving, camera_names
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 29
@@ -113,12 +113,12 @@ class FilmWriter:
         # Half resolution of colour is what all players have; it needs an even size.
         command += ["yuv444p" if odd and encoding.exact_size else "yuv420p", "-movflags", "+faststart"]
         command += [] if encoding.key_every is None else ["-g", str(encoding.key_every), "-bf", "0"]
-        self._said = tempfile.TemporaryFile()
+        self._stderr = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             [*command, "-f", "mp4", str(path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            stderr=self._said,
+            stderr=self._stderr,
             # Ctrl-C is for us; ffmpeg would end the file as if all were well.
             start_new_session=True,
         )
@@ -149,7 +149,7 @@ class FilmWriter:
 
     def close(self, abandoned: bool = False) -> None:
         """Finish the file; one that is `abandoned` is left as it is. Can be called twice."""
-        if self._said.closed:
+        if self._stderr.closed:
             return
         assert self._process.stdin is not None
         try:
@@ -162,11 +162,11 @@ class FilmWriter:
             if self._process.wait() and not abandoned:
                 raise self._error()
         finally:
-            self._said.close()
+            self._stderr.close()
 
     def _error(self) -> OSError:
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
         # Its last line names the temporary file; the reason stands at the end.
         reason = lines[-1].rpartition(": ")[2] if lines else f"ffmpeg ended with {self._process.returncode}"
         return OSError(f"The film could not be written: {reason}.")
@@ -225,8 +225,8 @@ def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uin
     command += ["-ss", f"{begin:.6f}", "-i", f"file:{film}", "-map", "0:v:0", "-frames:v", str(count)]
     command += ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
     # In memory: who reads recordings of others writes no files.
-    with os.fdopen(os.memfd_create("ffmpeg"), "w+b") as said:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said)
+    with os.fdopen(os.memfd_create("ffmpeg"), "w+b") as stderr:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr)
         late = threading.Timer(MOST_SECONDS, process.kill)
         late.start()
         try:
@@ -235,7 +235,7 @@ def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uin
             while (frame := _read_ppm(process.stdout)) is not None:
                 yield frame
             if (status := process.wait()) != 0:
-                raise OSError(_why(said, status))
+                raise OSError(_failure(stderr, status))
         finally:
             late.cancel()
             process.kill()
@@ -260,11 +260,11 @@ def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
     return np.frombuffer(content, np.uint8).reshape(height, width, 3)
 
 
-def _why(said: BinaryIO, status: int) -> str:
+def _failure(stderr: BinaryIO, status: int) -> str:
     if status < 0:
         return f"ffmpeg was ended by signal {-status}, after {MOST_SECONDS:.0f} s at most"
-    said.seek(0)
-    lines = said.read(4096).decode(errors="replace").strip().splitlines()
+    stderr.seek(0)
+    lines = stderr.read(4096).decode(errors="replace").strip().splitlines()
     return lines[-1][:200] if lines else f"ffmpeg ended with {status}"
 
 
@@ -365,13 +365,13 @@ def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
             # Small pictures keep their pixels; large ones are averaged.
             how = Image.Resampling.NEAREST if picture.height < height else Image.Resampling.LANCZOS
             sheet.paste(picture.resize((width, height), how), (left, top))
-            said = f"step {state}   {state * episode.info.control_dt:.2f} s"
+            label = f"step {state}   {state * episode.info.control_dt:.2f} s"
             colour = PALE
             if state == first_success:
-                said, colour = said + "   success", GOOD
+                label, colour = label + "   success", GOOD
             elif state == _first(episode, "fail"):
-                said, colour = said + "   fail", BAD
-            draw.text((left, top + height + 2), said, fill=colour, font=small)
+                label, colour = label + "   fail", BAD
+            draw.text((left, top + height + 2), label, fill=colour, font=small)
         top += height + CAPTION + GAP
     return sheet
 
@@ -433,7 +433,7 @@ class Eye:
         return np.concatenate([self.position, quaternion]).astype(np.float32)
 
 
-def usual_eye(episode: Episode) -> Eye:
+def default_eye(episode: Episode) -> Eye:
     """The recorded human-render camera's where there is one, else one that has all that moves in view."""
     for camera in episode.cameras:
         if camera.info.kind == "human" and len(camera.pose):
@@ -460,7 +460,7 @@ def scene_frames(episode: Episode, eye: Eye | None = None) -> Iterator[NDArray[n
 
     if episode.geometry is None or episode.poses is None:
         raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to film.")
-    eye = eye or usual_eye(episode)
+    eye = eye or default_eye(episode)
     # A recording that was read holds its env alone, as env 0 of 1; one in memory may still hold the batch.
     env = 0 if episode.geometry.num_envs == 1 else episode.info.env_index
     scene = RecordedScene(episode.geometry, env, *SIZE, eye.fovy)

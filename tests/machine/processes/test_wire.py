@@ -24,7 +24,7 @@ from workbench.jobs.pool import Answer
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.jobs.verdict import Rescore
 from workbench.machine.processes.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 from workbench.session.protocol.messages import Event, Load, Loaded, LoadFailed, Loading, Status
 from workbench.session.protocol.questions import QUESTIONS
 

@@ -12,9 +12,8 @@ import pytest
 import xxhash
 
 from tests.drive.episodes import Made
-from workbench.recording.episode.document import Checksum, check, checksum
-from workbench.recording.episode.source import UnreadableRecording
-from workbench.recording.episode.tags import write_into_description
+from workbench.recording.episode.document import Checksum, check, checksum, write_into_description
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.scan import scan_folder
@@ -48,7 +47,7 @@ def test_any_changed_byte_is_said_and_the_other_file_is_read(
     for at in [0, size - 1, *(chance.randrange(size) for _ in range(30))]:
         flip(file, at)
         found = read_episode(path)
-        (said,) = found.unread
+        (said,) = found.broken_files
         assert said.sentence.startswith(
             f"{file.name} was cut short or changed (its checksum is not the one"
         ), at
@@ -56,7 +55,7 @@ def test_any_changed_byte_is_said_and_the_other_file_is_read(
         assert (found.env_states == {}) == (suffix == ".h5")
         np.testing.assert_array_equal(found.action, episode.action)
         flip(file, at)
-    assert read_episode(path).unread == ()
+    assert read_episode(path).broken_files == ()
 
 
 def test_where_both_are_changed_there_is_no_recording(episode: Made, tmp_path: Path) -> None:
@@ -70,11 +69,11 @@ def test_where_both_are_changed_there_is_no_recording(episode: Made, tmp_path: P
 def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, tmp_path: Path) -> None:
     files = episode.write(tmp_path)
     write_into_description(files.json, ("good",), "a note")
-    assert read_episode(files.json).unread == ()
+    assert read_episode(files.json).broken_files == ()
     with files.rrd.open("ab") as file:
         file.write(b" ")
     size = files.rrd.stat().st_size
-    assert f"it has {size} bytes, and had {size - 1}" in read_episode(files.json).unread[0].what
+    assert f"it has {size} bytes, and had {size - 1}" in read_episode(files.json).broken_files[0].what
     (row,) = scan_folder(tmp_path).found.values()
     ((facts, _),) = read_found(tmp_path, row)
     assert facts.problem is not None and f"{files.rrd.name} was cut short or changed" in facts.problem
@@ -83,7 +82,7 @@ def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, t
     said = json.loads(files.json.read_bytes())
     del said["workbench"]["files"][".h5"]
     files.json.write_text(json.dumps(said))
-    assert read_episode(files.json).unread == ()
+    assert read_episode(files.json).broken_files == ()
 
 
 @pytest.mark.parametrize("size", [0, 1, 1 << 20, (1 << 20) + 1, 3_000_000])

@@ -18,13 +18,13 @@ from workbench.core.camera_data import CameraInfo
 from workbench.recording.episode import document
 from workbench.recording.episode.document import (
     MOST_PARTS,
-    CameraWords,
+    CameraJson,
     Checksum,
     Document,
-    EpisodeWords,
-    ResetWords,
-    SceneWords,
-    SealWords,
+    EpisodeJson,
+    ResetJson,
+    SceneJson,
+    SealJson,
     WrongDocument,
     as_json,
     check,
@@ -49,7 +49,7 @@ def why(document: Document) -> str:
 
 
 @pytest.mark.parametrize(
-    ("content", "is_ours", "is_maniskills"),
+    ("content", "is_ours", "is_maniskill"),
     [
         ('{"workbench": {}, "episodes": []}', True, True),
         ('{"workbench": [], "episodes": {}}', False, False),
@@ -59,11 +59,11 @@ def why(document: Document) -> str:
     ],
 )
 def test_whose_it_is_is_told_by_its_keys(
-    tmp_path: Path, content: str, is_ours: bool, is_maniskills: bool
+    tmp_path: Path, content: str, is_ours: bool, is_maniskill: bool
 ) -> None:
     (tmp_path / "a.json").write_text(content)
     document = read_document(tmp_path / "a.json")
-    assert (document.is_ours, document.is_maniskills) == (is_ours, is_maniskills)
+    assert (document.is_ours, document.is_maniskill) == (is_ours, is_maniskill)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_the_tasks_own_file_is_looked_for_from_the_recordings_folder(tmp_path: P
 
 
 def test_what_an_rrd_says_of_itself_is_completed_by_the_texts_beside_it(tmp_path: Path) -> None:
-    described = dict(said(tmp_path).said["workbench"])
+    described = dict(said(tmp_path).data["workbench"])
     del described["source"]
     assert description_in(json.dumps(described), {"a.py": "x"}).source == {"a.py": "x"}
     with pytest.raises(WrongDocument, match=r"expected `array`, got `int` at \$\.cameras$"):
@@ -142,7 +142,7 @@ def test_what_an_rrd_says_of_itself_is_completed_by_the_texts_beside_it(tmp_path
 )
 def test_a_seed_of_maniskills_is_where_it_is_said(words: dict[str, Any], seed: int | None) -> None:
     document = Document({"episodes": [{"episode_id": 1}, {"episode_id": 4, **words}]})
-    assert document.episode(0) == EpisodeWords(1)
+    assert document.episode(0) == EpisodeJson(1)
     assert (document.episode(1).episode_id, document.episode(1).seed) == (4, seed)
 
 
@@ -192,14 +192,14 @@ def test_words_are_written_under_their_names_and_what_is_not_said_is_not_written
     fields = fields_of(said(tmp_path, note="mine").description())
     assert {"return", "note", "thumbnail"} <= fields.keys()
     assert not {"total_reward", "tags", "files", "made_here", "source_path"} & fields.keys()
-    words = {"seal": SealWords("c", "p"), "at": tmp_path, "sum": float("inf")}
+    words = {"seal": SealJson("c", "p"), "at": tmp_path, "sum": float("inf")}
     assert as_json(words) == {
         "seal": {"content": "c", "place": "p"},
         "at": str(tmp_path),
         "sum": float("inf"),
     }
-    assert json_text([ResetWords(1)]) == '[{"seed": 1, "options": null}]'
-    assert json_text({"a": SceneWords((), (), ())}, indent=1).splitlines()[:3] == [
+    assert json_text([ResetJson(1)]) == '[{"seed": 1, "options": null}]'
+    assert json_text({"a": SceneJson((), (), ())}, indent=1).splitlines()[:3] == [
         "{",
         ' "a": {',
         '  "body_names": [],',
@@ -215,7 +215,7 @@ def test_a_camera_comes_back_from_its_words() -> None:
         mount="panda/hand",
         intrinsic=np.arange(9, dtype=np.float32).reshape(3, 3),
     )
-    words = CameraWords.of(info)
+    words = CameraJson.of(info)
     assert as_json(words) == {
         "name": "hand",
         "kind": "human",

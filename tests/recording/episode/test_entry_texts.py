@@ -32,7 +32,7 @@ from workbench.recording.episode.columns import (
 from workbench.recording.episode.document import as_json
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.episode_writer import EpisodeFiles
-from workbench.recording.writing.recover import recover
+from workbench.recording.writing.finish import recover
 
 Maker = Callable[..., Made]
 Others = Mapping[str, OtherEntry]
@@ -57,7 +57,7 @@ def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -
 def test_a_line_is_written_where_a_text_changes() -> None:
     writer = TextWriter()
     states: list[Others] = [{}, {"a": said("x")}, {"a": said("x")}, {"a": said("y"), "b": said("z")}, {}]
-    lines = [writer.news(state, others) for state, others in enumerate(states)]
+    lines = [writer.changes(state, others) for state, others in enumerate(states)]
     assert [len(found) for found in lines] == [0, 1, 0, 2, 2]
     tracks = tracks_of([line for found in lines for line in found])
     x, y, z = (TextEntry("str", text, False, True) for text in "xyz")
@@ -76,7 +76,7 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
     lines = [
         line
         for state in range(5000)
-        for line in writer.news(state, {"clock": said(f"{state:050}"), "a": said("x")})
+        for line in writer.changes(state, {"clock": said(f"{state:050}"), "a": said("x")})
     ]
     assert sum(len(line[1]) for line in lines) < MOST_BYTES + 400
     tracks = tracks_of(lines)

@@ -16,8 +16,14 @@ from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedSha
 from workbench.machine.processes.wire import Unpacker, pack_message
 from workbench.recording.episode.columns import MOST_LINES, TextEntry
 from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality, encode
-from workbench.recording.episode.episode import CameraTrack, Episode, EpisodeInfo, Unread
-from workbench.recording.reader.episode_wire import Garbled, KnownShapes, SentShapes, packed, unpacked
+from workbench.recording.episode.episode import BrokenFile, CameraTrack, Episode, EpisodeInfo
+from workbench.recording.reader.episode_wire import (
+    InvalidEpisode,
+    KnownShapes,
+    SentShapes,
+    pack_episode,
+    unpack_episode,
+)
 from workbench.recording.reader.requests import EpisodeRead, PictureRead, RowsRead
 
 T, B = 3, 2
@@ -57,7 +63,7 @@ def an_episode() -> Episode:
         {"": np.ones((T + 1, 5))},
         {"mean": np.ones(T + 1)},
         {"phase": ((0, TextEntry("str", "reach", False, True)), (2, None))},
-        (Unread("a.h5", "is broken."),),
+        (BrokenFile("a.h5", "is broken."),),
     )
 
 
@@ -71,17 +77,17 @@ def fetched(camera: int, modality: Modality, index: int, encoded: bool) -> Pictu
 
 
 def here(read: EpisodeRead, known: dict | None = None, shapes: SharedShapes | None = None) -> Episode:
-    return unpacked(crossed(read), fetched, 1, shapes or SharedShapes(), {} if known is None else known)
+    return unpack_episode(crossed(read), fetched, 1, shapes or SharedShapes(), {} if known is None else known)
 
 
 def test_it_is_the_same_on_the_other_side() -> None:
     there = an_episode()
-    episode = here(packed(there, None, 1, SentShapes()))
+    episode = here(pack_episode(there, None, 1, SentShapes()))
     assert episode.info == there.info and episode.segmentation == there.segmentation
-    assert (episode.action_names, episode.texts, episode.unread) == (
+    assert (episode.action_names, episode.texts, episode.broken_files) == (
         there.action_names,
         there.texts,
-        there.unread,
+        there.broken_files,
     )
     for name in ("poses", "action", "reward", "terminated", "truncated"):
         np.testing.assert_array_equal(getattr(episode, name), getattr(there, name), strict=True)
@@ -105,12 +111,12 @@ def test_it_is_the_same_on_the_other_side() -> None:
 
 def test_a_shape_crosses_once_for_all_episodes_that_share_it() -> None:
     sent, shapes, (_, known) = SentShapes(), SharedShapes(), KnownShapes().of(SharedShapes())
-    one, other = (packed(an_episode(), None, number, sent) for number in (1, 2))
+    one, other = (pack_episode(an_episode(), None, number, sent) for number in (1, 2))
     assert (len(one.shapes), len(other.shapes)) == (1, 0)
     first, second = (here(read, known, shapes).geometry for read in (one, other))
     assert first is not None and second is not None
     assert first.visuals[0].mesh is second.visuals[0].mesh
-    with pytest.raises(Garbled, match="a visual without a shape"):
+    with pytest.raises(InvalidEpisode, match="a visual without a shape"):
         here(other)
 
 
@@ -177,26 +183,26 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
     ],
 )
 def test_what_does_not_fit_together_is_said(change: Callable[[EpisodeRead], EpisodeRead], says: str) -> None:
-    with pytest.raises(Garbled, match=says):
-        here(change(packed(an_episode(), None, 1, SentShapes())))
+    with pytest.raises(InvalidEpisode, match=says):
+        here(change(pack_episode(an_episode(), None, 1, SentShapes())))
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 4), (6, -1), (5000, 5000)])
 def test_a_camera_of_no_size_or_of_far_too_much_is_said(width: int, height: int) -> None:
-    read = packed(an_episode(), None, 1, SentShapes())
+    read = pack_episode(an_episode(), None, 1, SentShapes())
     lens = msgspec.structs.replace(read.cameras[0].camera, width=width, height=height)
-    with pytest.raises(Garbled, match=f"pictures of {width} x {height}"):
+    with pytest.raises(InvalidEpisode, match=f"pictures of {width} x {height}"):
         here(of_first("cameras", camera=lens)(read))
 
 
 @pytest.mark.parametrize("rows", [numbers(T), np.zeros((), np.float32), np.zeros(T + 1, "S2")])
 def test_a_column_without_a_row_a_state_is_left_out_and_named(rows: NDArray) -> None:
     read = of_episode(obs={"odd": rows, "whole": numbers(T + 1, 2)})(
-        packed(an_episode(), None, 1, SentShapes())
+        pack_episode(an_episode(), None, 1, SentShapes())
     )
     episode = here(read)
     assert list(episode.obs) == ["whole"]
-    assert [broken.file for broken in episode.unread] == ["a.h5", "odd"]
+    assert [broken.file for broken in episode.broken_files] == ["a.h5", "odd"]
 
 
 @pytest.mark.parametrize(
@@ -210,8 +216,8 @@ def test_a_column_without_a_row_a_state_is_left_out_and_named(rows: NDArray) -> 
     ],
 )
 def test_a_picture_that_is_none_is_said(picture: NDArray | None) -> None:
-    read = crossed(packed(an_episode(), None, 1, SentShapes()))
-    episode = unpacked(read, lambda *_: PictureRead(picture), 1, SharedShapes(), {})
+    read = crossed(pack_episode(an_episode(), None, 1, SentShapes()))
+    episode = unpack_episode(read, lambda *_: PictureRead(picture), 1, SharedShapes(), {})
     pictures = episode.cameras[0].rgb
     assert pictures is not None
     with pytest.raises(OSError, match="the reader gave"):
@@ -224,12 +230,12 @@ def test_a_picture_that_is_none_is_said(picture: NDArray | None) -> None:
     ("modality", "picture"), [("depth", numbers(4, 6)), ("segmentation", numbers(4, 6, kind="i4"))]
 )
 def test_pictures_of_one_number_a_pixel_come_as_they_are(modality: Modality, picture: NDArray) -> None:
-    read = of_first("cameras", pictures={modality: T + 1})(packed(an_episode(), None, 1, SentShapes()))
-    (track,) = unpacked(crossed(read), lambda *_: PictureRead(picture), 1, SharedShapes(), {}).cameras
+    read = of_first("cameras", pictures={modality: T + 1})(pack_episode(an_episode(), None, 1, SentShapes()))
+    (track,) = unpack_episode(crossed(read), lambda *_: PictureRead(picture), 1, SharedShapes(), {}).cameras
     np.testing.assert_array_equal(getattr(track, modality)[T], picture, strict=True)
 
 
 def test_a_camera_may_be_a_pixel_wide() -> None:
-    read = packed(an_episode(), None, 1, SentShapes())
+    read = pack_episode(an_episode(), None, 1, SentShapes())
     lens = msgspec.structs.replace(read.cameras[0].camera, width=1, height=1)
     assert here(of_first("cameras", camera=lens)(read)).cameras[0].info.width == 1

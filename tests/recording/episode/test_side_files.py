@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.episodes import Made, made, write
-from workbench.recording.episode.side_files import place_of, side_files, side_files_in_words
+from workbench.recording.episode.side_files import side_file_path, side_files, side_files_text
 from workbench.recording.reader.read_episode import read_episode
 
 TEXT = """
@@ -56,22 +56,25 @@ def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
     text = "load('meshes/part.obj', 'notes.txt')"
     recorded = side_files(str(task), {str(task): text})
     assert list(recorded) == ["meshes/part.obj", "notes.txt"]
-    assert "which the recording does not hold: they are as then." in side_files_in_words(str(task), recorded)
+    assert "which the recording does not hold: they are as then." in side_files_text(str(task), recorded)
     (task.parent / "meshes/part.obj").write_text("v 9 9 9 9")
     (task.parent / "notes.txt").unlink()
-    said = side_files_in_words(str(task), recorded)
+    said = side_files_text(str(task), recorded)
     assert "meshes/part.obj has changed since; notes.txt is not there." in said
-    assert "is not there" in side_files_in_words("task.py", recorded), "read where the task is not"
-    assert "is not there" in side_files_in_words(str(task), {"../../etc/hostname": "0" * 12})
-    assert side_files_in_words(str(task), {}) == ""
+    assert "is not there" in side_files_text("task.py", recorded), "read where the task is not"
+    assert "is not there" in side_files_text(str(task), {"../../etc/hostname": "0" * 12})
+    assert side_files_text(str(task), {}) == ""
 
 
 @pytest.mark.parametrize(
     "name", ["../beside.txt", "a/../../beside.txt", "..", "/etc/hostname", "", ".", "./"]
 )
 def test_what_lies_outside_the_tasks_folder_is_nowhere(tmp_path: Path, name: str) -> None:
-    assert place_of(tmp_path, name) is None
-    assert place_of(None, "a.txt") is None and place_of(tmp_path, "a/b.txt") == tmp_path / "a" / "b.txt"
+    assert side_file_path(tmp_path, name) is None
+    assert (
+        side_file_path(None, "a.txt") is None
+        and side_file_path(tmp_path, "a/b.txt") == tmp_path / "a" / "b.txt"
+    )
 
 
 def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
@@ -80,8 +83,8 @@ def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
     outside.write_text("mine")
     try:
         hashed = side_files(str(outside.with_name("task.py")), {"": "load('outside.txt')"})["outside.txt"]
-        assert "is not there" in side_files_in_words(str(task), {"../outside.txt": hashed})
-        assert "is not there" in side_files_in_words(str(task), {str(outside): hashed})
+        assert "is not there" in side_files_text(str(task), {"../outside.txt": hashed})
+        assert "is not there" in side_files_text(str(task), {str(outside): hashed})
     finally:
         outside.unlink()
 
@@ -93,7 +96,7 @@ def test_a_file_that_changed_within_its_second_is_another(task: Path) -> None:
     path.write_text("MINE")
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     assert path.stat().st_size == before.st_size
-    assert "notes.txt has changed since" in side_files_in_words(str(task), recorded)
+    assert "notes.txt has changed since" in side_files_text(str(task), recorded)
 
 
 def test_a_recording_says_them(tmp_path: Path) -> None:

@@ -13,14 +13,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from workbench.recording.episode.episode import Episode, Unread
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.episode import BrokenFile, Episode
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
 from workbench.recording.lerobot.format import Choice, frames_of
 from workbench.recording.lerobot.read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import read_source, sources_among
+from workbench.recording.reader.reading import find_all_sources, read_source
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -163,7 +163,7 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
     ):
         export(tmp_path / "set", episode, narrow)
     assert list(tmp_path.iterdir()) == []
-    cut = replace(episode, unread=(Unread("c.rrd", "was cut short."),))
+    cut = replace(episode, broken_files=(BrokenFile("c.rrd", "was cut short."),))
     made = export(tmp_path / "rest", episode, narrow, cut, episode, options=ExportOptions(only_fitting=True))
     assert made.episodes == 2 and made.frames == 2 * episode.length
     assert made.not_fitting[0].startswith("episode 1 does not go") and made.not_fitting[1:] == [
@@ -203,7 +203,7 @@ def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Pa
     for name in ("broken", "whole"):
         export(tmp_path / name, episode)
     (tmp_path / "broken/meta/info.json").write_text("{")
-    broken, whole = sources_among([tmp_path])
+    broken, whole = find_all_sources([tmp_path])
     assert (broken.name, whole.name) == ("broken#0", "whole#0")
     with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
         read_source(broken)

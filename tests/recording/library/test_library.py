@@ -28,7 +28,7 @@ from PIL import Image
 from tests.drive.episodes import Made
 from tests.drive.waiting import until
 from tests.recording.library_files import describe, jpeg
-from workbench.recording.episode.row import Entry, Facts, LibraryRow, clean_facts
+from workbench.recording.episode.row import Facts, LibraryEntry, LibraryRow, clean_facts
 from workbench.recording.library.index import LibraryIndex, index_path
 from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
@@ -306,7 +306,7 @@ def test_only_what_changed_is_read_again(
     library.refresh()
     read_keys: list[str] = []
 
-    def spy(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
+    def spy(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[LibraryEntry]]]:
         wanted = list(wanted)
         read_keys.extend(found.key for found in wanted)
         return read_rows(folder, wanted)
@@ -603,7 +603,7 @@ def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     library.refresh()
     before = tree(tmp_path)
     first, second = library.rows()
-    for refused in (library.may_delete, library.delete):
+    for refused in (library.check_delete, library.delete):
         with pytest.raises(LibraryError, match="demo.h5 holds 2 recordings"):
             refused([first.id])
     assert tree(tmp_path) == before

@@ -14,9 +14,9 @@ from workbench.recording.library.trash import (
     Trash,
     TrashError,
     empty_trash,
-    look_into_trash,
-    put_into_trash,
-    take_out_of_trash,
+    move_to_trash,
+    read_trash,
+    restore_from_trash,
 )
 
 
@@ -46,77 +46,77 @@ def test_a_move_that_fails_leaves_every_file_of_the_recording_where_it_was(tmp_p
         with pytest.raises(
             TrashError, match=f"{paths[at - 1].name} was left where it is: Input/output error"
         ):
-            put_into_trash(tmp_path, [paths])
+            move_to_trash(tmp_path, [paths])
     assert files(tmp_path) == before
-    batch = put_into_trash(tmp_path, [paths])
+    batch = move_to_trash(tmp_path, [paths])
     assert batch is not None and outside(tmp_path) == {}
     with refused(at, ("rename",)):
         with pytest.raises(TrashError, match="was left where it is: Input/output error"):
-            take_out_of_trash(tmp_path, batch)
-    assert outside(tmp_path) == {} and look_into_trash(tmp_path).files == 3
-    assert sorted(take_out_of_trash(tmp_path, batch)) == sorted(before)
+            restore_from_trash(tmp_path, batch)
+    assert outside(tmp_path) == {} and read_trash(tmp_path).files == 3
+    assert sorted(restore_from_trash(tmp_path, batch)) == sorted(before)
     assert files(tmp_path) == before
 
 
 def test_of_several_recordings_those_before_the_one_that_fails_are_in_the_trash(tmp_path: Path) -> None:
     three = [recording(tmp_path, name) for name in "abc"]
     with refused(5, ("rename",)), pytest.raises(TrashError, match=r"b\.h5"):
-        put_into_trash(tmp_path, three)
+        move_to_trash(tmp_path, three)
     assert {name[0] for name in outside(tmp_path)} == {"b", "c"} and len(outside(tmp_path)) == 6
-    (batch,) = look_into_trash(tmp_path).batches
-    assert sorted(take_out_of_trash(tmp_path, batch)) == ["a.h5", "a.json", "a.rrd"]
+    (batch,) = read_trash(tmp_path).batches
+    assert sorted(restore_from_trash(tmp_path, batch)) == ["a.h5", "a.json", "a.rrd"]
 
 
 def test_what_makes_it_a_recording_goes_first_and_comes_back_last(tmp_path: Path) -> None:
     paths = recording(tmp_path, "a", (".json", ".h5", ".rrd", ".notes"))
     with refused(0, ("rename",)) as gone:
-        batch = put_into_trash(tmp_path, [paths])
+        batch = move_to_trash(tmp_path, [paths])
     assert batch is not None and gone[0] == "rename a.json"
     with refused(0, ("rename",)) as back:
-        take_out_of_trash(tmp_path, batch)
+        restore_from_trash(tmp_path, batch)
     assert back[-1] == "rename a.json" and len(back) == len(gone) == 4
     assert os.listdir(tmp_path / TRASH) == []
 
 
 def test_what_lies_in_the_trash_is_counted_by_deletion_file_and_byte(tmp_path: Path) -> None:
-    assert look_into_trash(tmp_path) == Trash()
+    assert read_trash(tmp_path) == Trash()
     recordings = [recording(tmp_path, name) for name in ("a", "sub/b")]
     size = sum(len(content) for content in files(tmp_path).values())
-    first = put_into_trash(tmp_path, recordings[:1])
-    second = put_into_trash(tmp_path, recordings[1:])
+    first = move_to_trash(tmp_path, recordings[:1])
+    second = move_to_trash(tmp_path, recordings[1:])
     assert first is not None and second is not None and first < second
     (tmp_path / TRASH / "no deletion").write_text("?")
     (tmp_path / TRASH / "link").symlink_to(tmp_path)
-    assert look_into_trash(tmp_path) == Trash((first, second), files=6, size=size)
-    assert put_into_trash(tmp_path, recordings) is None, "nothing is there any more"
-    assert look_into_trash(tmp_path).batches == (first, second)
-    assert take_out_of_trash(tmp_path, second) == ("sub/b.h5", "sub/b.rrd", "sub/b.json")
-    assert look_into_trash(tmp_path).batches == (first,)
+    assert read_trash(tmp_path) == Trash((first, second), files=6, size=size)
+    assert move_to_trash(tmp_path, recordings) is None, "nothing is there any more"
+    assert read_trash(tmp_path).batches == (first, second)
+    assert restore_from_trash(tmp_path, second) == ("sub/b.h5", "sub/b.rrd", "sub/b.json")
+    assert read_trash(tmp_path).batches == (first,)
     with pytest.raises(TrashError, match="no longer in the trash"):
-        take_out_of_trash(tmp_path, second)
+        restore_from_trash(tmp_path, second)
     with pytest.raises(TrashError, match="no longer in the trash"):
-        take_out_of_trash(tmp_path, "link")
+        restore_from_trash(tmp_path, "link")
 
 
 def test_a_file_that_is_taken_out_meanwhile_is_not_counted(tmp_path: Path) -> None:
-    put_into_trash(tmp_path, [recording(tmp_path, "a")])
+    move_to_trash(tmp_path, [recording(tmp_path, "a")])
     for at, count in ((1, 2), (2, 2), (3, 2), (4, 3)):
         with refused(at, ("lstat",), errno.ENOENT):
-            assert look_into_trash(tmp_path).files == count
+            assert read_trash(tmp_path).files == count
 
 
 def test_links_are_moved_as_links_and_what_is_back_already_is_not_written_over(tmp_path: Path) -> None:
     paths = recording(tmp_path, "a")
     paths[2].unlink()
     paths[2].symlink_to(tmp_path / "gone")
-    batch = put_into_trash(tmp_path, [paths])
+    batch = move_to_trash(tmp_path, [paths])
     assert batch is not None and outside(tmp_path) == {} and not paths[2].is_symlink()
     paths[0].write_text("a newer one")
     with pytest.raises(TrashError, match="a.json was left where it is: there is a file of that name already"):
-        take_out_of_trash(tmp_path, batch)
+        restore_from_trash(tmp_path, batch)
     assert outside(tmp_path) == {"a.json": b"a newer one"} and not paths[2].is_symlink()
     paths[0].unlink()
-    assert len(take_out_of_trash(tmp_path, batch)) == 3
+    assert len(restore_from_trash(tmp_path, batch)) == 3
     assert paths[2].is_symlink() and outside(tmp_path) == {"a.json": b"a.json", "a.h5": b"a.h5"}
 
 
@@ -126,9 +126,9 @@ def test_a_trash_that_leads_elsewhere_is_left_alone(tmp_path: Path) -> None:
     recording(elsewhere / "batch", "b")
     before = files(elsewhere)
     (folder / TRASH).symlink_to(elsewhere)
-    assert look_into_trash(folder) == Trash()
+    assert read_trash(folder) == Trash()
     with pytest.raises(TrashError, match="is a link, so nothing was moved there"):
-        put_into_trash(folder, [paths])
+        move_to_trash(folder, [paths])
     with pytest.raises(TrashError, match="could not be emptied"):
         empty_trash(folder)
     assert files(elsewhere) == before and all(path.exists() for path in paths)
@@ -136,23 +136,23 @@ def test_a_trash_that_leads_elsewhere_is_left_alone(tmp_path: Path) -> None:
 
 def test_emptying_deletes_all_of_it_and_an_empty_one_needs_none(tmp_path: Path) -> None:
     empty_trash(tmp_path)
-    put_into_trash(tmp_path, [recording(tmp_path, "a")])
+    move_to_trash(tmp_path, [recording(tmp_path, "a")])
     kept = recording(tmp_path, "b")
     empty_trash(tmp_path)
     assert not (tmp_path / TRASH).exists() and all(path.exists() for path in kept)
     (tmp_path / TRASH).write_text("no folder")
-    assert look_into_trash(tmp_path) == Trash()
+    assert read_trash(tmp_path) == Trash()
     with pytest.raises(TrashError, match="could not be emptied: Not a directory"):
         empty_trash(tmp_path)
 
 
 def test_a_folder_in_the_trash_that_cannot_be_removed_keeps_nothing_from_coming_back(tmp_path: Path) -> None:
     paths = recording(tmp_path, "a")
-    batch = put_into_trash(tmp_path, [paths])
+    batch = move_to_trash(tmp_path, [paths])
     assert batch is not None
     with refused(1, ("rmdir",), then=errno.EIO):
-        assert len(take_out_of_trash(tmp_path, batch)) == 3
-    assert all(path.exists() for path in paths) and look_into_trash(tmp_path).files == 0
+        assert len(restore_from_trash(tmp_path, batch)) == 3
+    assert all(path.exists() for path in paths) and read_trash(tmp_path).files == 0
 
 
 @pytest.mark.parametrize("then", [0, errno.EROFS])
@@ -165,7 +165,7 @@ def test_whatever_call_fails_no_recording_is_in_two_places_half(tmp_path: Path, 
     folder = tmp_path / "0"
     both, before = two(folder), files(folder)
     with refused() as calls:
-        put_into_trash(folder, both)
+        move_to_trash(folder, both)
     assert {call.split()[0] for call in calls} == {"mkdir", "rename"}
     for at, call in enumerate(calls, 1):
         folder = tmp_path / str(at)
@@ -173,7 +173,7 @@ def test_whatever_call_fails_no_recording_is_in_two_places_half(tmp_path: Path, 
         told = ""
         with refused(at, then=then):
             try:
-                put_into_trash(folder, both)
+                move_to_trash(folder, both)
             except TrashError as error:
                 told = str(error)
         there = outside(folder)
@@ -182,46 +182,46 @@ def test_whatever_call_fails_no_recording_is_in_two_places_half(tmp_path: Path, 
             moved = [path for path in paths if not path.exists()]
             if len(moved) not in (0, len(paths)):
                 assert then and all(f"{path} is {folder / TRASH}" in told for path in moved), (call, told)
-        for batch in look_into_trash(folder).batches:
-            take_out_of_trash(folder, batch)
+        for batch in read_trash(folder).batches:
+            restore_from_trash(folder, batch)
         assert outside(folder) == before, call
 
 
 def test_a_deletion_that_moved_nothing_is_none_to_take_back(tmp_path: Path) -> None:
     first, second = recording(tmp_path, "a"), recording(tmp_path, "sub/b")
     before = files(tmp_path)
-    batch = put_into_trash(tmp_path, [first])
+    batch = move_to_trash(tmp_path, [first])
     for at in (1, 2):
         with refused(at, ("rename",)), pytest.raises(TrashError):
-            put_into_trash(tmp_path, [second])
-    assert look_into_trash(tmp_path).batches == (batch,)
-    assert put_into_trash(tmp_path, [[tmp_path / "nowhere.json"]]) is None
-    assert look_into_trash(tmp_path).batches == (batch,)
+            move_to_trash(tmp_path, [second])
+    assert read_trash(tmp_path).batches == (batch,)
+    assert move_to_trash(tmp_path, [[tmp_path / "nowhere.json"]]) is None
+    assert read_trash(tmp_path).batches == (batch,)
     assert batch is not None
-    take_out_of_trash(tmp_path, batch)
-    assert files(tmp_path) == before and look_into_trash(tmp_path).batches == ()
+    restore_from_trash(tmp_path, batch)
+    assert files(tmp_path) == before and read_trash(tmp_path).batches == ()
 
 
 def test_what_comes_from_elsewhere_is_no_deletion(tmp_path: Path) -> None:
     outer = tmp_path / "outer"
     paths = recording(tmp_path / "folder", "a")
     recording(outer, "b")
-    batch = put_into_trash(tmp_path / "folder", [paths])
+    batch = move_to_trash(tmp_path / "folder", [paths])
     assert batch is not None
     for name in ("..", "../..", "../../outer", "", ".", "nothing", str(outer), f"{batch}/."):
         with pytest.raises(TrashError, match="no longer in the trash"):
-            take_out_of_trash(tmp_path / "folder", name)
+            restore_from_trash(tmp_path / "folder", name)
     (tmp_path / "folder" / TRASH / "link").symlink_to(outer)
-    assert look_into_trash(tmp_path / "folder").batches == (batch,)
+    assert read_trash(tmp_path / "folder").batches == (batch,)
     with pytest.raises(TrashError):
-        take_out_of_trash(tmp_path / "folder", "link")
+        restore_from_trash(tmp_path / "folder", "link")
     assert len(files(outer)) == 3
 
 
 def test_a_trash_that_cannot_be_emptied_is_told(tmp_path: Path) -> None:
-    put_into_trash(tmp_path, [recording(tmp_path, "a")])
+    move_to_trash(tmp_path, [recording(tmp_path, "a")])
     with refused(2, ("unlink",)), pytest.raises(TrashError, match="could not be emptied: Input/output error"):
         empty_trash(tmp_path)
-    assert look_into_trash(tmp_path).files == 2
+    assert read_trash(tmp_path).files == 2
     empty_trash(tmp_path)
-    assert look_into_trash(tmp_path).files == 0
+    assert read_trash(tmp_path).files == 0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.recording.foreign_h5 import write
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.maniskill.safe_h5 import DEEPEST, RefusedH5, open_h5
 from workbench.recording.reader.read_episode import read_maniskill
 from workbench.recording.reader.read_rows import read_found

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tests.drive.episodes import Made
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode, read_maniskill, trajectories
 
 STEPS = 6
@@ -208,7 +208,7 @@ def test_a_file_that_was_cut_takes_only_its_own_with_it(
     file = path.with_suffix(suffix)
     file.write_bytes(file.read_bytes()[:-100])
     read = read_episode(path)
-    (said,) = read.unread
+    (said,) = read.broken_files
     assert said.sentence.startswith(f"{file.name} was cut short or changed (")
     np.testing.assert_array_equal(read.reward, made.reward)
     assert read.info == made.info
@@ -226,7 +226,7 @@ def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> No
         with pytest.raises(UnreadableRecording, match=why):
             reading()
     ours.with_suffix(".rrd").write_bytes(b"RRF2 and then nothing")
-    (said,) = read_episode(ours).unread
+    (said,) = read_episode(ours).broken_files
     assert said.sentence.startswith(f"{ours.stem}.rrd was cut short or changed")
     ours.with_suffix(".rrd").unlink()
     assert read_episode(ours).length == STEPS

@@ -26,7 +26,7 @@ from tests.recording.foreign_h5 import write as write_h5
 from workbench.core.camera_data import CameraInfo, Picture
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.episode import Episode, EpisodeInfo
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import export_lerobot
 from workbench.recording.reader import reading
 from workbench.recording.reader.read_episode import read_episode
@@ -179,7 +179,7 @@ def look_at(folder: Path) -> list[str]:
 
 
 def opened(episode: Episode) -> Iterator[str]:
-    yield from (broken.sentence for broken in episode.unread)
+    yield from (broken.sentence for broken in episode.broken_files)
     find_events(episode)
     for camera in episode.cameras:
         for pictures in (camera.rgb, camera.depth, camera.segmentation):

@@ -21,8 +21,7 @@ from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
-from workbench.recording.episode.row import Facts
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import Facts, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader import reading
 from workbench.recording.reader.read_episode import read_episode
@@ -122,7 +121,7 @@ def test_an_episode_is_what_reading_it_here_gives(recorded: Any, tmp_path: Path)
     path = recorded.episode.write(tmp_path).json
     here, there = read_episode(path), reading.read_recording("ours", path)
     assert there.info == here.info and there.segmentation == here.segmentation
-    assert there.action_names == here.action_names and there.unread == here.unread == ()
+    assert there.action_names == here.action_names and there.broken_files == here.broken_files == ()
     for name in ("poses", "action", "reward", "terminated", "truncated"):
         np.testing.assert_array_equal(getattr(there, name), getattr(here, name), strict=True)
     for name in ("evaluate", "env_states", "obs"):
@@ -271,6 +270,6 @@ print(tried(lambda: subprocess.run(["/bin/true"], check=True)), tried(lambda: op
 def test_the_nursery_has_one_thread(tmp_path: Path) -> None:
     describe(tmp_path, "a")
     rows(tmp_path)
-    nursery = psutil.Process(reader_of(tmp_path, episodes=False)).parent()
-    assert nursery is not None and nursery.num_threads() == 1
-    assert sys.executable == nursery.exe() or nursery.cmdline()[0] == sys.executable
+    fork_server = psutil.Process(reader_of(tmp_path, episodes=False)).parent()
+    assert fork_server is not None and fork_server.num_threads() == 1
+    assert sys.executable == fork_server.exe() or fork_server.cmdline()[0] == sys.executable

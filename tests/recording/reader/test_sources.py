@@ -8,8 +8,8 @@ import pytest
 
 from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
-from workbench.recording.episode.source import Kind, Source, UnreadableRecording
-from workbench.recording.reader.reading import read_source, sources_among
+from workbench.recording.episode.row import Source, SourceKind, UnreadableRecording
+from workbench.recording.reader.reading import find_all_sources, read_source
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ from workbench.recording.reader.reading import read_source, sources_among
     ],
 )
 def test_who_made_it_and_what_files_made_of_it_are_called(
-    path: str, part: str | None, kind: Kind, stem: str
+    path: str, part: str | None, kind: SourceKind, stem: str
 ) -> None:
     source = Source(Path(path), part)
     assert (source.kind, source.stem) == (kind, stem)
@@ -32,14 +32,14 @@ def test_each_is_found_once_by_name_whatever_names_it(child_process: None, tmp_p
     second, first = describe(tmp_path, "b", id="two"), describe(tmp_path / "a", "z", id="one")
     describe(tmp_path / "c", "copy", id="one")
     theirs = write_h5(tmp_path)
-    found = sources_among([tmp_path])
+    found = find_all_sources([tmp_path])
     assert [(source.id, source.path, source.name) for source in found] == [
         ("one", first, "z"),
         ("two", second, "b"),
         (f"{theirs}#traj_0", theirs, "theirs#traj_0"),
     ]
-    assert sources_among([second.with_suffix(".rrd"), tmp_path, second]) == (found[1], found[0], found[2])
-    assert sources_among([second.with_suffix(".h5")]) == (found[1],)
+    assert find_all_sources([second.with_suffix(".rrd"), tmp_path, second]) == (found[1], found[0], found[2])
+    assert find_all_sources([second.with_suffix(".h5")]) == (found[1],)
 
 
 def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is_not(
@@ -49,15 +49,15 @@ def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is
     describe(folder, "a", id="one")
     empty.mkdir()
     other.write_text("")
-    assert [source.id for source in sources_among([empty, folder])] == ["one"]
+    assert [source.id for source in find_all_sources([empty, folder])] == ["one"]
     with pytest.raises(UnreadableRecording, match=f"no recording in {other}: looked for are"):
-        sources_among([folder, other])
+        find_all_sources([folder, other])
     with pytest.raises(UnreadableRecording, match=f"no recording in {empty}, {empty}: looked for are"):
-        sources_among([empty, empty])
+        find_all_sources([empty, empty])
     with pytest.raises(FileNotFoundError, match=f"nothing at {tmp_path / 'none'}:"):
-        sources_among([folder, tmp_path / "none"])
+        find_all_sources([folder, tmp_path / "none"])
     with pytest.raises(UnreadableRecording, match="No recording is named"):
-        sources_among([])
+        find_all_sources([])
 
 
 def test_an_episode_is_read_by_the_way_of_its_kind(child_process: None, tmp_path: Path) -> None:

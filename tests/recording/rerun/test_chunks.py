@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from workbench.recording.rerun.chunks import TimedChunks, property_chunk, telling
+from workbench.recording.rerun.chunks import TimedChunks, changed_rows, property_chunk
 
 STEPS = np.arange(5, dtype=np.int64)
 
@@ -62,7 +62,7 @@ def test_rows_between_two_equal_ones_are_left_out() -> None:
     values = np.array([0, 0, 0, 1, 1, 1, 0.0])
     assert [
         None if rows is None else rows.tolist()
-        for rows in telling(np.stack([values, np.arange(7)])[..., None])
+        for rows in changed_rows(np.stack([values, np.arange(7)])[..., None])
     ] == [[0, 2, 3, 5, 6], None]
     chunk = TimedChunks(0.05).scalars("/reward", np.arange(7, dtype=np.int64), values)
     batch = chunk.to_record_batch()

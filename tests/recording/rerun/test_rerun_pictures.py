@@ -95,8 +95,8 @@ def test_a_picture_here_and_there_is_of_the_state_that_it_was_taken_at(tmp_path:
 
 
 def test_what_is_kept_of_pictures_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = read._Kept()
-    monkeypatch.setattr(read, "_kept", kept)
+    kept = read._ChunkCache()
+    monkeypatch.setattr(read, "_chunk_cache", kept)
     monkeypatch.setattr(read, "KEPT_BYTES", 4000)
     episodes = [read_episode(write(tmp_path, made(9, seed=s)).with_suffix(".rrd")) for s in range(6)]
     for _ in range(2):
@@ -113,7 +113,7 @@ def test_its_file_is_closed_when_a_recording_is_let_go_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rrd = write(tmp_path, made(9)).with_suffix(".rrd")
-    monkeypatch.setattr(read, "_kept", read._Kept())
+    monkeypatch.setattr(read, "_chunk_cache", read._ChunkCache())
     episode = read_episode(rrd)
     assert str(rrd) in descriptors()
     del episode

@@ -33,10 +33,9 @@ from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.rerun import write
 from workbench.recording.writing.episode_writer import EpisodeFiles, EpisodeWriter
-from workbench.recording.writing.finish import episode_stem
+from workbench.recording.writing.finish import episode_stem, recover
 from workbench.recording.writing.journal import FOLDER
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.recover import recover
 
 Maker = Callable[..., Made]
 

@@ -14,10 +14,9 @@ from tests.drive.rows import append
 from tests.recording.refused_calls import descriptors, refused
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.episode_writer import EpisodeWriter
-from workbench.recording.writing.finish import SUFFIXES
+from workbench.recording.writing.finish import SUFFIXES, recover
 from workbench.recording.writing.journal import FOLDER
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.recover import recover
 
 Maker = Callable[..., Made]
 
@@ -60,7 +59,7 @@ def test_whatever_call_fails_the_next_try_makes_the_files_once(
             assert os.listdir(folder) == [], "its rows were nowhere but in memory"
             continue
         (path,) = folder.glob("*.json")
-        assert read_episode(path).length == 2 and read_episode(path).unread == (), call
+        assert read_episode(path).length == 2 and read_episode(path).broken_files == (), call
         assert len(os.listdir(folder)) == 3, call
         assert not (folder / FOLDER).exists()
 

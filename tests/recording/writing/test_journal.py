@@ -16,15 +16,15 @@ from tests.drive.episodes import entries_of
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.recording.writing import journal as journals
-from workbench.recording.writing.journal import Entry, Journal, claim
+from workbench.recording.writing.journal import Journal, JournalEntry, claim
 
 
 @pytest.fixture(autouse=True)
 def no_thread_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is written when is the test's affair."""
-    keeper = type(journals._keeper)()
+    keeper = type(journals._journal_thread)()
     monkeypatch.setattr(keeper, "watch", lambda journal: None)
-    monkeypatch.setattr(journals, "_keeper", keeper)
+    monkeypatch.setattr(journals, "_journal_thread", keeper)
 
 
 @pytest.fixture
@@ -46,22 +46,22 @@ def numbers(*values: int) -> list[bytes]:
 def test_a_folder_that_vanished_is_told_at_the_next_row(
     tmp_path: Path, journal: Journal, removed: str
 ) -> None:
-    journal.append(Entry("row", 0, b"0"))
+    journal.append(JournalEntry("row", 0, b"0"))
     journal.sync()
-    journal.append(Entry("row", 0, b"1"))
+    journal.append(JournalEntry("row", 0, b"1"))
     if removed == "folder":
         shutil.rmtree(tmp_path / "folder")
     else:
         journal.path.unlink()
     journal.sync()
-    for tell in (lambda: journal.append(Entry("row", 0, b"2")), journal.append, journal.finish):
+    for tell in (lambda: journal.append(JournalEntry("row", 0, b"2")), journal.append, journal.finish):
         with pytest.raises(FileNotFoundError, match="was removed during the recording"):
             tell()
 
 
 def test_a_folder_that_was_renamed_keeps_its_journal(tmp_path: Path, journal: Journal) -> None:
     (tmp_path / "folder").rename(tmp_path / "elsewhere")
-    journal.append(Entry("row", 0, b"0"))
+    journal.append(JournalEntry("row", 0, b"0"))
     journal.finish()
     assert rows(tmp_path / "elsewhere" / "a.arrow") == [b"0"]
 
@@ -69,12 +69,12 @@ def test_a_folder_that_was_renamed_keeps_its_journal(tmp_path: Path, journal: Jo
 def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no_good_of_it(
     journal: Journal,
 ) -> None:
-    journal.append(Entry("row", 0, b"0"))
+    journal.append(JournalEntry("row", 0, b"0"))
     with refused(1, ("fsync",)):
         journal.sync()
     for _ in range(2):
         journal.sync()
-        for tell in (lambda: journal.append(Entry("row", 0, b"1")), journal.append):
+        for tell in (lambda: journal.append(JournalEntry("row", 0, b"1")), journal.append):
             with pytest.raises(OSError, match="Input/output error"):
                 tell()
     journal.finish()
@@ -88,10 +88,10 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
     journal: Journal, monkeypatch: pytest.MonkeyPatch, number: int, then: int, half: int
 ) -> None:
     """Also where half of it was, and what is to take that back fails too."""
-    journal.append(Entry("row", 0, b"0"))
+    journal.append(JournalEntry("row", 0, b"0"))
     journal.write()
     for value in numbers(1, 2):
-        journal.append(Entry("row", 0, value * 3000))
+        journal.append(JournalEntry("row", 0, value * 3000))
     write = os.pwrite
     with monkeypatch.context() as patch:
         if half:
@@ -99,7 +99,7 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
         with refused(2 if half else 1, ("pwrite",), number, then):
             journal.write()
     with pytest.raises(OSError) as told:
-        journal.append(Entry("row", 0, b"not kept"))
+        journal.append(JournalEntry("row", 0, b"not kept"))
     assert told.value.errno == number
     assert rows(journal.path) == [b"0"]
     journal.finish()
@@ -116,7 +116,9 @@ def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
 
     def bring(value: bytes) -> bool:
         try:
-            journal.append(*([] if alone else [Entry("camera/0", 0, value)]), Entry("row", 0, value))
+            journal.append(
+                *([] if alone else [JournalEntry("camera/0", 0, value)]), JournalEntry("row", 0, value)
+            )
         except OSError:
             return False
         return True
@@ -130,12 +132,12 @@ def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
 
 def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
     begin = journal.size
-    made: Future[list[Entry]] = Future()
-    journal.append(Entry("row", 0, b"0" * 100))
-    journal.append(made, Entry("row", 0, b"1" * 100))
+    made: Future[list[JournalEntry]] = Future()
+    journal.append(JournalEntry("row", 0, b"0" * 100))
+    journal.append(made, JournalEntry("row", 0, b"1" * 100))
     waiting = journal.size
     assert begin + 200 < waiting < begin + 300
-    made.set_result([Entry("picture/0/rgb", 1, b"p" * 1000)])
+    made.set_result([JournalEntry("picture/0/rgb", 1, b"p" * 1000)])
     assert journal.size > waiting + 1000
     for _ in range(2):
         journal.write()
@@ -143,25 +145,25 @@ def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
 
 
 def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(journal: Journal) -> None:
-    made: Future[list[Entry]] = Future()
+    made: Future[list[JournalEntry]] = Future()
     made.set_exception(MemoryError("no room"))
-    journal.append(Entry("row", 0, b"0"))
-    journal.append(Entry("camera/0", 1, b"pose"), made, Entry("row", 0, b"1"))
+    journal.append(JournalEntry("row", 0, b"0"))
+    journal.append(JournalEntry("camera/0", 1, b"pose"), made, JournalEntry("row", 0, b"1"))
     for _ in range(2):
         with pytest.raises(OSError, match="could not be encoded .*no room"):
             journal.finish()
-    assert entries_of(journal.path) == [Entry("row", 0, b"0")]
+    assert entries_of(journal.path) == [JournalEntry("row", 0, b"0")]
 
 
 def test_rows_that_come_while_the_disk_fails_keep_their_order(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> int:
-        journal.append(Entry("row", 0, b"2"))
+        journal.append(JournalEntry("row", 0, b"2"))
         raise OSError(errno.ENOSPC, "No space left on device")
 
     for value in (b"0", b"1"):
-        journal.append(Entry("row", 0, value))
+        journal.append(JournalEntry("row", 0, value))
     with monkeypatch.context() as patch:
         patch.setattr(os, "pwrite", full)
         journal.write()
@@ -251,7 +253,7 @@ def test_a_disk_that_does_not_give_what_was_written_is_no_end(
 ) -> None:
     """A journal may end anywhere, but what a network drive does not give for a moment is not lost."""
     for value in numbers(0, 1, 2):
-        journal.append(Entry("row", 0, value * 5000))
+        journal.append(JournalEntry("row", 0, value * 5000))
         journal.write()
     opened = journals.open_regular_file
 
@@ -282,7 +284,7 @@ def test_a_disk_that_does_not_give_what_was_written_is_no_end(
 def test_threads_write_all_journals_and_end_with_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journals, "_keeper", type(journals._keeper)())
+    monkeypatch.setattr(journals, "_journal_thread", type(journals._journal_thread)())
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
     lasting: set[str] = set()
     fsync = os.fsync
@@ -297,7 +299,7 @@ def test_threads_write_all_journals_and_end_with_the_last(
     (thread,) = set(threading.enumerate()) - before
     assert thread.daemon, "the end of a process does not wait for it"
     for journal in three:
-        journal.append(Entry("row", 0, b"x"))
+        journal.append(JournalEntry("row", 0, b"x"))
     until(
         lambda: all(rows(journal.path) == [b"x"] and str(journal.path) in lasting for journal in three),
         "every row on the disk",
@@ -312,8 +314,8 @@ def test_threads_write_all_journals_and_end_with_the_last(
 def test_what_waits_is_written_to_all_journals_before_the_disk_is_waited_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keeper = type(journals._keeper)()
-    monkeypatch.setattr(journals, "_keeper", keeper)
+    keeper = type(journals._journal_thread)()
+    monkeypatch.setattr(journals, "_journal_thread", keeper)
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
     three: list[Journal] = []
     put: list[bool] = []
@@ -327,7 +329,7 @@ def test_what_waits_is_written_to_all_journals_before_the_disk_is_waited_for_onc
         # The last of a round, so that the next one begins with all of them.
         if len(three) == 3 and not put and descriptor == list(keeper._journals)[-1]._descriptor:
             for number, journal in enumerate(three):
-                journal.append(Entry("row", 0, bytes([number])))
+                journal.append(JournalEntry("row", 0, bytes([number])))
             put.append(True)
 
     monkeypatch.setattr(os, "fsync", noted)

@@ -17,10 +17,10 @@ from tests.drive.episodes import begin
 from tests.drive.episodes import made as small
 from tests.recording.verify_rrd import verify_rrd
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import mend
+from workbench.recording.reader.reading import recover_confined
+from workbench.recording.writing.finish import recover
 from workbench.recording.writing.journal import FOLDER
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.recover import recover
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -110,15 +110,15 @@ def test_a_killed_writer_loses_a_second_of_one_episode(tmp_path: Path, steps: in
 
 
 def test_mending_is_done_by_a_process_that_bears_what_a_folder_brings(tmp_path: Path) -> None:
-    assert mend(tmp_path / "none") == mend(tmp_path) == ()
+    assert recover_confined(tmp_path / "none") == recover_confined(tmp_path) == ()
     begin(tmp_path, small(5, seed=8))
     for name in ("pipe.arrow", "pipe.scene"):
         os.mkfifo(tmp_path / FOLDER / name)
     (tmp_path / FOLDER / "zero.arrow").symlink_to("/dev/zero")
     (tmp_path / FOLDER / "noise.arrow").write_bytes(os.urandom(3000))
-    assert len(mend(tmp_path)) == 1
+    assert len(recover_confined(tmp_path)) == 1
     (path,) = tmp_path.glob("*.json")
-    assert read_episode(path).length == 5 and read_episode(path).unread == ()
+    assert read_episode(path).length == 5 and read_episode(path).broken_files == ()
 
 
 def test_files_of_another_folder_are_not_touched_by_the_process_either(tmp_path: Path) -> None:
@@ -128,5 +128,5 @@ def test_files_of_another_folder_are_not_touched_by_the_process_either(tmp_path:
     (other / "precious.json").write_text("{}")
     (folder / FOLDER).symlink_to(other)
     with pytest.raises(RecordingError, match="is a link"):
-        mend(folder)
+        recover_confined(folder)
     assert (other / "precious.json").exists()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.refused_calls import descriptors, left_open, refused
-from workbench.recording.writing.publish import make_last, publish, reason
+from workbench.recording.writing.publish import publish, reason, sync_files
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -33,11 +33,11 @@ def test_an_error_of_the_disk_is_told_of_whichever_file_it_is(tmp_path: Path, at
     paths = made(tmp_path)
     before, threads = descriptors(), threading.active_count()
     with refused(at, ("fsync",)) as calls, pytest.raises(OSError) as told:
-        make_last(paths)
+        sync_files(paths)
     assert told.value.errno == errno.EIO
     assert sorted(calls) == ["fsync id.h5", "fsync id.json", "fsync id.rrd"]
     assert left_open(before) == [] and threading.active_count() <= threads
-    make_last(paths)
+    sync_files(paths)
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])

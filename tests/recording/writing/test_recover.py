@@ -20,10 +20,9 @@ from tests.recording.refused_calls import descriptors, refused
 from workbench.core.scene.shapes import Mesh
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing import finish as making
-from workbench.recording.writing.finish import episode_stem
-from workbench.recording.writing.journal import FOLDER, Entry, Journal
+from workbench.recording.writing.finish import episode_stem, recover
+from workbench.recording.writing.journal import FOLDER, Journal, JournalEntry
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.recover import recover
 
 Maker = Callable[..., Made]
 
@@ -274,7 +273,7 @@ def not_a_state(make_episode: Maker, folder: Path) -> None:
 
 def of_a_camera_that_is_not_there(make_episode: Maker, folder: Path) -> None:
     path = left(make_episode(), folder, id="0")
-    changed(path, "acted", lambda text: text, more=Entry("camera/7", 0, bytes(28)))
+    changed(path, "acted", lambda text: text, more=JournalEntry("camera/7", 0, bytes(28)))
 
 
 def of_another_version(make_episode: Maker, folder: Path) -> None:
@@ -285,7 +284,9 @@ def of_another_version(make_episode: Maker, folder: Path) -> None:
     changed(left(make_episode(), folder, id="0"), "header", further)
 
 
-def changed(path: Path, kind: str, change: Callable[[bytes], bytes], more: Entry | None = None) -> None:
+def changed(
+    path: Path, kind: str, change: Callable[[bytes], bytes], more: JournalEntry | None = None
+) -> None:
     """Write the journal again with another value of the entries of a kind, and one entry `more` before the last row."""
     entries = entries_of(path)
     path.unlink()
@@ -294,7 +295,7 @@ def changed(path: Path, kind: str, change: Callable[[bytes], bytes], more: Entry
         if more is not None and number == len(entries) - 1:
             journal.append(more)
         value = change(entry.value) if entry.kind == kind else entry.value
-        journal.append(Entry(entry.kind, entry.number, value))
+        journal.append(JournalEntry(entry.kind, entry.number, value))
     journal.finish()
     journal.close()
 

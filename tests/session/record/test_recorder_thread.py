@@ -20,7 +20,7 @@ from workbench.recording.reader.read_episode import read_episode
 from workbench.session.process.job_lane import JobProgress
 from workbench.session.record import live
 from workbench.session.record.keep_past import KeepStatus
-from workbench.session.record.live import LiveRecorder, RecordingStatus, recovered_in_words
+from workbench.session.record.live import LiveRecorder, RecordingStatus, recovered_text
 from workbench.ui.live.episodes_panel import recording_html
 
 
@@ -59,9 +59,9 @@ def test_what_is_stopped_in_the_middle_of_an_episode_is_written(child_process: N
 
 
 def test_of_many_that_were_mended_three_are_named() -> None:
-    assert recovered_in_words([]) == ""
+    assert recovered_text([]) == ""
     said = "4 episodes that an earlier session left half written were mended: a, b, c and 1 more"
-    assert recovered_in_words(list("abcd")) == said
+    assert recovered_text(list("abcd")) == said
 
 
 def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_not_the_thread(

@@ -17,7 +17,7 @@ from tests.drive.episodes import made, poses_of, write
 from tests.drive.waiting import until
 from workbench.core.scene.shapes import SharedShapes
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.review import MOST_OPEN, Review

@@ -16,7 +16,7 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from workbench.authoring.problem import Problem
 from workbench.jobs.verdict import Verdict
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
 from workbench.session.rescore import verdict_text as words
 from workbench.session.rescore.background import RescoreView

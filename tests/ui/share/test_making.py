@@ -13,8 +13,8 @@ from tests.drive.waiting import until
 from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.source import Source
-from workbench.recording.reader.reading import sources_among
+from workbench.recording.episode.row import Source
+from workbench.recording.reader.reading import find_all_sources
 from workbench.ui.share.make import MakeRequest, Making, MakingView
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -68,7 +68,7 @@ class Told:
 
 
 def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_path: Path) -> None:
-    told, (source,) = Told(), sources_among([recordings])
+    told, (source,) = Told(), find_all_sources([recordings])
     assert told.making.start(MakeRequest("sheet", (source,), tmp_path))
     assert not told.making.start(MakeRequest("sheet", (source,), tmp_path)), "two at a time"
     view = told.wait(lambda view: not view.running)
@@ -81,7 +81,7 @@ def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_pat
 
 def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     told = Told()
-    told.making.start(MakeRequest("film", sources_among([recordings]) * 20, tmp_path / "films", "eye"))
+    told.making.start(MakeRequest("film", find_all_sources([recordings]) * 20, tmp_path / "films", "eye"))
     told.wait(lambda view: view.done > 0.01 and "eye" in view.doing)
     told.making.stop()
     view = told.wait(lambda view: not view.running)
@@ -92,7 +92,7 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
 def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
     told = Told()
     told.making.start(
-        MakeRequest("lerobot", sources_among([recordings]) * 200, tmp_path / "datasets" / "one")
+        MakeRequest("lerobot", find_all_sources([recordings]) * 200, tmp_path / "datasets" / "one")
     )
     until(lambda: list(tmp_path.glob("datasets/.one.*/videos/*/*/*")), "a film that is written")
     told.making.stop()
@@ -112,12 +112,12 @@ def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
 
 
 def test_recordings_are_found_in_folders_and_by_any_of_their_files(recordings: Path, tmp_path: Path) -> None:
-    (found,) = sources_among([recordings])
+    (found,) = find_all_sources([recordings])
     for file in recordings.iterdir():
         if not file.name.startswith("."):
-            assert sources_among([file, recordings]) == (found,)
+            assert find_all_sources([file, recordings]) == (found,)
     with pytest.raises(FileNotFoundError, match="nothing at"):
-        sources_among([tmp_path / "none"])
+        find_all_sources([tmp_path / "none"])
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(ValueError, match="no recording in"):
-        sources_among([tmp_path])
+        find_all_sources([tmp_path])

@@ -10,7 +10,7 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView

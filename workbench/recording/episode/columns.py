@@ -167,11 +167,11 @@ class TextWriter:
         self._cut: set[str] = set()
 
     @property
-    def is_silent(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether the state before had no texts."""
         return not self._last
 
-    def news(self, state: int, others: Mapping[str, OtherEntry]) -> list[Line]:
+    def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[Line]:
         """Lines for what is another than in the state before; `others` as in an `EpisodeRow`."""
         if not others and not self._last:
             return []

@@ -15,10 +15,10 @@ from PIL import Image
 
 from workbench.recording.episode.document import (
     SHARED,
-    CameraWords,
-    ColumnWords,
+    CameraJson,
+    ColumnType,
     Description,
-    SceneWords,
+    SceneJson,
     checksum,
 )
 from workbench.recording.episode.encoded_pictures import small_jpeg
@@ -47,9 +47,9 @@ def describe(episode: Episode) -> Description:
         fail=last.get("fail"),
         fail_once=once.get("fail"),
         action_names=episode.action_names,
-        cameras=[CameraWords.of(camera.info) for camera in episode.cameras],
+        cameras=[CameraJson.of(camera.info) for camera in episode.cameras],
         segmentation=episode.segmentation,
-        scene=SceneWords(geometry.body_names, geometry.body_kinds, geometry.body_hidden),
+        scene=SceneJson(geometry.body_names, geometry.body_kinds, geometry.body_hidden),
         evaluate=_columns(episode.evaluate),
         batch=_columns(episode.batch),
         texts=episode.texts,
@@ -57,16 +57,18 @@ def describe(episode: Episode) -> Description:
     )
 
 
-def describe_beside(episode: Episode, folder: Path, files: Sequence[Path], sealed: bool) -> Description:
+def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed: bool) -> Description:
     """`describe`, with what is only worth saying in `folder`, where the recording lies; of which these are the other `files`."""
     info = episode.info
     source = info.source_file if info.source_file and os.path.isabs(info.source_file) else None
-    said = msgspec.structs.replace(describe(episode), files={path.suffix: checksum(path) for path in files})
+    description = msgspec.structs.replace(
+        describe(episode), files={path.suffix: checksum(path) for path in files}
+    )
     return msgspec.structs.replace(
-        said,
+        description,
         source_path=None if source is None else _relative(source, os.fspath(folder.resolve())),
         thumbnail=thumbnail(_sample(episode)),
-        made_here=seal(said, source) if sealed else None,
+        made_here=seal(description, source) if sealed else None,
     )
 
 
@@ -87,7 +89,7 @@ def thumbnail(picture: bytes | None) -> str | None:
         return base64.b64encode(small_jpeg(image, THUMBNAIL_WIDTH)).decode()
 
 
-def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnWords]:
+def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnType]:
     return {name: (column.dtype.str, column.shape[1:]) for name, column in columns.items()}
 
 

@@ -27,9 +27,11 @@ from workbench.machine.files import (
     NotARegularFile,
     open_regular_file,
     read_regular_file,
+    replace_file,
 )
 from workbench.recording.episode.columns import TextTrack
 from workbench.recording.episode.episode import NO_SEED, ActedBy, EpisodeInfo, Seal
+from workbench.recording.episode.row import clean_note, clean_tags
 
 FORMAT = 1
 MOST_BYTES = 64 << 20
@@ -40,8 +42,8 @@ MOST_PARTS = 40
 
 T = TypeVar("T")
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Row = tuple[float, float, float]
-ColumnWords = tuple[str, tuple[int, ...]]
+Vector = tuple[float, float, float]
+ColumnType = tuple[str, tuple[int, ...]]
 """numpy's type, and the shape of one row."""
 
 
@@ -49,7 +51,7 @@ class WrongDocument(ValueError):
     """No JSON that can be read, or a field is missing or of another type; the message goes on from the file's name."""
 
 
-class CameraWords(Struct, frozen=True):
+class CameraJson(Struct, frozen=True):
     """A camera's lens; where its config stands in the source is of no use to another day."""
 
     name: str
@@ -59,12 +61,12 @@ class CameraWords(Struct, frozen=True):
     fovy: float
     near: float
     far: float
-    intrinsic: tuple[Row, Row, Row]
+    intrinsic: tuple[Vector, Vector, Vector]
     mount: str | None
     modalities: tuple[str, ...]
 
     @classmethod
-    def of(cls, camera: CameraInfo) -> CameraWords:
+    def of(cls, camera: CameraInfo) -> CameraJson:
         rows = np.asarray(camera.intrinsic, dtype=np.float64).tolist()
         numbers = float(camera.fovy), float(camera.near), float(camera.far)
         size = camera.width, camera.height
@@ -76,7 +78,7 @@ class CameraWords(Struct, frozen=True):
         return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, self.mount, self.modalities)
 
 
-class SceneWords(Struct, frozen=True):
+class SceneJson(Struct, frozen=True):
     """Every body of the scene."""
 
     body_names: tuple[str, ...]
@@ -91,7 +93,7 @@ class Checksum(Struct, frozen=True):
     xxh3_128: str | None = None
 
 
-class SealWords(Struct, frozen=True):
+class SealJson(Struct, frozen=True):
     """Of the installation that recorded it (`made_here`)."""
 
     content: str
@@ -133,15 +135,15 @@ class Description(Struct, frozen=True, kw_only=True):
     fail: bool | None
     fail_once: bool | None
     action_names: tuple[str, ...]
-    cameras: list[CameraWords]
+    cameras: list[CameraJson]
     segmentation: dict[int, str]
-    scene: SceneWords
-    evaluate: dict[str, ColumnWords]
-    batch: dict[str, ColumnWords] = {}
+    scene: SceneJson
+    evaluate: dict[str, ColumnType]
+    batch: dict[str, ColumnType] = {}
     """Numbers that ``evaluate()`` returned without a row for each env."""
     texts: dict[str, TextTrack] = {}
     """Entries of ``evaluate()`` that are no numbers."""
-    obs: dict[str, ColumnWords]
+    obs: dict[str, ColumnType]
     # In the .json alone:
     files: dict[str, Checksum] | UnsetType = UNSET
     """By suffix, the other two files."""
@@ -149,7 +151,7 @@ class Description(Struct, frozen=True, kw_only=True):
     """Where the task's file lies as seen from the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
     """Base64 of a JPEG; None without cameras."""
-    made_here: SealWords | None | UnsetType = UNSET
+    made_here: SealJson | None | UnsetType = UNSET
     """None where the installation could make no seal."""
     tags: list[str] | UnsetType = UNSET
     note: str | UnsetType = UNSET
@@ -175,33 +177,33 @@ SHARED = (
 """What `EpisodeInfo` and `Description` say alike."""
 
 
-class ResetWords(Struct, frozen=True):
+class ResetJson(Struct, frozen=True):
     """How ManiSkill says that an episode was begun."""
 
     seed: Whole | list[Whole] | None = None
     options: dict[str, Any] | None = None
 
 
-class EpisodeWords(Struct, frozen=True):
+class EpisodeJson(Struct, frozen=True):
     """An episode in ManiSkill's words; an env of several says a list of one where others say a number."""
 
     episode_id: int
     episode_seed: Whole | list[Whole] | None = None
     control_mode: str | dict[str, Any] | None = None
     elapsed_steps: Whole | list[Whole] | None = None
-    reset_kwargs: ResetWords | None = None
+    reset_kwargs: ResetJson | None = None
     success: bool | list[bool] | None = None
     fail: bool | list[bool] | None = None
 
     @property
     def seed(self) -> int | None:
-        said = self.episode_seed
-        if said is None and self.reset_kwargs is not None:
-            said = self.reset_kwargs.seed
-        return said if not isinstance(said, list) else said[0] if said else None
+        seed = self.episode_seed
+        if seed is None and self.reset_kwargs is not None:
+            seed = self.reset_kwargs.seed
+        return seed if not isinstance(seed, list) else seed[0] if seed else None
 
 
-class EnvWords(Struct, frozen=True):
+class EnvJson(Struct, frozen=True):
     """How ManiSkill makes the env again."""
 
     env_id: str | None = None
@@ -213,45 +215,45 @@ class EnvWords(Struct, frozen=True):
 class Document:
     """A ``.json`` that may be a recording's. Its parts are checked when they are asked for."""
 
-    said: Mapping[str, Any]
+    data: Mapping[str, Any]
 
     @property
     def is_ours(self) -> bool:
-        return isinstance(self.said.get("workbench"), dict)
+        return isinstance(self.data.get("workbench"), dict)
 
     @property
-    def is_maniskills(self) -> bool:
-        return isinstance(self.said.get("episodes"), list)
+    def is_maniskill(self) -> bool:
+        return isinstance(self.data.get("episodes"), list)
 
     def description(self) -> Description:
         """Of a recording of ours. Raises WrongDocument."""
-        return _typed(self.said.get("workbench"), Description, "workbench")
+        return _typed(self.data.get("workbench"), Description, "workbench")
 
-    def env(self) -> EnvWords:
+    def env(self) -> EnvJson:
         """Raises WrongDocument."""
-        return _typed(self.said.get("env_info") or {}, EnvWords, "env_info")
+        return _typed(self.data.get("env_info") or {}, EnvJson, "env_info")
 
-    def episode(self, number: int) -> EpisodeWords:
+    def episode(self, number: int) -> EpisodeJson:
         """Of a file of ManiSkill's. Raises WrongDocument."""
-        return _typed(self.said["episodes"][number], EpisodeWords, f"episodes[{number}]")
+        return _typed(self.data["episodes"][number], EpisodeJson, f"episodes[{number}]")
 
     @property
     def source_type(self) -> str:
         """What chose ManiSkill's actions; empty where it is not said."""
-        said = self.said.get("source_type")
-        return " ".join(said.split())[:80] if isinstance(said, str) else ""
+        source = self.data.get("source_type")
+        return " ".join(source.split())[:80] if isinstance(source, str) else ""
 
 
 def read_document(path: Path) -> Document:
     """Raises OSError, WrongDocument."""
-    said = read_json(path)
-    return Document(said if isinstance(said, dict) else {})
+    data = read_json(path)
+    return Document(data if isinstance(data, dict) else {})
 
 
 def description_in(text: str, source: Mapping[str, str]) -> Description:
     """The description in an ``.rrd``, and the texts that lie beside it there. Raises WrongDocument."""
-    said = parse_json(text)
-    return _typed({**said, "source": dict(source)} if isinstance(said, dict) else said, Description, "")
+    data = parse_json(text)
+    return _typed({**data, "source": dict(source)} if isinstance(data, dict) else data, Description, "")
 
 
 def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
@@ -301,9 +303,9 @@ def _plain(value: object) -> Any:
     return msgspec.structs.astuple(value) if value.__struct_config__.array_like else fields_of(value)
 
 
-def _typed(said: object, kind: type[T], place: str) -> T:
+def _typed(data: object, kind: type[T], place: str) -> T:
     try:
-        return msgspec.convert(said, kind, str_keys=True)
+        return msgspec.convert(data, kind, str_keys=True)
     except (msgspec.ValidationError, OverflowError) as error:
         what, _, within = str(error).partition(" - at `$")
         at = f"${'.' if place else ''}{place}{within.rstrip('`')}"
@@ -359,21 +361,88 @@ def checksum(path: Path) -> Checksum:
     return Checksum(size, hashed.hexdigest())
 
 
-def check(path: Path, said: Mapping[str, Checksum]) -> None:
+def check(path: Path, checksums: Mapping[str, Checksum]) -> None:
     """Compare the file at `path` with what its ``.json`` says of files of its suffix, if it says anything.
 
     Raises:
         OSError: it is another, and how; or it cannot be read.
     """
-    if (why := wrong_size(said, path.suffix, path.stat().st_size)) is not None:
+    if (why := wrong_size(checksums, path.suffix, path.stat().st_size)) is not None:
         raise OSError(why)
-    written = said.get(path.suffix)
+    written = checksums.get(path.suffix)
     if written is not None and written.xxh3_128 is not None and checksum(path) != written:
         raise OSError("its checksum is not the one that was written down with it")
 
 
-def wrong_size(said: Mapping[str, Checksum], suffix: str, size: int) -> str | None:
+def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str | None:
     """What is wrong with a file that is `size` bytes long; None for nothing."""
-    if suffix not in said or said[suffix].size == size:
+    if suffix not in checksums or checksums[suffix].size == size:
         return None
-    return f"it has {size} bytes, and had {said[suffix].size}"
+    return f"it has {size} bytes, and had {checksums[suffix].size}"
+
+
+# --- tags and notes ----------------------------------------------------------------------------
+
+
+MOST_NOTES_BYTES = 16 << 20
+"""Of a ``.notes``, and of the ``.json`` of a recording of ours, which holds its task's source and one small picture."""
+_NOTES = "workbench_notes"
+
+
+def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes``; what is not
+    one holds none."""
+    try:
+        return _notes(path)
+    except (OSError, ValueError):
+        return {}
+
+
+def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note: str) -> None:
+    """Put tags and note of one trajectory into a ``.notes``; without any left, the file goes.
+
+    Raises:
+        OSError: the file cannot be read, or the folder not written to.
+        ValueError: there is something else in the file, which is not written over. The message is a sentence's end.
+    """
+    try:
+        entries = _notes(path)
+    except FileNotFoundError:
+        entries = {}
+    entries.pop(trajectory or "", None)
+    if tags or note:
+        entries[trajectory or ""] = (tags, note)
+    if not entries:
+        path.unlink(missing_ok=True)
+        return
+    plain = {name: {"tags": list(tags), "note": note} for name, (tags, note) in sorted(entries.items())}
+    replace_file(path, json.dumps({_NOTES: plain}, indent=2, ensure_ascii=False).encode())
+
+
+def _notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Raises OSError, ValueError."""
+    try:
+        entries = read_json(path, MOST_NOTES_BYTES)[_NOTES]
+        return {
+            str(name): (clean_tags(entry.get("tags")), clean_note(entry.get("note")))
+            for name, entry in entries.items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path.name} holds no notes that this version can read: move it away") from error
+
+
+def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None:
+    """Put tags and note into the ``.json`` of a recording of ours.
+
+    Raises:
+        OSError: it cannot be read or written.
+        ValueError: it is no recording of ours. The message is the end of a sentence.
+    """
+    described = read_json(path, MOST_NOTES_BYTES)
+    if not isinstance(described, dict) or not Document(described).is_ours:
+        raise ValueError("is not a recording of the workbench")
+    described["workbench"] |= {"tags": list(tags), "note": note}
+    # Indented as what was read: these files are looked at.
+    with open_regular_file(path) as file:
+        indent = 2 if b"\n" in file.read(4) else None
+    replace_file(path, json.dumps(described, indent=indent).encode())

@@ -115,7 +115,7 @@ def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Unread:
+class BrokenFile:
     """A file of a recording that is broken."""
 
     file: str
@@ -159,7 +159,7 @@ class Episode:
     """(T + 1, ...) the numbers that ``evaluate()`` returned of the whole batch."""
     texts: dict[str, TextTrack] = field(default_factory=dict)
     """Its entries that are no numbers."""
-    unread: tuple[Unread, ...] = ()
+    broken_files: tuple[BrokenFile, ...] = ()
     """Of a recording that was read: its files that are broken."""
 
     @property
@@ -210,11 +210,11 @@ def box_of_moving(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, N
 ActedBy = tuple[tuple[int, str], ...]
 
 
-def acted_by_from(said: Iterable[Iterable[Any]] | None) -> ActedBy:
+def parse_acted_by(pairs: Iterable[Iterable[Any]] | None) -> ActedBy:
     """`EpisodeInfo.acted_by` of what JSON keeps of it. Raises TypeError or ValueError."""
-    return tuple((int(begin), str(what)) for begin, what in said or ())
+    return tuple((int(begin), str(what)) for begin, what in pairs or ())
 
 
-def acted_by_in_words(acted_by: ActedBy) -> str:
+def acted_by_text(acted_by: ActedBy) -> str:
     """``random; from step 41 on: sliders``; empty where it is not known. Action k leads to step k + 1."""
     return "; ".join(what if begin == 0 else f"from step {begin + 1} on: {what}" for begin, what in acted_by)

@@ -19,7 +19,7 @@ from hashlib import sha256
 from typing import Any
 
 from workbench.machine.user_folder import create_private, read_private, set_aside
-from workbench.recording.episode.document import SHARED, Description, SealWords, as_json
+from workbench.recording.episode.document import SHARED, Description, SealJson, as_json
 from workbench.recording.episode.episode import EpisodeInfo
 
 log = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
 _COVERED = {*SHARED, "seed", "source"} - {"acted_by"}
-_told: set[str] = set()
+_logged: set[str] = set()
 
 
 class MadeHere(Enum):
@@ -39,16 +39,18 @@ class MadeHere(Enum):
     """And the file that it names now is the one that was open then (with another text, perhaps)."""
 
 
-def seal(said: Description, source_file: str | None) -> SealWords | None:
-    """For the description `said` of a recording that is being made; None as `seal_text`.
+def seal(description: Description, source_file: str | None) -> SealJson | None:
+    """For the description `description` of a recording that is being made; None as `seal_text`.
 
     Args:
         source_file: the absolute path of the task's file.
     """
-    values = {name: getattr(said, name) for name in _COVERED}
-    content = seal_text(_content(values, said.source_file, said.files, said.acted_by), "content")
+    values = {name: getattr(description, name) for name in _COVERED}
+    content = seal_text(
+        _content(values, description.source_file, description.files, description.acted_by), "content"
+    )
     place = seal_text(source_file or "", "place")
-    return None if content is None or place is None else SealWords(content, place)
+    return None if content is None or place is None else SealJson(content, place)
 
 
 def made_here(info: EpisodeInfo) -> MadeHere:
@@ -79,7 +81,7 @@ def seal_text(text: str, what: str = "text") -> str | None:
     try:
         return _mac(_key() or _new_key(), what, text)
     except OSError as error:
-        _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
+        _log_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
         return None
 
 
@@ -88,7 +90,7 @@ def is_sealed(text: str, found: object, what: str = "text") -> bool:
     try:
         key = _key()
     except OSError as error:
-        _tell_once(f"Recordings that were made here cannot be told from others: {error}")
+        _log_once(f"Recordings that were made here cannot be told from others: {error}")
         return False
     if key is None or not isinstance(found, str):
         return False
@@ -117,7 +119,7 @@ def _key() -> bytes | None:
 def _new_key() -> bytes:
     if read_private(KEY_FILE) is not None:
         broken = set_aside(KEY_FILE)
-        _tell_once(
+        _log_once(
             f"The key of this installation's recordings was broken, and is {broken} now: there is a new one."
         )
     create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # or another process did, a moment ago
@@ -127,7 +129,7 @@ def _new_key() -> bytes:
     return key
 
 
-def _tell_once(what: str) -> None:
-    if what not in _told:
-        _told.add(what)
+def _log_once(what: str) -> None:
+    if what not in _logged:
+        _logged.add(what)
         log.warning("%s", what)

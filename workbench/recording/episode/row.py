@@ -14,9 +14,41 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from workbench.recording.episode.source import Source
+SourceKind = Literal["ours", "maniskill", "lerobot"]
+"""Who made a recording: which of the three ways to read it."""
 
-Kind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
+
+class UnreadableRecording(ValueError):
+    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One recording, not read yet."""
+
+    path: Path
+    """A file of ours, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
+    part: str | None = None
+    """Which of several: ``traj_3``, or the number of the dataset's episode."""
+    id: str = ""
+    """What the caller knows it by."""
+    name: str = ""
+    """For people."""
+
+    @property
+    def stem(self) -> str:
+        """Of the names of what is made from it."""
+        stem = self.path.name if self.kind == "lerobot" else self.path.stem
+        return stem if self.part is None else f"{stem}_{self.part}"
+
+    @property
+    def kind(self) -> SourceKind:
+        if self.part is None:
+            return "ours"
+        return "maniskill" if self.path.suffix == ".h5" else "lerobot"
+
+
+RecordingKind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
 LONGEST_TAG = 40
 LONGEST_NOTE = 1000
 MOST_TAGS = 20
@@ -26,7 +58,7 @@ MOST_TAGS = 20
 class Facts:
     """What a file says of one recording in it. None is: not known."""
 
-    kind: Kind
+    kind: RecordingKind
     task: str = ""
     trajectory: str | None = None
     """Which one of the file, for a file with several (ManiSkill's), or of a LeRobot dataset."""
@@ -56,7 +88,7 @@ class Facts:
     """One sentence, where something is wrong with the files."""
 
 
-Entry = tuple[Facts, bytes | None]
+LibraryEntry = tuple[Facts, bytes | None]
 """A recording and its thumbnail (jpeg)."""
 
 
@@ -97,21 +129,21 @@ def clean_facts(facts: Facts) -> Facts:
     wholes = ("seed", "env_index", "length")
     return replace(
         facts,
-        **{name: text(getattr(facts, name)) for name in texts},
-        **{name: whole(getattr(facts, name)) for name in wholes},
-        trajectory=None if facts.trajectory is None else text(facts.trajectory),
+        **{name: clean_text(getattr(facts, name)) for name in texts},
+        **{name: integer(getattr(facts, name)) for name in wholes},
+        trajectory=None if facts.trajectory is None else clean_text(facts.trajectory),
         written=number(facts.written),
         total_reward=total(facts.total_reward),
         tags=clean_tags(facts.tags),
         note=clean_note(facts.note),
-        problem=None if facts.problem is None else text(facts.problem, 500),
+        problem=None if facts.problem is None else clean_text(facts.problem, 500),
     )
 
 
 # --- values of any type, as what they should be or not at all ---------------------------------------
 
 
-def text(value: object, longest: int = 200) -> str:
+def clean_text(value: object, longest: int = 200) -> str:
     """One line of printable characters; empty for what is no text."""
     if not isinstance(value, str):
         return ""
@@ -120,7 +152,7 @@ def text(value: object, longest: int = 200) -> str:
     return "".join(c if c.isprintable() else " " for c in value[: 2 * longest]).strip()[:longest]
 
 
-def whole(value: object) -> int | None:
+def integer(value: object) -> int | None:
     """A whole number that fits 64 bits; lists of one number (a batched env's seed) are that number."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
@@ -150,13 +182,13 @@ def total(value: object) -> float | None:
     return number(value)
 
 
-def truth(value: object) -> bool | None:
+def boolean(value: object) -> bool | None:
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     return value if isinstance(value, bool) else None
 
 
-def moment(value: object) -> float | None:
+def unix_seconds(value: object) -> float | None:
     """Unix seconds of an ISO date; one without a zone is UTC."""
     if not isinstance(value, str):
         return None
@@ -175,9 +207,9 @@ def clean_tags(values: object) -> tuple[str, ...]:
     """At most `MOST_TAGS` words, each once, in their order; a comma parts them where they are typed."""
     if not isinstance(values, Iterable) or isinstance(values, (str, bytes, Mapping)):
         return ()
-    tags = (text(value, LONGEST_TAG).replace(",", " ").strip() for value in values)
+    tags = (clean_text(value, LONGEST_TAG).replace(",", " ").strip() for value in values)
     return tuple(dict.fromkeys(tag for tag in tags if tag))[:MOST_TAGS]
 
 
 def clean_note(value: object) -> str:
-    return text(value, LONGEST_NOTE)
+    return clean_text(value, LONGEST_NOTE)

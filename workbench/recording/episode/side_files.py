@@ -70,7 +70,7 @@ def hash_of(path: Path) -> str:
     return _hashes[key]
 
 
-def side_files_in_words(task: str | None, recorded: Mapping[str, str]) -> str:
+def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
     """A sentence on what the recorded text needs besides, and how that is now; empty for nothing.
 
     Args:
@@ -79,28 +79,28 @@ def side_files_in_words(task: str | None, recorded: Mapping[str, str]) -> str:
     """
     if not recorded:
         return ""
-    amiss = list(_not_as_recorded(folder_of(task), recorded).items())
+    changed = list(_changed_files(folder_of(task), recorded).items())
     names = ", ".join(list(recorded)[:3]) + (f" and {len(recorded) - 3} more" if len(recorded) > 3 else "")
     it = "it is" if len(recorded) == 1 else "they are"
-    now = f"{it} as then" if not amiss else "; ".join(f"{name} {what}" for name, what in amiss[:3])
-    if len(amiss) > 3:
-        now += f"; nor are {len(amiss) - 3} more as they were"
+    now = f"{it} as then" if not changed else "; ".join(f"{name} {what}" for name, what in changed[:3])
+    if len(changed) > 3:
+        now += f"; nor are {len(changed) - 3} more as they were"
     return f"The task also reads {names}, which the recording does not hold: {now}."
 
 
-def _not_as_recorded(folder: Path | None, recorded: Mapping[str, str]) -> dict[str, str]:
+def _changed_files(folder: Path | None, recorded: Mapping[str, str]) -> dict[str, str]:
     """Those of `recorded` that are not as they were, and what is with them."""
-    amiss = {}
+    changed = {}
     for name, hashed in recorded.items():
-        path = place_of(folder, name)
+        path = side_file_path(folder, name)
         try:
             if path is None or not path.is_file():
-                amiss[name] = "is not there"
+                changed[name] = "is not there"
             elif hash_of(path) != hashed:
-                amiss[name] = "has changed since"
+                changed[name] = "has changed since"
         except OSError as error:
-            amiss[name] = f"cannot be read ({error.strerror})"
-    return amiss
+            changed[name] = f"cannot be read ({error.strerror})"
+    return changed
 
 
 def folder_of(task: str | None) -> Path | None:
@@ -108,7 +108,7 @@ def folder_of(task: str | None) -> Path | None:
     return Path(task).parent if task is not None and os.path.isabs(task) and os.path.isfile(task) else None
 
 
-def place_of(folder: Path | None, name: str) -> Path | None:
+def side_file_path(folder: Path | None, name: str) -> Path | None:
     """Where a side file is; None where that is nowhere, or above the folder: a recording is somebody else's file."""
     pure = PurePosixPath(name)
     if folder is None or pure.is_absolute() or ".." in pure.parts or not pure.parts:

@@ -184,8 +184,8 @@ class _Writer:
             episode = read()
         except ValueError as error:
             raise DoesNotFit(str(error) if name in str(error) else f"{name}: {error}") from error
-        if episode.unread:
-            raise DoesNotFit(" ".join(broken.sentence for broken in episode.unread))
+        if episode.broken_files:
+            raise DoesNotFit(" ".join(broken.sentence for broken in episode.broken_files))
         if self._options.only_successes and not _succeeds(episode):
             self._made.left_out += 1
             return None
@@ -305,7 +305,7 @@ class _Writer:
             }
         )
         pq.write_table(tasks.replace_schema_metadata(form.tasks_metadata()), self._folder / form.TASKS)
-        stats = {key: form.together(parts) for key, parts in self._stats.items()}
+        stats = {key: form.combined_stats(parts) for key, parts in self._stats.items()}
         _write_json(
             self._folder / form.STATS,
             {key: {name: value.tolist() for name, value in of.items()} for key, of in stats.items()},

@@ -90,7 +90,7 @@ def sampled(count: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, MOST_SAMPLED)).round().astype(np.int64))
 
 
-def together(parts: list[Stats]) -> Stats:
+def combined_stats(parts: list[Stats]) -> Stats:
     """The statistics of all episodes from those of each, as lerobot puts them together (quantiles are means of them)."""
     counts = np.array([float(part["count"][0]) for part in parts])
     weights = (counts / counts.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
@@ -166,17 +166,21 @@ class Frames:
 
     def features(self) -> dict[str, dict]:
         """As ``meta/info.json`` says them, without those of every frame."""
-        said: dict[str, dict] = {}
+        features: dict[str, dict] = {}
         for camera in self.cameras:
             info = cameras_by_name(self.episode)[camera].info
-            said[IMAGES + feature_name(camera)] = {
+            features[IMAGES + feature_name(camera)] = {
                 "dtype": "video",
                 "shape": [info.height, info.width, 3],
                 "names": ["height", "width", "channels"],
             }
         for key, values in self.columns.items():
-            said[key] = {"dtype": str(values.dtype), "shape": [values.shape[1]], "names": self.names.get(key)}
-        return said
+            features[key] = {
+                "dtype": str(values.dtype),
+                "shape": [values.shape[1]],
+                "names": self.names.get(key),
+            }
+        return features
 
 
 def feature_name(name: str) -> str:
@@ -199,7 +203,7 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     columns: dict[str, NDArray] = {}
     names: dict[str, list[str]] = {}
     sources = _numbers(episode)
-    keys = {STATE: choice.state or _usual_state(sources), ENVIRONMENT: choice.environment}
+    keys = {STATE: choice.state or _default_state(sources), ENVIRONMENT: choice.environment}
     for feature, wanted in keys.items():
         chosen = [key for name in wanted for key in _below(sources, name)]
         if chosen:
@@ -237,7 +241,7 @@ def _numbers(episode: Episode) -> dict[str, NDArray[np.float32]]:
     }
 
 
-def _usual_state(sources: dict[str, NDArray[np.float32]]) -> tuple[str, ...]:
+def _default_state(sources: dict[str, NDArray[np.float32]]) -> tuple[str, ...]:
     return ("agent",) if any(key.split("/")[0] == "agent" for key in sources) else tuple(sources)
 
 

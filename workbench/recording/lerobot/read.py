@@ -26,12 +26,11 @@ from workbench.machine.files import open_regular_file
 from workbench.recording.episode.document import read_json
 from workbench.recording.episode.encoded_pictures import MOST_PIXELS, EncodedPictures, LazyPictures
 from workbench.recording.episode.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
-from workbench.recording.episode.row import Facts, text, whole
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import Facts, UnreadableRecording, clean_text, integer
 from workbench.recording.films import FilmPart
 from workbench.recording.lerobot import format as form
 
-USUAL_FOVY = math.radians(60)
+DEFAULT_FOVY = math.radians(60)
 """A dataset does not say how its cameras see; nothing is computed from this."""
 MOST_EPISODES = 100_000
 MOST_FRAMES = 20_000_000
@@ -62,9 +61,9 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
             seed = ours[index].get("seed") if 0 <= index < len(ours) else None
             facts = Facts(
                 "lerobot",
-                task=text(_task(entry)),
+                task=clean_text(_task(entry)),
                 trajectory=str(index),
-                seed=whole(seed),
+                seed=integer(seed),
                 length=int(entry["length"]),
                 total_reward=None if totals is None else totals.get(index, 0.0),
                 success=None if successes is None else successes.get(index, 0.0) > 0,
@@ -200,10 +199,10 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
             kind="sensor",
             width=width,
             height=height,
-            fovy=USUAL_FOVY,
+            fovy=DEFAULT_FOVY,
             near=0.01,
             far=100.0,
-            intrinsic=intrinsic_from_fov(USUAL_FOVY, width, height).astype(np.float32),
+            intrinsic=intrinsic_from_fov(DEFAULT_FOVY, width, height).astype(np.float32),
             mount=None,
             modalities=("rgb",),
         ),

@@ -27,7 +27,7 @@ from typing import TypeVar
 import msgspec
 
 from workbench.machine.user_folder import cache_folder
-from workbench.recording.episode.row import Entry, Facts, clean_facts
+from workbench.recording.episode.row import Facts, LibraryEntry, clean_facts
 from workbench.recording.reader.scan import Found
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class LibraryIndex:
         self._lock = threading.Lock()
         self._path = index_path(folder)
         self._database: sqlite3.Connection | None = _open(self._path)
-        _tidy(self._path)
+        _remove_oldest(self._path)
 
     def load(self) -> dict[str, Kept]:
         """All that it holds, by key."""
@@ -74,7 +74,9 @@ class LibraryIndex:
 
         return self._do(read, {})
 
-    def store(self, read: Collection[tuple[Found, Sequence[Entry]]], gone: Collection[str] = ()) -> None:
+    def store(
+        self, read: Collection[tuple[Found, Sequence[LibraryEntry]]], gone: Collection[str] = ()
+    ) -> None:
         """Keep what was read, and forget the keys that are gone."""
 
         def write(database: sqlite3.Connection) -> None:
@@ -109,12 +111,12 @@ class LibraryIndex:
                 self._database.close()
                 self._database = None
 
-    def _do(self, work: Callable[[sqlite3.Connection], T], otherwise: T) -> T:
-        """`otherwise` where another process holds the file, and where what is there is of no use: it is thrown away. Another
+    def _do(self, work: Callable[[sqlite3.Connection], T], default: T) -> T:
+        """`default` where another process holds the file, and where what is there is of no use: it is thrown away. Another
         process that has it open goes on with what it has, unharmed."""
         with self._lock:
             if self._database is None:
-                return otherwise
+                return default
             try:
                 with self._database:
                     return work(self._database)
@@ -126,7 +128,7 @@ class LibraryIndex:
                     self._database.close()
                     _remove(self._path)
                     self._database = _open(self._path)
-                return otherwise
+                return default
 
 
 def index_path(folder: Path) -> Path:
@@ -163,7 +165,7 @@ def _connect(name: str) -> sqlite3.Connection:
     return database
 
 
-def _tidy(path: Path) -> None:
+def _remove_oldest(path: Path) -> None:
     """Throw away the indices that were used least lately, where there are very many."""
     try:
         os.utime(path)

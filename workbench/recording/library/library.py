@@ -22,16 +22,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from workbench.machine.processes.watched_thread import watched_thread
-from workbench.recording.episode.row import Entry, Facts, LibraryRow, clean_note, clean_tags, text
-from workbench.recording.episode.tags import write_into_description, write_notes
+from workbench.recording.episode.document import write_into_description, write_notes
+from workbench.recording.episode.row import (
+    Facts,
+    LibraryEntry,
+    LibraryRow,
+    clean_note,
+    clean_tags,
+    clean_text,
+)
 from workbench.recording.library.index import Kept, LibraryIndex
 from workbench.recording.library.trash import (
     Trash,
     TrashError,
     empty_trash,
-    look_into_trash,
-    put_into_trash,
-    take_out_of_trash,
+    move_to_trash,
+    read_trash,
+    restore_from_trash,
 )
 from workbench.recording.reader.reading import read_rows
 from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, Scan, key_of, scan_folder
@@ -118,7 +125,7 @@ class Library:
         self._thread = watched_thread("library", self._watch)
         self._thread.start()
 
-    def look_soon(self) -> None:
+    def request_scan(self) -> None:
         """Have the watching thread look at every file now, for whoever knows that something changed."""
         self._asked.set()
 
@@ -154,7 +161,7 @@ class Library:
         """
         with self._looking:
             late = time.monotonic() - self._thorough_at > LOOK_THOROUGHLY_EVERY
-            if not (thorough or late) and self._scan.looks_the_same():
+            if not (thorough or late) and self._scan.is_unchanged():
                 return
             with self._changing:
                 if self._index is None and self.folder.is_dir() and not self._stopping.is_set():
@@ -182,7 +189,7 @@ class Library:
             # Where not all could be looked at, what is not seen may be there: the index keeps it.
             forgotten = [] if scan.problem else sorted(gone)
         changed.sort(key=lambda found: found.newest, reverse=True)
-        unsaved: list[tuple[Found, list[Entry]]] = []
+        unsaved: list[tuple[Found, list[LibraryEntry]]] = []
         published = time.monotonic()
         for done, (found, entries) in enumerate(read_rows(self.folder, changed)):
             if self._stopping.is_set():
@@ -201,7 +208,7 @@ class Library:
             self._save(unsaved, forgotten)
             self._show(reading=None if only is None else before, problem=scan.problem)
 
-    def _save(self, read: list[tuple[Found, list[Entry]]], gone: list[str]) -> None:
+    def _save(self, read: list[tuple[Found, list[LibraryEntry]]], gone: list[str]) -> None:
         if self._index is not None and (read or gone):
             self._index.store(read, gone)
 
@@ -222,13 +229,13 @@ class Library:
         name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
         name += "" if facts.trajectory is None else f"#{facts.trajectory}"
         # A file's name may hold bytes that are no text, which no page can be sent.
-        name, place = text(name, 400), (found.key, number)
+        name, place = clean_text(name, 400), (found.key, number)
         paths, size = found.paths(self.folder), sum(found.sizes.values())
         return LibraryRow(**vars(facts), id=id, name=name, place=place, paths=paths, size=size)
 
     def _publish(self, **changes: object) -> None:
         with self._changed:
-            view = replace(self._view, trash=look_into_trash(self.folder), **changes)  # type: ignore[arg-type]
+            view = replace(self._view, trash=read_trash(self.folder), **changes)  # type: ignore[arg-type]
             if view.rows is not self._view.rows:
                 self._by_id = {row.id: row for row in view.rows}
             if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
@@ -257,7 +264,7 @@ class Library:
             touched: set[str] = set()
             try:
                 for id in ids:
-                    row, found = self._there(id)
+                    row, found = self._row_and_files(id)
                     tags, note = change(row)
                     if (tags, note) == (row.tags, row.note):
                         continue
@@ -287,7 +294,7 @@ class Library:
             keys = self._keys_to_delete(ids)
             paths = [self._kept[key].found.paths(self.folder) for key in sorted(keys)]
             try:
-                batch = put_into_trash(self.folder, paths)
+                batch = move_to_trash(self.folder, paths)
             except TrashError as error:
                 raise LibraryError(f"Not everything was deleted. {error}") from error
             finally:
@@ -296,24 +303,24 @@ class Library:
                 raise LibraryError("Those files were gone already.")
             return batch
 
-    def may_delete(self, ids: Iterable[str]) -> None:
+    def check_delete(self, ids: Iterable[str]) -> None:
         """Raise LibraryError where `delete` would refuse them."""
         with self._changing:
             self._keys_to_delete(ids)
 
     def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
         wanted = set(ids)
-        keys = {self._there(id)[1].key for id in wanted}
+        keys = {self._row_and_files(id)[1].key for id in wanted}
         for key in keys:
             if key.split("/")[-2:] == DATASET_KEY and "/" in key:
                 raise LibraryError(
-                    f"{text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
+                    f"{clean_text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
                     "deleted from here: delete the folder."
                 )
             of_file = {row.id for row in self.rows() if row.place[0] == key}
             if not wanted >= of_file:
                 raise LibraryError(
-                    f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
+                    f"{clean_text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
                     "select all of them."
                 )
         return keys
@@ -325,11 +332,11 @@ class Library:
             LibraryError: there is none, or something could not be brought back.
         """
         with self._changing:
-            batches = look_into_trash(self.folder).batches
+            batches = read_trash(self.folder).batches
             if not batches:
                 raise LibraryError("The trash is empty.")
             try:
-                back = take_out_of_trash(self.folder, batches[-1])
+                back = restore_from_trash(self.folder, batches[-1])
             except TrashError as error:
                 raise LibraryError(f"Not everything could be brought back. {error}") from error
             self._read_changed(scan_folder(self.folder), {key_of(path) for path in back})
@@ -344,7 +351,7 @@ class Library:
             finally:
                 self._publish()
 
-    def _there(self, id: str) -> tuple[LibraryRow, Found]:
+    def _row_and_files(self, id: str) -> tuple[LibraryRow, Found]:
         row = self.row(id)
         kept = None if row is None else self._kept.get(row.place[0])
         if row is None or kept is None:

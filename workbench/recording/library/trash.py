@@ -36,7 +36,7 @@ class TrashError(OSError):
     the message says where."""
 
 
-def put_into_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
+def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
     """Move the files of these recordings, each the one that makes it first; returns the name of the deletion, or None
     if nothing was there any more.
 
@@ -54,7 +54,7 @@ def put_into_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | 
     return batch if moved else None
 
 
-def take_out_of_trash(folder: Path, batch: str) -> tuple[str, ...]:
+def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
     """Move what this deletion took to where it was; returns the paths below `folder`, with ``/``. What stands there now is not
     written over.
 
@@ -62,7 +62,7 @@ def take_out_of_trash(folder: Path, batch: str) -> tuple[str, ...]:
         TrashError: something could not be moved, and is in the trash still.
     """
     root = folder / TRASH / batch
-    if batch not in look_into_trash(folder).batches:
+    if batch not in read_trash(folder).batches:
         raise TrashError("That deletion is no longer in the trash.")
     # The .json, which sorts after .h5, must come last.
     order = {".h5": 0, ".rrd": 1, ".json": 2}
@@ -75,7 +75,7 @@ def take_out_of_trash(folder: Path, batch: str) -> tuple[str, ...]:
     return tuple(path.relative_to(root).as_posix() for path in files)
 
 
-def look_into_trash(folder: Path) -> Trash:
+def read_trash(folder: Path) -> Trash:
     size = 0
     if (folder / TRASH).is_symlink():
         return Trash()  # another folder, which came with this one

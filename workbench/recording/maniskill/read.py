@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from transforms3d.quaternions import mat2quat
 
 from workbench.core.camera_data import CameraInfo
-from workbench.recording.episode.document import Document, EpisodeWords, WrongDocument, read_document
+from workbench.recording.episode.document import Document, EpisodeJson, WrongDocument, read_document
 from workbench.recording.episode.encoded_pictures import (
     MILLIMETRES_PER_METRE,
     MODALITIES,
@@ -28,7 +28,7 @@ from workbench.recording.episode.encoded_pictures import (
     encode,
 )
 from workbench.recording.episode.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
 
 _PICTURES = ("sensor_data", "sensor_param")
@@ -59,13 +59,13 @@ def read_maniskill(path: Path, trajectory: str) -> Episode:
         UnreadableRecording: one of the two files is missing or broken, or has no such episode.
     """
     path = Path(path)
-    document, said = _said(path.with_suffix(".json"), trajectory)
+    document, entry = _read_entry(path.with_suffix(".json"), trajectory)
     try:
         with open_h5(path) as file:
             group = file.group(trajectory)
             if group is None:
                 raise UnreadableRecording(f"{path.name} has no {trajectory}.")
-            return _episode(group, document, said, path, trajectory)
+            return _episode(group, document, entry, path, trajectory)
     except UnreadableRecording:
         raise
     except RefusedH5 as error:
@@ -94,11 +94,11 @@ def _number(name: str) -> tuple[int, str]:
     return (int(digits) if digits.isdigit() else 1 << 60, name)
 
 
-def _said(path: Path, trajectory: str) -> tuple[Document, EpisodeWords]:
+def _read_entry(path: Path, trajectory: str) -> tuple[Document, EpisodeJson]:
     try:
         document = read_document(path)
-        for number, said in enumerate(document.said["episodes"]):
-            if f"traj_{said['episode_id']}" == trajectory:
+        for number, entry in enumerate(document.data["episodes"]):
+            if f"traj_{entry['episode_id']}" == trajectory:
                 return document, document.episode(number)
     except OSError as error:
         raise UnreadableRecording(f"{path.name} cannot be read: {error.strerror}") from error
@@ -109,7 +109,7 @@ def _said(path: Path, trajectory: str) -> tuple[Document, EpisodeWords]:
     raise UnreadableRecording(f"{path.name} says nothing of {trajectory}.")
 
 
-def _episode(group: H5Group, document: Document, said: EpisodeWords, path: Path, trajectory: str) -> Episode:
+def _episode(group: H5Group, document: Document, entry: EpisodeJson, path: Path, trajectory: str) -> Episode:
     env = document.env()
     kwargs = env.env_kwargs or {}
     actions, action_names = _actions(group["actions"])
@@ -122,15 +122,15 @@ def _episode(group: H5Group, document: Document, said: EpisodeWords, path: Path,
     info = EpisodeInfo(
         task=env.env_id or "unknown task",
         env_index=0,
-        seed=NO_SEED if said.seed is None else said.seed,
+        seed=NO_SEED if entry.seed is None else entry.seed,
         source_file=None,
         source_hash="",
         source={},
         control_dt=1 / frequency if frequency else _UNKNOWN_DT,
-        control_mode=said.control_mode if isinstance(said.control_mode, str) else None,
+        control_mode=entry.control_mode if isinstance(entry.control_mode, str) else None,
         backend=str(kwargs.get("sim_backend") or "physx_cpu"),
         env_kwargs=kwargs,
-        reset_options=(said.reset_kwargs and said.reset_kwargs.options) or {},
+        reset_options=(entry.reset_kwargs and entry.reset_kwargs.options) or {},
         max_episode_steps=env.max_episode_steps,
         written_at=_written(path),
         id=f"{path.stem}/{trajectory}",

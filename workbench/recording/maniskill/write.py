@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.recording.episode.description import describe_beside
+from workbench.recording.episode.description import describe_json
 from workbench.recording.episode.document import json_text
 from workbench.recording.episode.episode import Episode
 
@@ -112,16 +112,16 @@ def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path]
     Args:
         sealed: say by a seal that this installation recorded it.
     """
-    described = describe_beside(episode, folder, files, sealed)
-    content = json_text({**_maniskills(episode), "workbench": described}, indent=2).encode()
+    described = describe_json(episode, folder, files, sealed)
+    content = json_text({**_maniskill_json(episode), "workbench": described}, indent=2).encode()
     with path.open("xb") as file:
         file.write(content)
 
 
-def _maniskills(episode: Episode) -> dict[str, Any]:
+def _maniskill_json(episode: Episode) -> dict[str, Any]:
     info = episode.info
     seed = info.seed if info.seed >= 0 else None
-    said: dict[str, Any] = {
+    entry: dict[str, Any] = {
         "episode_id": 0,
         "episode_seed": seed,
         "control_mode": info.control_mode,
@@ -129,7 +129,7 @@ def _maniskills(episode: Episode) -> dict[str, Any]:
         "reset_kwargs": {"options": info.reset_options, **({} if seed is None else {"seed": seed})},
     }
     for name, values in episode.flags.items():
-        said[name] = bool(values[-1])
+        entry[name] = bool(values[-1])
     return {
         "env_info": {
             "env_id": info.task,
@@ -137,7 +137,7 @@ def _maniskills(episode: Episode) -> dict[str, Any]:
             "max_episode_steps": info.max_episode_steps,
         },
         "commit_info": None,
-        "episodes": [said],
+        "episodes": [entry],
         "source_type": "workbench",
         "source_desc": f"recorded with maniskill-workbench {info.versions.get('maniskill-workbench', '')}".strip(),
     }

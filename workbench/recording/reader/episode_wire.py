@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.recording.episode.columns import MOST_LINES
-from workbench.recording.episode.document import CameraWords
+from workbench.recording.episode.document import CameraJson
 from workbench.recording.episode.encoded_pictures import MOST_PIXELS, EncodedPictures, LazyPictures, Modality
-from workbench.recording.episode.episode import CameraTrack, Episode, Unread
+from workbench.recording.episode.episode import BrokenFile, CameraTrack, Episode
 from workbench.recording.reader.requests import CameraRead, EpisodeRead, PictureRead, ShapeRead, VisualRead
 
 FetchPicture = Callable[[int, Modality, int, bool], PictureRead]
 """Of a camera by its number: the picture of that number; encoded or not. Raises OSError."""
 
 
-class Garbled(Exception):
+class InvalidEpisode(Exception):
     """What came does not fit together."""
 
 
@@ -34,7 +34,7 @@ class Garbled(Exception):
 
 
 class SentShapes:
-    """Which shapes were sent to who asks for episodes with one number of `Open.sharing`."""
+    """Which shapes were sent to who asks for episodes with one number of `OpenEpisode.sharing`."""
 
     _numbers = itertools.count()
 
@@ -52,7 +52,7 @@ class SentShapes:
         return self._sent[key], before
 
 
-def packed(episode: Episode, source_path: str | None, opened: int, sent: SentShapes) -> EpisodeRead:
+def pack_episode(episode: Episode, source_path: str | None, opened: int, sent: SentShapes) -> EpisodeRead:
     shapes, visuals, bare = [], [], episode.geometry
     if bare is not None:
         for visual in bare.visuals:
@@ -68,7 +68,7 @@ def packed(episode: Episode, source_path: str | None, opened: int, sent: SentSha
 
 def _camera(track: CameraTrack) -> CameraRead:
     counts: dict[Modality, int] = {modality: len(pictures) for modality, pictures in track.pictures.items()}
-    return CameraRead(CameraWords.of(track.info), track.frame, track.pose, counts)
+    return CameraRead(CameraJson.of(track.info), track.frame, track.pose, counts)
 
 
 # --- in the server -----------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ def _pictures(modality: Modality, camera: int, count: int, fetch: FetchPicture) 
     return EncodedPictures(modality, LazyPictures(count, one), decoded)
 
 
-def unpacked(
+def unpack_episode(
     read: EpisodeRead,
     fetch: FetchPicture,
     process: int,
@@ -124,7 +124,7 @@ def unpacked(
         known: shapes that came before.
 
     Raises:
-        Garbled: it does not fit together; the message says what of it.
+        InvalidEpisode: it does not fit together; the message says what of it.
     """
     episode = read.episode
     reward = _checked(episode.reward, "rewards", None)
@@ -135,9 +135,9 @@ def unpacked(
     if poses is not None:
         bodies = -1 if geometry is None else len(geometry.body_names)
         poses = _checked(poses, "poses", length + 1, bodies, 7).astype(np.float32, copy=False)
-    unread = list(episode.unread)
+    broken_files = list(episode.broken_files)
     many = {
-        name: dict(_rows(getattr(episode, name), length + 1, unread))
+        name: dict(_rows(getattr(episode, name), length + 1, broken_files))
         for name in ("evaluate", "env_states", "obs", "batch")
     }
     ends = {
@@ -145,7 +145,7 @@ def unpacked(
         for name in ("terminated", "truncated")
     }
     action = _checked(episode.action, "actions", length, len(episode.action_names))
-    _must(sum(map(len, episode.texts.values())) <= MOST_LINES, "too many entries that are no numbers")
+    _require(sum(map(len, episode.texts.values())) <= MOST_LINES, "too many entries that are no numbers")
     return replace(
         episode,
         geometry=geometry,
@@ -153,7 +153,7 @@ def unpacked(
         action=action.astype(np.float32, copy=False),
         reward=reward.astype(np.float32, copy=False),
         cameras=[_track(camera, number, fetch) for number, camera in enumerate(read.cameras)],
-        unread=tuple(unread),
+        broken_files=tuple(broken_files),
         **many,
         **ends,
     )
@@ -163,20 +163,24 @@ def _checked(array: NDArray, what: str, *shape: int | None, kinds: str = "biuf")
     """`array`, where it is of that shape, with any size for None, and of plain numbers of these kinds."""
     fits = array.ndim == len(shape) and all(want in (None, size) for want, size in zip(shape, array.shape))
     wanted = " x ".join("any" if size is None else str(size) for size in shape)
-    _must(
+    _require(
         fits and array.dtype.kind in kinds,
         f"{what} of shape {array.shape} and type {array.dtype}, not {wanted}",
     )
     return array
 
 
-def _rows(held: dict[str, NDArray], states: int, unread: list[Unread]) -> Iterator[tuple[str, NDArray]]:
+def _rows(
+    held: dict[str, NDArray], states: int, broken_files: list[BrokenFile]
+) -> Iterator[tuple[str, NDArray]]:
     """Those with a row a state; of others it is said that they are left out."""
     for name, rows in held.items():
         if rows.ndim > 0 and len(rows) == states and rows.dtype.kind in "biuf":
             yield name, rows
         else:
-            unread.append(Unread(name, f"has shape {rows.shape} for {states} states, and is left out."))
+            broken_files.append(
+                BrokenFile(name, f"has shape {rows.shape} for {states} states, and is left out.")
+            )
 
 
 def _geometry(
@@ -189,12 +193,12 @@ def _geometry(
     for shape in read.shapes:
         known[process, shape.number] = shapes.shared(_mesh(shape.mesh), _material(shape.material))
     bodies = len(bare.body_names)
-    _must(len(bare.body_kinds) == len(bare.body_hidden) == bodies, "kinds of other bodies than there are")
+    _require(len(bare.body_kinds) == len(bare.body_hidden) == bodies, "kinds of other bodies than there are")
     visuals = []
     for visual in read.visuals:
-        _must((process, visual.shape) in known, "a visual without a shape")
+        _require((process, visual.shape) in known, "a visual without a shape")
         worn = _checked(visual.bodies, "bodies", None, kinds="iu")
-        _must(bool(np.all((0 <= worn) & (worn < bodies))), "a visual of bodies that are not there")
+        _require(bool(np.all((0 <= worn) & (worn < bodies))), "a visual of bodies that are not there")
         none = np.zeros(len(worn), np.int32)
         visuals.append(
             Visual(visual.name, *known[process, visual.shape], none, worn.astype(np.int32, copy=False))
@@ -205,7 +209,7 @@ def _geometry(
 def _mesh(mesh: Mesh) -> Mesh:
     vertices = _checked(mesh.vertices, "vertices", None, 3, kinds="f").astype(np.float32, copy=False)
     faces = _checked(mesh.faces, "faces", None, 3, kinds="iu")
-    _must(bool(np.all((0 <= faces) & (faces < len(vertices)))), "faces of vertices that are not there")
+    _require(bool(np.all((0 <= faces) & (faces < len(vertices)))), "faces of vertices that are not there")
     normals, uvs = (
         None
         if part is None
@@ -219,7 +223,7 @@ def _material(material: Material) -> Material:
     if (texture := material.texture) is not None:
         _checked(texture, "a texture", None, None, 4)
         fits = texture.dtype == np.uint8 and 0 < texture.size <= 4 * MOST_PIXELS
-        _must(fits, f"a texture of shape {texture.shape} and type {texture.dtype}")
+        _require(fits, f"a texture of shape {texture.shape} and type {texture.dtype}")
     return material
 
 
@@ -227,16 +231,16 @@ def _track(read: CameraRead, number: int, fetch: FetchPicture) -> CameraTrack:
     info = read.camera.info()
     frame = _checked(read.frame, f"{info.name}: frames", None, kinds="iu").astype(np.int64, copy=False)
     pose = _checked(read.pose, f"{info.name}: poses", len(frame), 7).astype(np.float32, copy=False)
-    _must(
+    _require(
         info.width > 0 and info.height > 0 and info.width * info.height <= MOST_PIXELS,
         f"{info.name}: pictures of {info.width} x {info.height}",
     )
     for count in read.pictures.values():
-        _must(count == len(frame), f"{info.name}: {len(frame)} frames and {count} pictures")
+        _require(count == len(frame), f"{info.name}: {len(frame)} frames and {count} pictures")
     held = {m: _pictures(m, number, count, fetch) for m, count in read.pictures.items()}
     return CameraTrack(info, frame, pose, **held)
 
 
-def _must(holds: bool, otherwise: str) -> None:
+def _require(holds: bool, problem: str) -> None:
     if not holds:
-        raise Garbled(f"it has {otherwise}")
+        raise InvalidEpisode(f"it has {problem}")

@@ -18,7 +18,7 @@ from typing import get_args
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack
-from workbench.recording.reader.requests import Answer, Ended, Forget, NewReader, Request
+from workbench.recording.reader.requests import Answer, CloseEpisodes, Ended, NewReader, Request
 
 START_SECONDS = 60.0
 """For a nursery to be there; it imports for half a second."""
@@ -43,7 +43,7 @@ class ReaderBusy(OSError):
     """The reader is at something else."""
 
 
-class NotThere(Exception):
+class WrongProcess(Exception):
     """The process that was meant is not the one that reads now."""
 
 
@@ -54,7 +54,7 @@ class Answered:
     """The number of the process that it came from."""
 
 
-class _Nursery:
+class _ForkServer:
     """One a process, started when it is first needed."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class _Nursery:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = subprocess.Popen(
-                    python_command("-m", "workbench.recording.reader.nursery", str(theirs.fileno())),
+                    python_command("-m", "workbench.recording.reader.fork_server", str(theirs.fileno())),
                     env=child_environment(**FOR_READING),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
@@ -130,7 +130,7 @@ class _Nursery:
         self._control = self._process = None
 
 
-nursery = _Nursery()
+fork_server = _ForkServer()
 
 
 class Reader:
@@ -174,7 +174,7 @@ class Reader:
 
         Raises:
             ReaderEnded: it ended the reader, or was not answered in time. Another one reads what comes next.
-            ReaderBusy, NotThere
+            ReaderBusy, WrongProcess
             OSError: no reader can be started.
         """
         (answer,) = self.ask_all([request], seconds, patience, process)
@@ -200,7 +200,7 @@ class Reader:
             while len(answers) < len(requests):
                 line = self._started()
                 if process is not None and process != self.process:
-                    raise NotThere
+                    raise WrongProcess
                 begun = len(answers)
                 try:
                     self._send_forgotten(line)
@@ -244,7 +244,7 @@ class Reader:
             self._kill()
         if self._line is None:
             wanted = NewReader(list(paths), self._episodes, self._writes)
-            self._pid, self._line = nursery.new_reader(wanted)
+            self._pid, self._line = fork_server.new_reader(wanted)
             self.process, self._there = next(self._numbers), there
         return self._line
 
@@ -255,7 +255,7 @@ class Reader:
             if process == self.process:
                 gone.append(opened)
         if gone:
-            line.send(Forget(gone))
+            line.send(CloseEpisodes(gone))
 
     def _ended(self, error: Exception, seconds: float) -> ReaderEnded:
         status = self._kill()
@@ -275,7 +275,7 @@ class Reader:
         # With what it started. Its number is its own until the nursery was told.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
-        return nursery.ended(self._pid)
+        return fork_server.ended(self._pid)
 
 
 class _Turns:

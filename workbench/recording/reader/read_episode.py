@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from workbench.core.scene.shapes import SceneGeometry, SharedShapes
 from workbench.recording.episode.columns import MOST_LINES
 from workbench.recording.episode.document import (
-    CameraWords,
-    ColumnWords,
+    CameraJson,
+    ColumnType,
     Description,
     Document,
     WrongDocument,
@@ -33,8 +33,8 @@ from workbench.recording.episode.document import (
     task_file,
 )
 from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality
-from workbench.recording.episode.episode import CameraTrack, Episode, Unread
-from workbench.recording.episode.source import Source, UnreadableRecording
+from workbench.recording.episode.episode import BrokenFile, CameraTrack, Episode
+from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.lerobot.read import is_lerobot, lerobot_rows
 from workbench.recording.maniskill.read import leaves
 from workbench.recording.maniskill.read import read_maniskill as read_maniskill
@@ -62,20 +62,20 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     With `shapes`, meshes are those of other recordings that were read with it, where they look the same.
 
     What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
-    states. The same for one that is broken, named in `Episode.unread`. The geometry is that of this env alone, as
+    states. The same for one that is broken, named in `Episode.broken_files`. The geometry is that of this env alone, as
     env 0 of 1.
 
     Raises:
         UnreadableRecording: what is there is no recording of ours, or all of it is broken; the message says which.
     """
-    episode, source_path = read_inert(path, shapes)
+    episode, source_path = read_without_task(path, shapes)
     found = task_file(source_path, episode.info.task, Path(path).parent)
     if found is not None:
         episode.info = replace(episode.info, source_file=found)
     return episode
 
 
-def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
+def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
     """As `read_episode`, from these files alone: the task's own file is not looked for, and where it may be is said beside.
 
     Raises as `read_episode`.
@@ -85,8 +85,8 @@ def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode,
     there = {suffix: file for suffix, file in files.items() if file.is_file()}
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
-    unread: list[Unread] = []
-    beside, not_json = _beside(there.get(".json"))
+    broken_files: list[BrokenFile] = []
+    beside, not_json = _read_description(there.get(".json"))
     files = {} if beside is None else beside.files or {}
     table = states = None
     if ".rrd" in there:
@@ -95,41 +95,41 @@ def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode,
             table = RerunTable(there[".rrd"], shapes)
         except (OSError, ValueError, RuntimeError) as error:
             lost = "its 3-D scene, its pictures and what evaluate() said are missing"
-            unread.append(_unread(there[".rrd"], error, lost))
+            broken_files.append(_unread(there[".rrd"], error, lost))
     if ".h5" in there:
         try:
             check(there[".h5"], files)
             states = _read_states(there[".h5"])
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-            unread.append(_unread(there[".h5"], error, "its env states are missing"))
-    if table is None and states is None and unread:
-        raise UnreadableRecording(" ".join(broken.sentence for broken in unread))
+            broken_files.append(_unread(there[".h5"], error, "its env states are missing"))
+    if table is None and states is None and broken_files:
+        raise UnreadableRecording(" ".join(broken.sentence for broken in broken_files))
     if not_json is not None and table is not None:
-        unread.append(
+        broken_files.append(
             _unread(there[".json"], not_json, "its tags, its note and the place of its task are missing")
         )
-    said = beside or _description(there.get(".json"), not_json, table, path)
+    description = beside or _description(there.get(".json"), not_json, table, path)
     try:
-        episode = _episode(said, table)
+        episode = _episode(description, table)
         if states is not None:
             _add_states(episode, states)
         elif table is not None:
-            episode.obs = dict(_observations(table, said.obs, episode.length + 1))
+            episode.obs = dict(_observations(table, description.obs, episode.length + 1))
     except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise UnreadableRecording(
             f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
         ) from error
-    episode.unread = tuple(unread)
-    return episode, said.source_path or None
+    episode.broken_files = tuple(broken_files)
+    return episode, description.source_path or None
 
 
-def _unread(file: Path, error: Exception, lost: str) -> Unread:
+def _unread(file: Path, error: Exception, lost: str) -> BrokenFile:
     why = " ".join(str(error).split()).removeprefix(f"Failed to read RRD file at {file}: ")
     why = why if len(why) <= 160 else why[:159] + "\u2026"
-    return Unread(file.name, f"was cut short or changed ({why}): {lost}.")
+    return BrokenFile(file.name, f"was cut short or changed ({why}): {lost}.")
 
 
-def _beside(file: Path | None) -> tuple[Description | None, Exception | None]:
+def _read_description(file: Path | None) -> tuple[Description | None, Exception | None]:
     """What the .json says; nothing where it is none of ours, and why where it is no JSON."""
     if file is None:
         return None, None
@@ -155,12 +155,12 @@ def _description(
         raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
     if table is None:
         raise UnreadableRecording(f"{path.stem}.json is missing, which says what is in {path.name}.")
-    said = table.property("workbench", "description")
-    if not isinstance(said, str):
+    description = table.property("workbench", "description")
+    if not isinstance(description, str):
         raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
     files, texts = (_list(table.property("source", key)) for key in ("files", "texts"))
     try:
-        return description_in(said, dict(zip(files, texts)))
+        return description_in(description, dict(zip(files, texts)))
     except WrongDocument as error:
         raise UnreadableRecording(f"{path.stem}.rrd {error}.") from error
 
@@ -169,51 +169,54 @@ def _list(value: Any) -> list[Any]:
     return [] if value is None else value if isinstance(value, list) else [value]
 
 
-def _episode(said: Description, table: RerunTable | None) -> Episode:
-    states = said.length + 1
+def _episode(description: Description, table: RerunTable | None) -> Episode:
+    states = description.length + 1
     if not 0 < states <= MOST_STATES:
-        raise ValueError(f"it says that it has {said.length} steps")
-    if sum(map(len, said.texts.values())) > MOST_LINES:
+        raise ValueError(f"it says that it has {description.length} steps")
+    if sum(map(len, description.texts.values())) > MOST_LINES:
         raise ValueError(f"it has more than {MOST_LINES} lines of entries that are no numbers")
     geometry = poses = None
     cameras: list[CameraTrack] = []
     if table is not None:
-        scene = said.scene
+        scene = description.scene
         bare = SceneGeometry(1, scene.body_names, scene.body_kinds, scene.body_hidden, ())
         entities = body_entities(bare)
         geometry = table.geometry(bare, entities)
         _check_room("the poses", (states, len(entities), 7), np.dtype(np.float32))
         poses = table.poses(entities, states)
-        cameras = list(_cameras(said.cameras, table, states))
-    actions, number, flag = ("<f4", (len(said.action_names),)), ("<f4", ()), ("|b1", ())
+        cameras = list(_cameras(description.cameras, table, states))
+    actions, number, flag = ("<f4", (len(description.action_names),)), ("<f4", ()), ("|b1", ())
     return Episode(
-        info=said.info(),
+        info=description.info(),
         geometry=geometry,
-        segmentation=said.segmentation,
+        segmentation=description.segmentation,
         poses=poses,
         action=_column(table, "/action", actions, 1, states),
-        action_names=said.action_names,
+        action_names=description.action_names,
         reward=_column(table, "/reward", number, 1, states),
         terminated=_column(table, "/episode/terminated", flag, 1, states),
         truncated=_column(table, "/episode/truncated", flag, 1, states),
-        evaluate=_columns(table, said.evaluate, evaluate_entity, states),
+        evaluate=_columns(table, description.evaluate, evaluate_entity, states),
         cameras=cameras,
-        batch=_columns(table, said.batch, batch_entity, states),
-        texts=said.texts,
+        batch=_columns(table, description.batch, batch_entity, states),
+        texts=description.texts,
     )
 
 
 def _columns(
-    table: RerunTable | None, said: Mapping[str, ColumnWords], entity_of: Callable[[str], str], states: int
+    table: RerunTable | None,
+    columns: Mapping[str, ColumnType],
+    entity_of: Callable[[str], str],
+    states: int,
 ) -> dict[str, NDArray]:
     if table is None:
         return {}
-    return {name: _column(table, entity_of(name), words, 0, states) for name, words in said.items()}
+    return {name: _column(table, entity_of(name), kind, 0, states) for name, kind in columns.items()}
 
 
-def _column(table: RerunTable | None, entity: str, words: ColumnWords, first: int, states: int) -> NDArray:
-    """States `first` to the last of the numbers of `entity`, as `words` say they were."""
-    dtype, shape = np.dtype(words[0]), (states - first, *words[1])
+def _column(table: RerunTable | None, entity: str, kind: ColumnType, first: int, states: int) -> NDArray:
+    """States `first` to the last of the numbers of `entity`, as `kind` say they were."""
+    dtype, shape = np.dtype(kind[0]), (states - first, *kind[1])
     _check_room(entity, shape, dtype)
     out = np.full(shape, np.nan if dtype.kind == "f" else 0, dtype=dtype)
     if table is None or out.size == 0:
@@ -237,8 +240,8 @@ def _check_room(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
         raise ValueError(f"{what} is said to be {shape} numbers")
 
 
-def _cameras(said: Sequence[CameraWords], table: RerunTable, states: int) -> Iterator[CameraTrack]:
-    infos = [words.info() for words in said]
+def _cameras(cameras: Sequence[CameraJson], table: RerunTable, states: int) -> Iterator[CameraTrack]:
+    infos = [camera.info() for camera in cameras]
     for info, entity in zip(infos, camera_entities(infos)):
         held: dict[Modality, tuple[NDArray[np.int64], EncodedPictures]] = {}
         for modality in ("rgb", "depth", "segmentation"):
@@ -256,7 +259,7 @@ def _cameras(said: Sequence[CameraWords], table: RerunTable, states: int) -> Ite
 
 
 def _observations(
-    table: RerunTable, columns: Mapping[str, ColumnWords], states: int
+    table: RerunTable, columns: Mapping[str, ColumnType], states: int
 ) -> Iterator[tuple[str, NDArray]]:
     begin = 0
     together = sum(math.prod(shape) for _, shape in columns.values())
@@ -317,8 +320,8 @@ def _in_file(path: Path) -> Iterator[Source]:
     json, h5, rrd = (path.with_suffix(suffix) for suffix in (".json", ".h5", ".rrd"))
     document = _document(json)
     if document.is_ours:
-        yield Source(json, None, str(document.said["workbench"].get("id") or json.resolve()), json.stem)
-    elif document.is_maniskills and h5.is_file():
+        yield Source(json, None, str(document.data["workbench"].get("id") or json.resolve()), json.stem)
+    elif document.is_maniskill and h5.is_file():
         try:
             names = trajectories(h5)
         except UnreadableRecording:

@@ -21,27 +21,27 @@ from PIL import Image
 from workbench.machine.files import NotARegularFile, open_regular_file
 from workbench.recording.episode.document import (
     Document,
-    EpisodeWords,
+    EpisodeJson,
     WrongDocument,
     read_document,
+    read_notes,
     wrong_size,
 )
 from workbench.recording.episode.encoded_pictures import open_picture, small_jpeg
-from workbench.recording.episode.episode import acted_by_from, acted_by_in_words
+from workbench.recording.episode.episode import acted_by_text, parse_acted_by
 from workbench.recording.episode.row import (
-    Entry,
     Facts,
-    Kind,
+    LibraryEntry,
+    RecordingKind,
+    UnreadableRecording,
+    boolean,
     clean_note,
     clean_tags,
-    moment,
-    text,
+    clean_text,
+    integer,
     total,
-    truth,
-    whole,
+    unix_seconds,
 )
-from workbench.recording.episode.source import UnreadableRecording
-from workbench.recording.episode.tags import read_notes
 from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
 from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, broken
 
@@ -55,7 +55,7 @@ _LARGEST_PICTURE = 4096
 """Pixels of a side of a picture that a thumbnail is made of."""
 
 
-def read_found(folder: Path, found: Found) -> list[Entry]:
+def read_found(folder: Path, found: Found) -> list[LibraryEntry]:
     """The recordings in these files: none, one, or one a trajectory. Whatever is wrong is said in a row."""
     try:
         entries = _read(folder, found)
@@ -71,18 +71,18 @@ def read_found(folder: Path, found: Found) -> list[Entry]:
     return entries
 
 
-def _read(folder: Path, found: Found) -> list[Entry]:
+def _read(folder: Path, found: Found) -> list[LibraryEntry]:
     if ".json" in found.sizes:
         try:
             document = read_document(found.path(folder, ".json"))
         except WrongDocument as error:
             return [_broken(found, str(error))]
         if document.is_ours:
-            return [_ours(found, document)]
-        if document.said and found.key.split("/")[-2:] == DATASET_KEY:
-            return _lerobots(folder, found)
-        if document.is_maniskills:
-            return _maniskills(folder, found, document)
+            return [_workbench_entry(found, document)]
+        if document.data and found.key.split("/")[-2:] == DATASET_KEY:
+            return _lerobot_entries(folder, found)
+        if document.is_maniskill:
+            return _maniskill_entries(folder, found, document)
         if ".h5" in found.sizes:
             return [_broken(found, "names neither an env nor episodes")]
     elif ".h5" in found.sizes:
@@ -95,7 +95,7 @@ def _read(folder: Path, found: Found) -> list[Entry]:
     return []
 
 
-def _broken(found: Found, what: str) -> Entry:
+def _broken(found: Found, what: str) -> LibraryEntry:
     return broken(found, f"{Path(found.key).name}{next(iter(found.sizes))} {what}.")
 
 
@@ -104,53 +104,53 @@ def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts
     return replace(facts, tags=tags, note=note)
 
 
-def _ours(found: Found, document: Document) -> Entry:
+def _workbench_entry(found: Found, document: Document) -> LibraryEntry:
     name = Path(found.key).name
     lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
     problem = f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None
     try:
         written = document.description().files or {}
     except WrongDocument as error:
-        written, problem = {}, problem or text(f"{name}.json {error}.", 500)
+        written, problem = {}, problem or clean_text(f"{name}.json {error}.", 500)
     for suffix, size in found.sizes.items():
         # What only the bytes tell is told when it is opened: a list of thousands reads none of them.
         if problem is None and (why := wrong_size(written, suffix, size)) is not None:
             problem = f"{name}{suffix} was cut short or changed: {why}."
-    described = document.said["workbench"]
+    described = document.data["workbench"]
     facts = replace(_episode("workbench", described, found.times[".json"] / 1e9), problem=problem)
     return facts, _thumbnail(described.get("thumbnail"))
 
 
-def _episode(kind: Kind, said: dict[str, Any], if_undated: float) -> Facts:
+def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Facts:
     """Of an episode of ours: its ``.json`` and its ``.rrd`` say the same under the same names."""
-    seed = whole(said.get("seed"))
+    seed = integer(data.get("seed"))
     return Facts(
         kind,
-        task=text(said.get("task")),
-        uid=text(said.get("id"), 64),
-        written=moment(said.get("written_at")) or if_undated,
+        task=clean_text(data.get("task")),
+        uid=clean_text(data.get("id"), 64),
+        written=unix_seconds(data.get("written_at")) or if_undated,
         seed=None if seed is None or seed < 0 else seed,
-        env_index=whole(said.get("env_index")),
-        length=whole(said.get("length")),
-        total_reward=total(said.get("return")),
-        success=truth(said.get("success")),
-        success_once=truth(said.get("success_once")),
-        fail=truth(said.get("fail")),
-        control_mode=text(said.get("control_mode")),
-        acted_by=_acted_by(said.get("acted_by")),
-        source_hash=text(said.get("source_hash"), 64),
-        tags=clean_tags(said.get("tags")),
-        note=clean_note(said.get("note")),
-        recovered=said.get("recovered") is True,
+        env_index=integer(data.get("env_index")),
+        length=integer(data.get("length")),
+        total_reward=total(data.get("return")),
+        success=boolean(data.get("success")),
+        success_once=boolean(data.get("success_once")),
+        fail=boolean(data.get("fail")),
+        control_mode=clean_text(data.get("control_mode")),
+        acted_by=_acted_by(data.get("acted_by")),
+        source_hash=clean_text(data.get("source_hash"), 64),
+        tags=clean_tags(data.get("tags")),
+        note=clean_note(data.get("note")),
+        recovered=data.get("recovered") is True,
     )
 
 
-def _acted_by(said: object) -> str:
+def _acted_by(data: object) -> str:
     """A list in a ``.json``, words already in a ``.rrd``."""
-    if not isinstance(said, list):
-        return text(said)
+    if not isinstance(data, list):
+        return clean_text(data)
     try:
-        return text(acted_by_in_words(acted_by_from(said)))
+        return clean_text(acted_by_text(parse_acted_by(data)))
     except (TypeError, ValueError):
         return ""
 
@@ -170,30 +170,30 @@ def _thumbnail(encoded: object) -> bytes | None:
         return None
 
 
-def _maniskills(folder: Path, found: Found, document: Document) -> list[Entry]:
+def _maniskill_entries(folder: Path, found: Found, document: Document) -> list[LibraryEntry]:
     """One row an episode of ManiSkill's ``RecordEpisode`` and of its demonstrations: they have the same form."""
     name = Path(found.key).name
     written = found.newest / 1e9
-    count = len(document.said["episodes"])
+    count = len(document.data["episodes"])
     try:
-        task, problem = text(document.env().env_id), None
+        task, problem = clean_text(document.env().env_id), None
     except WrongDocument as error:
-        task, problem = "", text(f"{name}.json {error}.", 500)
+        task, problem = "", clean_text(f"{name}.json {error}.", 500)
     if ".h5" not in found.sizes:
         if not task:
             return []  # a .json of something else that has episodes
         lost = f"{name}.h5, which {name}.json describes, is missing."
         return [(Facts("maniskill", task=task, written=written, problem=lost), None)]
-    said = [_or_why(document, number) for number in range(min(count, MOST_EPISODES))]
-    names = [f"traj_{one.episode_id}" for one in said if isinstance(one, EpisodeWords)]
-    totals, pictures, broken = _look_into(found.path(folder, ".h5"), names)
+    data = [_episode_or_problem(document, number) for number in range(min(count, MOST_EPISODES))]
+    names = [f"traj_{one.episode_id}" for one in data if isinstance(one, EpisodeJson)]
+    totals, pictures, broken = _read_h5(found.path(folder, ".h5"), names)
     problem = problem or broken
     if not task and problem is None:
         problem = f"{name}.json does not name the env."
-    entries: list[Entry] = []
-    for one in said:
+    entries: list[LibraryEntry] = []
+    for one in data:
         if isinstance(one, str):
-            why = problem or text(f"{name}.json {one}.", 500)
+            why = problem or clean_text(f"{name}.json {one}.", 500)
             entries.append((Facts("maniskill", task=task, written=written, problem=why), None))
             continue
         trajectory = f"traj_{one.episode_id}"
@@ -204,12 +204,12 @@ def _maniskills(folder: Path, found: Found, document: Document) -> list[Entry]:
             trajectory=trajectory,
             written=written,
             seed=one.seed,
-            length=whole(one.elapsed_steps),
+            length=integer(one.elapsed_steps),
             total_reward=totals.get(trajectory),
-            success=truth(one.success),
-            fail=truth(one.fail),
-            control_mode=text(one.control_mode),
-            acted_by=text(document.source_type),
+            success=boolean(one.success),
+            fail=boolean(one.fail),
+            control_mode=clean_text(one.control_mode),
+            acted_by=clean_text(document.source_type),
             problem=problem or lost,
         )
         entries.append((facts, pictures.get(trajectory)))
@@ -219,14 +219,14 @@ def _maniskills(folder: Path, found: Found, document: Document) -> list[Entry]:
     return entries
 
 
-def _or_why(document: Document, number: int) -> EpisodeWords | str:
+def _episode_or_problem(document: Document, number: int) -> EpisodeJson | str:
     try:
         return document.episode(number)
     except WrongDocument as error:
         return str(error)
 
 
-def _lerobots(folder: Path, found: Found) -> list[Entry]:
+def _lerobot_entries(folder: Path, found: Found) -> list[LibraryEntry]:
     """One row an episode of a LeRobot dataset, which is known by its ``meta/info.json``."""
     # Arrow's threads must not be there when a reader is forked, and most libraries hold no dataset.
     from workbench.recording.lerobot.read import lerobot_rows
@@ -235,11 +235,11 @@ def _lerobots(folder: Path, found: Found) -> list[Entry]:
     try:
         rows = lerobot_rows(found.path(folder, ".json").parents[1])
     except UnreadableRecording as error:
-        return [(Facts("lerobot", written=written, problem=text(str(error), 500)), None)]
+        return [(Facts("lerobot", written=written, problem=clean_text(str(error), 500)), None)]
     return [(replace(facts, written=written), None) for facts in rows]
 
 
-def _look_into(
+def _read_h5(
     path: Path, trajectories: list[str]
 ) -> tuple[dict[str, float | None], dict[str, bytes], str | None]:
     """Of each trajectory that is in the ``.h5`` the sum of rewards (None where they were not recorded) and a thumbnail, where
@@ -279,19 +279,19 @@ def _last_picture(group: H5Group) -> bytes | None:
     return None
 
 
-def _rrd_only(folder: Path, found: Found) -> Entry:
+def _rrd_only(folder: Path, found: Found) -> LibraryEntry:
     # It takes rerun along, which is half a second that a library without such files has no need of.
     from workbench.recording.rerun.read import read_properties
 
     path = found.path(folder, ".rrd")
     try:
         open_regular_file(path).close()
-        said = read_properties(path)
+        data = read_properties(path)
     except NotARegularFile as error:
         return _broken(found, str(error.strerror))
     except (OSError, ValueError, RuntimeError):
         return _broken(found, "is no recording that rerun can read, or was cut short")
-    episode = said.get("episode", {})
+    episode = data.get("episode", {})
     if not episode:
         return _broken(found, "is a recording of rerun, but not of an episode")
     return _episode("rrd only", episode, found.newest / 1e9), None

@@ -20,24 +20,30 @@ from workbench.core.scene.shapes import SharedShapes
 from workbench.recording.episode.document import task_file
 from workbench.recording.episode.encoded_pictures import Modality
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.row import Entry, clean_facts, text
-from workbench.recording.episode.source import Kind, Source, UnreadableRecording
-from workbench.recording.reader.episode_wire import Garbled, KnownShapes, unpacked
-from workbench.recording.reader.processes import Answered, NotThere, Reader, ReaderEnded, nursery
+from workbench.recording.episode.row import (
+    LibraryEntry,
+    Source,
+    SourceKind,
+    UnreadableRecording,
+    clean_facts,
+    clean_text,
+)
+from workbench.recording.reader.episode_wire import InvalidEpisode, KnownShapes, unpack_episode
+from workbench.recording.reader.processes import Answered, Reader, ReaderEnded, WrongProcess, fork_server
 from workbench.recording.reader.requests import (
     EpisodeRead,
-    ForRerun,
-    Open,
-    PictureAt,
+    FindSources,
+    OpenEpisode,
     PictureRead,
     ReadFailed,
+    ReadPicture,
+    ReadRerunInfo,
+    ReadRows,
     Recover,
     Recovered,
-    Rows,
+    RerunInfo,
     RowsRead,
-    Sources,
     SourcesFound,
-    ToldRerun,
 )
 from workbench.recording.reader.scan import NOTES, Found, broken
 from workbench.recording.writing.publish import RecordingError
@@ -46,7 +52,7 @@ ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0
 PICTURE_SECONDS = 70.0
 """A film is taken apart when its first frame is looked at."""
-MENDING_SECONDS = 1800.0
+RECOVERY_SECONDS = 1800.0
 """An hour with four cameras takes some minutes."""
 PICTURE_PATIENCE = 0.2
 """Seconds that a picture waits for another recording to be opened."""
@@ -64,7 +70,7 @@ _shapes = KnownShapes()
 
 def start_reading() -> None:
     """Begin to start what reads recordings, before one is wanted. Returns at once; raises OSError."""
-    nursery.start()
+    fork_server.start()
 
 
 def stop_reading() -> None:
@@ -74,10 +80,10 @@ def stop_reading() -> None:
         _readers.clear()
     for reader in readers:
         reader.close()
-    nursery.end()
+    fork_server.end()
 
 
-def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
+def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[LibraryEntry]]]:
     """The recordings in these files of a library's folder, with a thumbnail each. Whatever is wrong is said in a row.
 
     Raises:
@@ -85,17 +91,21 @@ def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, li
     """
     wanted = list(wanted)
     reader = _reader(folder, episodes=False)
-    reader.allow(_beyond(path for found in wanted for path in found.paths(folder)))
+    reader.allow(_link_targets(path for found in wanted for path in found.paths(folder)))
     for begin in range(0, len(wanted), _AT_ONCE):
         some = wanted[begin : begin + _AT_ONCE]
-        asked = [Rows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some]
+        asked = [ReadRows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some]
         answers = reader.ask_all(asked, ROW_SECONDS)
         for found, answer in zip(some, answers, strict=True):
             yield found, _entries(found, answer)
 
 
 def read_recording(
-    kind: Kind, path: Path, part: str = "", shapes: SharedShapes | None = None, folder: Path | None = None
+    kind: SourceKind,
+    path: Path,
+    part: str = "",
+    shapes: SharedShapes | None = None,
+    folder: Path | None = None,
 ) -> Episode:
     """An episode. Its pictures are read one by one when they are looked at.
 
@@ -112,15 +122,15 @@ def read_recording(
     folder = folder or (path if kind == "lerobot" else path.parent)
     beside = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
     reader = _reader(folder, episodes=True)
-    reader.allow(_beyond(beside))
+    reader.allow(_link_targets(beside))
     shapes = SharedShapes() if shapes is None else shapes
     sharing, known = _shapes.of(shapes)
-    wanted = Open(kind, path, part, sharing)
-    read, process = _asked(reader, wanted, EpisodeRead, path.name)
-    opened = _Opened(reader, wanted, process, read.opened, path.name)
+    wanted = OpenEpisode(kind, path, part, sharing)
+    read, process = _request(reader, wanted, EpisodeRead, path.name)
+    opened = _OpenEpisode(reader, wanted, process, read.opened, path.name)
     try:
-        episode = unpacked(read, opened.picture, process, shapes, known)
-    except Garbled as error:
+        episode = unpack_episode(read, opened.picture, process, shapes, known)
+    except InvalidEpisode as error:
         raise UnreadableRecording(f"{path.name} is a recording, but a broken one: {error}.") from error
     if kind == "ours":
         found = task_file(read.source_path, episode.info.task, path.parent)
@@ -139,16 +149,16 @@ def find_trajectories(path: Path) -> list[str]:
     return [source.part for source in _found(path, trajectories=True) if source.part is not None]
 
 
-def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
+def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
     """What rerun calls the recording in an ``.rrd``, and the blueprint in it. Raises as `read_recording`."""
     path = Path(path).absolute()
     reader = _reader(path.parent, episodes=True)
-    reader.allow(_beyond([path]))
-    told, _ = _asked(reader, ForRerun(path), ToldRerun, path.name)
+    reader.allow(_link_targets([path]))
+    told, _ = _request(reader, ReadRerunInfo(path), RerunInfo, path.name)
     return told.store, told.blueprint
 
 
-def mend(folder: Path) -> tuple[Path, ...]:
+def recover_confined(folder: Path) -> tuple[Path, ...]:
     """Make what dead writers left in `folder` episodes; returns the .rrd of each.
 
     A folder that came from elsewhere may bring journals along. So it is done by a process that may write below that folder
@@ -169,7 +179,7 @@ def mend(folder: Path) -> tuple[Path, ...]:
         raise RecordingError(f"{failed}{error.strerror}") from error
     reader = Reader(Path("/"), episodes=False, writes=folder.absolute())
     try:
-        answer = reader.ask(Recover(folder.absolute()), MENDING_SECONDS).answer
+        answer = reader.ask(Recover(folder.absolute()), RECOVERY_SECONDS).answer
     except OSError as error:
         raise RecordingError(f"{failed}it {error}") from error
     finally:
@@ -182,10 +192,10 @@ def mend(folder: Path) -> tuple[Path, ...]:
         if isinstance(answer, ReadFailed)
         else ReadFailed("unreadable", f"it gave {type(answer).__name__}.")
     )
-    raise RecordingError(why.words if why.why == "system" else f"{failed}{why.words}")
+    raise RecordingError(why.message if why.why == "system" else f"{failed}{why.message}")
 
 
-def recovered_in_words(paths: Sequence[str]) -> str:
+def recovered_text(paths: Sequence[str]) -> str:
     """Of what a session that was killed left half written, and this one mended; empty for nothing."""
     if not paths:
         return ""
@@ -200,9 +210,11 @@ def recovered_in_words(paths: Sequence[str]) -> str:
 def _found(path: Path, trajectories: bool) -> list[Source]:
     path = Path(path).absolute()
     reader = _reader(path if path.is_dir() else path.parent, episodes=True)
-    reader.allow(_beyond([path]))
-    found, _ = _asked(reader, Sources(path, trajectories), SourcesFound, path.name)
-    return [replace(one, id=text(one.id, 8192), name=text(one.name, 400)) for one in found.sources]
+    reader.allow(_link_targets([path]))
+    found, _ = _request(reader, FindSources(path, trajectories), SourcesFound, path.name)
+    return [
+        replace(one, id=clean_text(one.id, 8192), name=clean_text(one.name, 400)) for one in found.sources
+    ]
 
 
 def _reader(folder: Path, episodes: bool) -> Reader:
@@ -220,18 +232,18 @@ def _reader(folder: Path, episodes: bool) -> Reader:
     return reader
 
 
-def _beyond(paths: Iterable[Path]) -> list[Path]:
+def _link_targets(paths: Iterable[Path]) -> list[Path]:
     """Where links lead that stand in place of files: out of the folder, perhaps."""
     return [Path(os.path.realpath(path)) for path in paths if os.path.islink(path)]
 
 
-def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
+def _entries(found: Found, answered: Answered | ReaderEnded) -> list[LibraryEntry]:
     answer = answered.answer if isinstance(answered, Answered) else answered
     if isinstance(answer, RowsRead):
         return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
     why = "gave something that is no row"
     if isinstance(answer, ReadFailed):
-        why = answer.words
+        why = answer.message
     elif isinstance(answer, ReaderEnded):
         # It is read again when it has changed, or by who opens it.
         why = f"{answer}, and is left alone until it changes"
@@ -245,7 +257,9 @@ def _thumbnail(jpeg: bytes | None) -> bytes | None:
     return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= LARGEST_THUMBNAIL else None
 
 
-def _asked(reader: Reader, request: Open | Sources | ForRerun, kind: type[T], name: str) -> tuple[T, int]:
+def _request(
+    reader: Reader, request: OpenEpisode | FindSources | ReadRerunInfo, kind: type[T], name: str
+) -> tuple[T, int]:
     """The answer, and the number of the process that gave it."""
     try:
         answered = reader.ask(request, OPEN_SECONDS)
@@ -254,17 +268,17 @@ def _asked(reader: Reader, request: Open | Sources | ForRerun, kind: type[T], na
     answer = answered.answer
     if isinstance(answer, ReadFailed):
         if answer.why == "system":
-            raise OSError(answer.words)
-        raise UnreadableRecording(answer.words)
+            raise OSError(answer.message)
+        raise UnreadableRecording(answer.message)
     if not isinstance(answer, kind):
         raise UnreadableRecording(f"{name} gave {type(answer).__name__}.")
     return answer, answered.process
 
 
-class _Opened:
+class _OpenEpisode:
     """An episode that is open in a reader for as long as somebody may look at its pictures."""
 
-    def __init__(self, reader: Reader, wanted: Open, process: int, opened: int, name: str) -> None:
+    def __init__(self, reader: Reader, wanted: OpenEpisode, process: int, opened: int, name: str) -> None:
         self._reader, self._wanted, self._name = reader, wanted, name
         self._lock = threading.Lock()
         self._failed: OSError | None = None
@@ -283,16 +297,16 @@ class _Opened:
                 raise self._failed from error
         if isinstance(answer, PictureRead):
             return answer
-        raise OSError(answer.words if isinstance(answer, ReadFailed) else "the reader gave no picture")
+        raise OSError(answer.message if isinstance(answer, ReadFailed) else "the reader gave no picture")
 
     def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
         for _ in range(2):
-            wanted = PictureAt(self._number, camera, modality, index, encoded)
+            wanted = ReadPicture(self._number, camera, modality, index, encoded)
             try:
                 return self._reader.ask(wanted, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
-            except NotThere:
+            except WrongProcess:
                 # Something else has ended the process since.
-                read, process = _asked(self._reader, self._wanted, EpisodeRead, self._name)
+                read, process = _request(self._reader, self._wanted, EpisodeRead, self._name)
                 self._is_open_in(process, read.opened)
         raise ReaderEnded("ended the process that reads recordings")
 
@@ -309,7 +323,7 @@ def read_source(source: Source, shapes: SharedShapes | None = None, folder: Path
     return read_recording(source.kind, source.path, source.part or "", shapes, folder)
 
 
-def sources_among(paths: Sequence[Path]) -> tuple[Source, ...]:
+def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
     """The recordings that these files are, or that lie in these folders and the folders below them, by name, each once.
 
     Raises:

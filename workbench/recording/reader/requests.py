@@ -9,11 +9,10 @@ import msgspec
 from numpy.typing import NDArray
 
 from workbench.core.scene.shapes import Material, Mesh
-from workbench.recording.episode.document import CameraWords
+from workbench.recording.episode.document import CameraJson
 from workbench.recording.episode.encoded_pictures import Modality
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.row import Entry
-from workbench.recording.episode.source import Kind, Source
+from workbench.recording.episode.row import LibraryEntry, Source, SourceKind
 
 
 class NewReader(msgspec.Struct, tag=True):
@@ -32,7 +31,7 @@ class Ended(msgspec.Struct, tag=True):
     pid: int
 
 
-class Rows(msgspec.Struct, frozen=True):
+class ReadRows(msgspec.Struct, frozen=True):
     """The rows of the files of one name; answered by `RowsRead`."""
 
     folder: Path
@@ -42,17 +41,17 @@ class Rows(msgspec.Struct, frozen=True):
     times: dict[str, int]
 
 
-class Open(msgspec.Struct, frozen=True):
-    """An episode; answered by `EpisodeRead`. Its files stay open until `Forget`."""
+class OpenEpisode(msgspec.Struct, frozen=True):
+    """An episode; answered by `EpisodeRead`. Its files stay open until `CloseEpisodes`."""
 
-    kind: Kind
+    kind: SourceKind
     path: Path
     part: str
     sharing: int
     """Episodes that are asked for with the same number share their shapes: each is sent once."""
 
 
-class PictureAt(msgspec.Struct, frozen=True):
+class ReadPicture(msgspec.Struct, frozen=True):
     """A picture of an episode that is open; answered by `PictureRead`."""
 
     opened: int
@@ -63,13 +62,13 @@ class PictureAt(msgspec.Struct, frozen=True):
     """As it is kept, not decoded."""
 
 
-class Forget(msgspec.Struct, frozen=True):
+class CloseEpisodes(msgspec.Struct, frozen=True):
     """Episodes that are of no use any more. Not answered."""
 
     opened: list[int]
 
 
-class Sources(msgspec.Struct, frozen=True):
+class FindSources(msgspec.Struct, frozen=True):
     """Which recordings a file is, or a folder holds; answered by `SourcesFound`."""
 
     path: Path
@@ -77,7 +76,7 @@ class Sources(msgspec.Struct, frozen=True):
     """It is an ``.h5`` and is read as ManiSkill's, whatever lies beside it."""
 
 
-class ForRerun(msgspec.Struct, frozen=True):
+class ReadRerunInfo(msgspec.Struct, frozen=True):
     """What rerun's viewer is told of an ``.rrd``; answered by `ToldRerun`."""
 
     path: Path
@@ -89,15 +88,15 @@ class Recover(msgspec.Struct, frozen=True):
     folder: Path
 
 
-Request = Rows | Open | PictureAt | Forget | Sources | ForRerun | Recover
+Request = ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | FindSources | ReadRerunInfo | Recover
 
 
 class RowsRead(msgspec.Struct, frozen=True):
-    entries: list[Entry]
+    entries: list[LibraryEntry]
 
 
 class CameraRead(msgspec.Struct, frozen=True):
-    camera: CameraWords
+    camera: CameraJson
     frame: NDArray
     pose: NDArray
     pictures: dict[Modality, int]
@@ -138,7 +137,7 @@ class SourcesFound(msgspec.Struct, frozen=True):
     sources: list[Source]
 
 
-class ToldRerun(msgspec.Struct, frozen=True):
+class RerunInfo(msgspec.Struct, frozen=True):
     store: str | None
     """What it calls the recording."""
     blueprint: bytes | None
@@ -154,7 +153,7 @@ class ReadFailed(msgspec.Struct, frozen=True):
 
     why: Literal["unreadable", "system", "gone"]
     """The content is broken; the file cannot be got at; that episode is not open (any more)."""
-    words: str
+    message: str
 
 
-Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | ToldRerun | Recovered | ReadFailed
+Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | RerunInfo | Recovered | ReadFailed

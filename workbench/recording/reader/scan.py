@@ -4,7 +4,7 @@ A recording is a handful of files with one name and different endings, so files 
 and times of all of them the index knows whether it has read them as they are.
 
 A folder's own time changes when a name in it comes, goes or is given to another file, which is how every recording of
-ours is written. So between two full looks it is enough to ask a few folders for their time (`Scan.looks_the_same`).
+ours is written. So between two full looks it is enough to ask a few folders for their time (`Scan.is_unchanged`).
 That time moves in ticks, and a file that came within the tick of the last look would never be seen: as long as a
 folder's time is this fresh, it is looked into again.
 """
@@ -16,7 +16,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from workbench.recording.episode.row import Entry, Facts, text
+from workbench.recording.episode.row import Facts, LibraryEntry, clean_text
 
 SUFFIXES = (".json", ".h5", ".rrd")
 """In the order in which a recording is opened by them."""
@@ -54,10 +54,10 @@ class Found:
         return tuple(self.path(folder, suffix) for suffix in self.sizes)
 
 
-def broken(found: Found, problem: str) -> Entry:
+def broken(found: Found, problem: str) -> LibraryEntry:
     """The row of files of which nothing else is known."""
     kind = "rrd only" if found.sizes.keys() <= {".rrd", NOTES} else "maniskill"
-    return Facts(kind, written=found.newest / 1e9, problem=text(problem, 500)), None
+    return Facts(kind, written=found.newest / 1e9, problem=clean_text(problem, 500)), None
 
 
 def key_of(path: str) -> str:
@@ -76,7 +76,7 @@ class Scan:
     problem: str | None = None
     """A sentence, where not everything could be looked at."""
 
-    def looks_the_same(self) -> bool:
+    def is_unchanged(self) -> bool:
         """Whether nothing came or went since; cheap."""
         if self.fresh or self.problem is not None:
             return False
@@ -111,11 +111,11 @@ def scan_folder(folder: Path) -> Scan:
                         _add(names, below, entry)
         except FileNotFoundError:
             if not below:
-                problem = f"{_said(folder)} is not there."
+                problem = f"{_printable(folder)} is not there."
         except OSError as error:
-            problem = f"{_said(path)} cannot be looked into: {error.strerror or error}."
+            problem = f"{_printable(path)} cannot be looked into: {error.strerror or error}."
         if entries > MOST_ENTRIES:
-            problem = f"{_said(folder)} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
+            problem = f"{_printable(folder)} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
             break
     found, waits = {}, False
     for key, stats in names.items():
@@ -150,6 +150,6 @@ def _group(key: str, stats: dict[str, os.stat_result]) -> Found | None:
     )
 
 
-def _said(path: str | Path) -> str:
+def _printable(path: str | Path) -> str:
     """A path as text that can be sent to a page."""
     return os.fsencode(path).decode(errors="replace")

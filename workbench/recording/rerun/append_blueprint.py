@@ -86,14 +86,14 @@ def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> Blueprint
     (manifest,) = [field for field in read_fields(stream[begin : begin + length]) if field[0] == _MANIFESTS]
     fields = _message(manifest)
     (table,) = [field for field in fields if field[0] == _TABLE]
-    said = dict(_message(table))
-    content = pa.py_buffer(said[_PAYLOAD])
-    if said[_COMPRESSION] == _LZ4:
-        content = pa.decompress(content, decompressed_size=said[_UNPACKED], codec="lz4_raw")
+    entries = dict(_message(table))
+    content = pa.py_buffer(entries[_PAYLOAD])
+    if entries[_COMPRESSION] == _LZ4:
+        content = pa.decompress(content, decompressed_size=entries[_UNPACKED], codec="lz4_raw")
     return BlueprintBytes(
         messages=stream[_HEADER : begin - _MESSAGE.size],
         manifest=[field for field in fields if field[0] != _TABLE],
-        table=[pair for pair in said.items() if pair[0] not in (_PAYLOAD, _COMPRESSION, _UNPACKED)],
+        table=[pair for pair in entries.items() if pair[0] not in (_PAYLOAD, _COMPRESSION, _UNPACKED)],
         places=pa.ipc.open_stream(content).read_next_batch(),
     )
 
@@ -101,15 +101,15 @@ def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> Blueprint
 @contextmanager
 def _rerun_on() -> Iterator[None]:
     """Whoever runs with ``RERUN=off`` means the logging in their own code: rerun would make no blueprint either."""
-    said = os.environ.get("RERUN")
-    if said is None:
+    entries = os.environ.get("RERUN")
+    if entries is None:
         yield
         return
     os.environ["RERUN"] = "on"
     try:
         yield
     finally:
-        os.environ["RERUN"] = said
+        os.environ["RERUN"] = entries
 
 
 def _encoded(application_id: str, blueprint: rrb.Blueprint) -> bytes:

@@ -35,7 +35,7 @@ SERIES_COLORS = (
 yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
 
 
-def telling(values: NDArray) -> list[NDArray[np.int64] | None]:
+def changed_rows(values: NDArray) -> list[NDArray[np.int64] | None]:
     """Of each of K things, which rows of `values` (K, R, D) say something; None for all of them.
 
     A row between two equal ones says nothing: whoever looks there finds the one before, and a curve is the same line.
@@ -140,9 +140,9 @@ class TimedChunks:
     def poses(
         self, entities: Sequence[str], steps: NDArray[np.int64], poses: NDArray[np.float32]
     ) -> Iterator[Chunk]:
-        """`poses` (len(steps), len(entities), 7) translation and xyzw; rows that `telling` leaves out are."""
+        """`poses` (len(steps), len(entities), 7) translation and xyzw; rows that `changed_rows` leaves out are."""
         by_entity = np.ascontiguousarray(poses.transpose(1, 0, 2), dtype=np.float32)
-        for entity, rows, values in zip(entities, telling(by_entity), by_entity):
+        for entity, rows, values in zip(entities, changed_rows(by_entity), by_entity):
             if rows is not None:
                 values = values[rows]
             columns = [
@@ -152,9 +152,9 @@ class TimedChunks:
             yield self.of(entity, steps if rows is None else steps[rows], columns)
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> Chunk:
-        """`values` (len(steps), ...), all of a step as one batch, at least one; rows that `telling` leaves out are."""
+        """`values` (len(steps), ...), all of a step as one batch, at least one; rows that `changed_rows` leaves out are."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
-        (rows,) = telling(flat[None])
+        (rows,) = changed_rows(flat[None])
         if rows is not None:
             steps, flat = steps[rows], flat[rows]
         descriptor, kind = _number_column()
@@ -175,6 +175,6 @@ class TimedChunks:
         return self._times[key]
 
 
-def still_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:
+def static_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:
     """The one pose, (3,) and (4,), of what never moves."""
     return static_chunk(entity, rr.Transform3D(translation=translation, quaternion=rr.Quaternion(xyzw=xyzw)))

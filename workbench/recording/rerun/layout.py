@@ -12,7 +12,7 @@ Two timelines index all of it: ``step``, the state's number, and ``sim_time``. R
 `StepResult` k said: the state after k control steps, with the action that led there and the reward
 that it earned, so the action of row k is ``episode.action[k - 1]`` and row 0 has neither.
 
-A row of numbers or of a pose that is between two equal ones is left out (`rerun_chunks.telling`): the state before it says what it is.
+A row of numbers or of a pose that is between two equal ones is left out (`rerun_chunks.changed_rows`): the state before it says what it is.
 
 Everything goes in as columns (one call an entity), which research measured at forty times the speed
 of one call a row. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
@@ -40,7 +40,7 @@ from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode
 from workbench.recording.episode.episode import CameraTrack, Episode, camera_names
-from workbench.recording.rerun.chunks import TimedChunks, series_chunk, static_chunk, still_pose
+from workbench.recording.rerun.chunks import TimedChunks, series_chunk, static_chunk, static_pose
 
 WORLD = "/world"
 CAMERAS = "/world/cameras"
@@ -74,7 +74,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     """
     geometry, poses = episode.geometry, episode.poses
     assert geometry is not None and poses is not None
-    still, present = _still(poses), np.asarray(np.isfinite(poses).any(axis=(0, 2)))
+    still, present = _never_moves(poses), np.asarray(np.isfinite(poses).any(axis=(0, 2)))
     bodies = {body: entity for body, entity in enumerate(body_entities(geometry)) if present[body]}
     cameras = list(zip(episode.cameras, camera_entities([camera.info for camera in episode.cameras])))
     numbers, pieces = _numbers(episode), _pieces(episode.cameras)
@@ -82,7 +82,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     yield _world()
     for body, entity in bodies.items():
         if still[body]:
-            yield still_pose(entity, poses[0, body, :3], xyzw(poses[0, body, 3:]))
+            yield static_pose(entity, poses[0, body, :3], xyzw(poses[0, body, 3:]))
     yield from _meshes(geometry, episode.info.env_index, bodies)
     if cameras:
         yield _classes(episode.segmentation)
@@ -97,7 +97,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     moving = {body: entity for body, entity in bodies.items() if not still[body]}
     yield from timed.poses(list(moving.values()), states, poses[:, list(moving)][..., _XYZW])
     for camera, entity in cameras:
-        if not _still(camera.pose):
+        if not _never_moves(camera.pose):
             pose = np.concatenate(optical_pose(camera.pose), axis=1)
             yield from timed.poses([entity], camera.frame, pose[:, None])
     for entity, _, values in numbers:
@@ -110,7 +110,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
             yield timed.of(f"{entity}/{modality}", camera.frame[some], columns)
 
 
-def _still(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _never_moves(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(...) of poses (R, ..., 7): whether it never moved."""
     bits = poses.view(np.int32)  # a NaN is no movement
     return np.asarray((bits == bits[0]).all(axis=(0, -1)))
@@ -250,9 +250,9 @@ def _classes(segmentation: Mapping[int, str]) -> Chunk:
 
 def _lens(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]:
     info = camera.info
-    if _still(camera.pose):
+    if _never_moves(camera.pose):
         translation, quaternion = optical_pose(camera.pose[:1])
-        yield still_pose(entity, translation[0], quaternion[0])
+        yield static_pose(entity, translation[0], quaternion[0])
     pinhole = rr.Pinhole(
         image_from_camera=info.intrinsic,
         resolution=[info.width, info.height],
@@ -340,13 +340,13 @@ def events(episode: Episode) -> list[tuple[int, str, str]]:
     found = [(0, "INFO", f"reset with seed {seed}" if seed >= 0 else "reset")]
     for name, level in (("success", "INFO"), ("fail", "WARN")):
         if name in flags:
-            found += [(step, level, name) for step in onsets(flags[name])]
+            found += [(step, level, name) for step in rising_edges(flags[name])]
     for name, values in (("terminated", episode.terminated), ("truncated", episode.truncated)):
-        found += [(step + 1, "INFO", name) for step in onsets(values)]
+        found += [(step + 1, "INFO", name) for step in rising_edges(values)]
     return sorted(found, key=lambda event: event[0])
 
 
-def onsets(values: NDArray[np.bool_]) -> list[int]:
+def rising_edges(values: NDArray[np.bool_]) -> list[int]:
     """Indices at which `values` becomes true."""
     before = np.concatenate([[False], values[:-1]])
     return np.flatnonzero(values & ~before).tolist()

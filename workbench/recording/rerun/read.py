@@ -164,7 +164,9 @@ class RerunTable:
         visuals: dict[str, tuple[Mesh, Material, list[int]]] = {}
         for body, entity in enumerate(entities):
             number = 0
-            while (worn := self._worn(f"{entity}/{number}", f"{bare.body_names[body]}/{number}")) is not None:
+            while (
+                worn := self._visual_at(f"{entity}/{number}", f"{bare.body_names[body]}/{number}")
+            ) is not None:
                 name, mesh, material = worn
                 visuals.setdefault(name, (mesh, material, []))[2].append(body)
                 number += 1
@@ -176,14 +178,14 @@ class RerunTable:
             ),
         )
 
-    def _worn(self, entity: str, otherwise: str) -> tuple[str, Mesh, Material] | None:
-        """The name of a visual, by default `otherwise`, and what it looks like; None if there is none."""
+    def _visual_at(self, entity: str, default: str) -> tuple[str, Mesh, Material] | None:
+        """The name of a visual, by default `default`, and what it looks like; None if there is none."""
         if entity in self._known:
             return self._known[entity]
         mesh = self._mesh(entity)
         if mesh is None:
             return None
-        name = str(self._one(entity, "visual", otherwise))
+        name = str(self._one(entity, "visual", default))
         mesh, material = self._shapes.shared(mesh, self._material(entity))
         if entity in self._alone and (entity, "visual") in self._static:
             self._shapes.learn(_mark(self._alone[entity]), name, mesh, material)
@@ -221,15 +223,15 @@ class RerunTable:
             texture=texture,
         )
 
-    def _one(self, entity: str, component: str, otherwise: Any) -> Any:
+    def _one(self, entity: str, component: str, default: Any) -> Any:
         values = self._static.get((entity, component))
-        return otherwise if values is None else values[0].as_py()
+        return default if values is None else values[0].as_py()
 
 
 def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int64]:
     """(states - first,) which row says what was at each state: the one before where it has none; -1 where there is none yet.
 
-    Rows that say nothing new are left out (`rerun_chunks.telling`).
+    Rows that say nothing new are left out (`rerun_chunks.changed_rows`).
     """
     return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 
@@ -316,7 +318,7 @@ class OpenFile:
             raise OSError(f"{self.name} is damaged at byte {place.begin}: {error}") from error
 
 
-class _Kept:
+class _ChunkCache:
     """The chunks that were looked at last."""
 
     def __init__(self) -> None:
@@ -343,7 +345,7 @@ class _Kept:
         return rows
 
 
-_kept = _Kept()
+_chunk_cache = _ChunkCache()
 
 
 def pictures_in(
@@ -354,7 +356,7 @@ def pictures_in(
 
     def one(number: int) -> bytes:
         part = int(np.searchsorted(ends, number, side="right"))
-        rows = _kept.rows(file, places[part], component)
+        rows = _chunk_cache.rows(file, places[part], component)
         content = rows[number - int(ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
         if modality != "segmentation":
             return content

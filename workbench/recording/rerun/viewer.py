@@ -141,7 +141,7 @@ class Viewer:
         end(self._process)
 
 
-def recordings_among(paths: Sequence[Path]) -> list[Path]:
+def resolve_recordings(paths: Sequence[Path]) -> list[Path]:
     """These recordings, in full.
 
     Raises:
@@ -164,10 +164,10 @@ def open_window(paths: Sequence[Path]) -> Viewer:
     """Show the recordings at `paths` together, in a window of rerun's viewer.
 
     Raises:
-        ValueError, FileNotFoundError: see `recordings_among`.
+        ValueError, FileNotFoundError: see `resolve_recordings`.
         RuntimeError: there is no screen here, or rerun did not start.
     """
-    files = recordings_among(paths)
+    files = resolve_recordings(paths)
     if not has_screen(os.environ):
         # Rerun would listen, load and only then find out.
         raise RuntimeError(
@@ -188,10 +188,10 @@ def open_window(paths: Sequence[Path]) -> Viewer:
     return Viewer(process, says)
 
 
-def _print_all(said: IO[bytes]) -> None:
+def _print_all(output: IO[bytes]) -> None:
     """What rerun says of a file has names from the file in it."""
-    with said:
-        for line in said:
+    with output:
+        for line in output:
             print(only_colours(line.decode(errors="replace")), end="", file=sys.stderr, flush=True)
 
 
@@ -214,12 +214,12 @@ def web_viewer_folder() -> Path:
     Raises:
         RuntimeError: rerun did not hand them over, or there is no room for them.
     """
-    folder = _kept_in()
+    folder = _cache_path()
     # One lock for all threads: a page asks for three files at once.
     with _packing:
         if not folder.is_dir():
             try:
-                _keep(web_viewer_files(), folder)
+                _write_cache(web_viewer_files(), folder)
             except OSError as error:
                 raise RuntimeError(
                     f"rerun's web viewer could not be kept in {folder} ({error.strerror or error}); make room there, or name "
@@ -228,16 +228,16 @@ def web_viewer_folder() -> Path:
     return folder
 
 
-def is_kept() -> bool:
+def viewer_is_cached() -> bool:
     """Whether `web_viewer_folder` answers at once."""
-    return _kept_in().is_dir()
+    return _cache_path().is_dir()
 
 
-def _kept_in() -> Path:
+def _cache_path() -> Path:
     return cache_folder() / "rerun-viewer" / version("rerun-sdk")
 
 
-def _keep(files: dict[str, bytes], folder: Path) -> None:
+def _write_cache(files: dict[str, bytes], folder: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
     try:

@@ -30,7 +30,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.episode.description import describe
 from workbench.recording.episode.document import fields_of, json_text
-from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_in_words, box_of_moving
+from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_text, box_of_moving
 from workbench.recording.rerun.append_blueprint import BlueprintBytes, add_blueprint, encode_blueprint
 from workbench.recording.rerun.chunks import STEP, property_chunk, static_chunk
 from workbench.recording.rerun.layout import (
@@ -138,22 +138,22 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     in ManiSkill's own metrics. ``source`` holds the text of the task's files, so that the episode can
     be made again where the files have changed since. ``workbench`` is the `Description` for programs.
     """
-    said = fields_of(describe(episode))
+    described = fields_of(describe(episode))
     words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
     words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered")
-    plain = {name: said[name] for name in words}
+    plain = {name: described[name] for name in words}
     for name in ("success", "success_once", "fail", "fail_once"):
-        plain[name] = bool(said[name])
-    plain["acted_by"] = acted_by_in_words(episode.info.acted_by)
+        plain[name] = bool(described[name])
+    plain["acted_by"] = acted_by_text(episode.info.acted_by)
     for name in ("env_kwargs", "reset_options"):
-        plain[name] = json_text(said[name])
+        plain[name] = json_text(described[name])
     values: dict[str, dict[str, Any]] = {"episode": plain}
-    if said["versions"]:
-        values["versions"] = dict(said["versions"])
-    if said["source"]:
-        values["source"] = {"files": list(said["source"]), "texts": list(said["source"].values())}
+    if described["versions"]:
+        values["versions"] = dict(described["versions"])
+    if described["source"]:
+        values["source"] = {"files": list(described["source"]), "texts": list(described["source"].values())}
     # The texts are megabytes in no task, and once is enough.
-    values["workbench"] = {"description": json_text({**said, "source": None})}
+    values["workbench"] = {"description": json_text({**described, "source": None})}
     return values
 
 

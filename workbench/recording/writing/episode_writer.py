@@ -2,7 +2,7 @@
 
 Whoever records (the page, the command line, a wrapper around an env) has a row a step and must not wait for the disk, must
 not fill the memory, and may be killed at any moment. So a row is checked, packed and handed to a `Journal`, its pictures to
-`encode_soon`; that is all that a step pays for. The rest (`make_files`) is done once, when the episode is over, and may be done on another
+`encode_async`; that is all that a step pays for. The rest (`make_files`) is done once, when the episode is over, and may be done on another
 thread.
 """
 
@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 
@@ -21,17 +23,22 @@ from workbench.core.camera_data import CameraInfo, CameraKind, Picture
 from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.columns import TEXT, Layout, TextWriter
-from workbench.recording.episode.encoded_pictures import MODALITIES, Modality
+from workbench.recording.episode.encoded_pictures import MODALITIES, Modality, encode
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.writing.encode_pool import encode_soon
 from workbench.recording.writing.finish import EpisodeFiles as EpisodeFiles
 from workbench.recording.writing.finish import make_files
 from workbench.recording.writing.from_journal import Header, header_text
-from workbench.recording.writing.journal import FOLDER, Entry, Journal, keep_scene
-from workbench.recording.writing.journal import Item as JournalItem
+from workbench.recording.writing.journal import (
+    FOLDER,
+    SCENE_SUFFIX,
+    Journal,
+    JournalEntry,
+    JournalItem,
+    remove_empty_folder,
+    write_scene,
+)
 from workbench.recording.writing.publish import RecordingError, reason
 
-SCENE_SUFFIX = ".scene"
 NO_OTHERS: Mapping[str, OtherEntry] = MappingProxyType({})
 _PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
     "rgb": ((3,), "u", "(H, W, 3) of uint8"),
@@ -76,8 +83,8 @@ class EpisodeWriter:
         try:
             self._journal = Journal(path)
             try:
-                keep_scene(geometry, self._scene)
-                self._journal.append(Entry("header", 0, header_text(self._header).encode()))
+                write_scene(geometry, self._scene)
+                self._journal.append(JournalEntry("header", 0, header_text(self._header).encode()))
             except OSError:
                 self.discard()
                 raise
@@ -125,14 +132,14 @@ class EpisodeWriter:
         if number is None:
             layout.check(self._header.bodies, self.actions)
             number = len(self._layouts)
-            items.append(Entry("layout", number, layout.text.encode()))
+            items.append(JournalEntry("layout", number, layout.text.encode()))
         if pictures:
             given, encoded = self._pictures_of(pictures)
             items += encoded
-        if others or not self._texts.is_silent:
-            items += [Entry(TEXT, *line) for line in self._texts.news(self._states, others)]
+        if others or not self._texts.is_empty:
+            items += [JournalEntry(TEXT, *line) for line in self._texts.changes(self._states, others)]
         try:
-            self._journal.append(*items, Entry("row", number, row))
+            self._journal.append(*items, JournalEntry("row", number, row))
         except OSError as error:
             raise self._failed(error) from error
         self._layouts[layout] = number
@@ -146,7 +153,7 @@ class EpisodeWriter:
             RecordingError: as `append`.
         """
         try:
-            self._journal.append(Entry("acted", len(self), what.encode()))
+            self._journal.append(JournalEntry("acted", len(self), what.encode()))
         except OSError as error:
             raise self._failed(error) from error
 
@@ -183,7 +190,7 @@ class EpisodeWriter:
         for remove in (self._journal.remove, self._scene.unlink):
             with contextlib.suppress(OSError):
                 remove()
-        tidy(self._folder)
+        remove_empty_folder(self._folder)
 
     def _pictures_of(
         self, pictures: Sequence[Picture]
@@ -195,9 +202,9 @@ class EpisodeWriter:
         items: list[JournalItem] = []
         for (index, modalities), picture in zip(seen.items(), pictures):
             pose = np.asarray(picture.pose, dtype=np.float32).tobytes()
-            items.append(Entry(f"camera/{index}", self._states, pose))
+            items.append(JournalEntry(f"camera/{index}", self._states, pose))
             items.append(
-                encode_soon(
+                encode_async(
                     [(f"picture/{index}/{m}", self._states, m, getattr(picture, m)) for m in modalities]
                 )
             )
@@ -242,13 +249,111 @@ class EpisodeWriter:
         )
 
 
-def tidy(folder: Path) -> None:
-    """Take the folder of the journals away if nothing is in it."""
-    try:
-        os.rmdir(folder / FOLDER)
-    except OSError:  # not empty, or not there
-        pass
-
-
 def _given(picture: Picture) -> tuple[Modality, ...]:
     return tuple(modality for modality in MODALITIES if getattr(picture, modality) is not None)
+
+
+# --- pictures encoded on threads ---------------------------------------------------------------
+
+
+MOST_PENDING_BYTES = 8 << 20
+"""Of pictures that are not encoded yet: a few hundredths of a second of work, which a killed process loses besides what its journal does."""
+_TOGETHER_BYTES = 1 << 20
+"""Pictures are handed over so many at a time. A thread that is woken at every step for one small picture costs the step as much as
+encoding it, and finds nothing of its own in the processor's caches: it takes three times as long (measured)."""
+
+_Pictures = Sequence[tuple[str, int, Modality, NDArray]]
+
+
+class PendingEntries(Future[list[JournalEntry]]):
+    """Entries that will be there; to ask for them is to have them made."""
+
+    def __init__(self, pool: _EncoderPool, pictures: _Pictures) -> None:
+        super().__init__()
+        self._pool, self._pictures = pool, pictures
+        self.size = sum(picture.nbytes for *_, picture in pictures)
+
+    def result(self, timeout: float | None = None) -> list[JournalEntry]:
+        if not self.done():
+            self._pool.begin()
+        return super().result(timeout)
+
+    def make(self) -> None:
+        pictures, self._pictures = self._pictures, ()
+        try:
+            self.set_result(
+                [
+                    JournalEntry(kind, number, encode(which, picture))
+                    for kind, number, which, picture in pictures
+                ]
+            )
+        except BaseException as error:  # whoever waits for it has to know
+            self.set_exception(error)
+
+
+class _EncoderPool:
+    """The threads of this process."""
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(
+            max(1, min(4, (os.cpu_count() or 2) - 1)), thread_name_prefix="episode-pictures"
+        )
+        self._lock = threading.Lock()
+        self._bytes = 0
+        self._gathered: list[PendingEntries] = []
+        self._gathered_bytes = 0
+
+    def take(self, pictures: _Pictures) -> PendingEntries:
+        soon = PendingEntries(self, pictures)
+        with self._lock:
+            full = self._bytes > 0 and self._bytes + soon.size > MOST_PENDING_BYTES
+            if not full:
+                self._bytes += soon.size
+                self._gathered.append(soon)
+                self._gathered_bytes += soon.size
+            enough = self._gathered_bytes >= _TOGETHER_BYTES
+        if full:
+            soon.make()
+        if full or enough:
+            self.begin()
+        return soon
+
+    def begin(self) -> None:
+        """Hand over what has gathered."""
+        with self._lock:
+            gathered, self._gathered, self._gathered_bytes = self._gathered, [], 0
+        if not gathered:
+            return
+        try:
+            self._threads.submit(self._make, gathered)
+        except RuntimeError:  # the interpreter is about to end, and its threads have
+            self._make(gathered)
+
+    def _make(self, gathered: list[PendingEntries]) -> None:
+        for soon in gathered:
+            soon.make()
+            with self._lock:
+                self._bytes -= soon.size
+
+
+_pool: _EncoderPool | None = None
+_making = threading.Lock()
+
+
+def encode_async(pictures: _Pictures) -> PendingEntries:
+    """Journal entries of `pictures`: kind and number of the entry, modality, picture. Nobody may write to these any more."""
+    global _pool
+    with _making:
+        if _pool is None:
+            _pool = _EncoderPool()
+        pool = _pool
+    return pool.take(pictures)
+
+
+def _forget() -> None:
+    global _pool, _making
+    _pool, _making = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)  # the threads stay behind

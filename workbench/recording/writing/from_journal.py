@@ -29,11 +29,11 @@ from workbench.recording.episode.columns import (
     layout_type,
     tracks_of,
 )
-from workbench.recording.episode.document import CameraWords, json_text
+from workbench.recording.episode.document import CameraJson, json_text
 from workbench.recording.episode.encoded_pictures import MODALITIES, EncodedPictures, LazyPictures, Modality
-from workbench.recording.episode.episode import CameraTrack, Episode, EpisodeInfo, acted_by_from
+from workbench.recording.episode.episode import CameraTrack, Episode, EpisodeInfo, parse_acted_by
 from workbench.recording.episode.made_here import is_sealed, seal_text
-from workbench.recording.writing.journal import Entry, JournalReader
+from workbench.recording.writing.journal import JournalEntry, JournalReader
 
 
 @dataclass(frozen=True)
@@ -64,29 +64,29 @@ def header_text(header: Header) -> str:
             "bodies": [geometry.num_envs, geometry.body_names, geometry.body_kinds, geometry.body_hidden],
             "segmentation": {str(key): name for key, name in header.segmentation.items()},
             "action_names": header.action_names,
-            "cameras": [CameraWords.of(camera) for camera in header.cameras],
+            "cameras": [CameraJson.of(camera) for camera in header.cameras],
         }
     )
 
 
 def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
     """The inverse of `header_text`; the meshes lie beside it. Raises ValueError, KeyError or TypeError."""
-    said = json.loads(text)
-    num_envs, names, kinds, hidden = said["bodies"]
+    data = json.loads(text)
+    num_envs, names, kinds, hidden = data["bodies"]
     # A journal of an earlier version holds it as an object, without a seal.
-    info = said["info"] if isinstance(said["info"], str) else json.dumps(said["info"])
+    info = data["info"] if isinstance(data["info"], str) else json.dumps(data["info"])
     return Header(
         info=_info_from(json.loads(info)),
         geometry=SceneGeometry(num_envs, tuple(names), tuple(kinds), tuple(hidden), visuals),
-        segmentation={int(key): name for key, name in said["segmentation"].items()},
-        action_names=tuple(said["action_names"]),
-        cameras=tuple(words.info() for words in msgspec.convert(said["cameras"], list[CameraWords])),
-        made_here=is_sealed(info, said.get("made_here")),
+        segmentation={int(key): name for key, name in data["segmentation"].items()},
+        action_names=tuple(data["action_names"]),
+        cameras=tuple(words.info() for words in msgspec.convert(data["cameras"], list[CameraJson])),
+        made_here=is_sealed(info, data.get("made_here")),
     )
 
 
-def _info_from(said: Mapping[str, Any]) -> EpisodeInfo:
-    return EpisodeInfo(**{**said, "acted_by": acted_by_from(said.get("acted_by")), "seal": None})
+def _info_from(data: Mapping[str, Any]) -> EpisodeInfo:
+    return EpisodeInfo(**{**data, "acted_by": parse_acted_by(data.get("acted_by")), "seal": None})
 
 
 def recovered(header: Header) -> Header:
@@ -137,7 +137,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
     seen = [_Seen() for _ in header.cameras]
     acted = list(header.info.acted_by)
     texts: list[tuple[int, bytes]] = []
-    for place, (kind, number, value) in _of_whole_states(journal):
+    for place, (kind, number, value) in _complete_states(journal):
         if kind == "row":
             if not runs or runs[-1][0] != number:
                 runs.append((number, []))
@@ -181,9 +181,9 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
     )
 
 
-def _of_whole_states(journal: JournalReader) -> Iterator[tuple[tuple[int, int], Entry]]:
+def _complete_states(journal: JournalReader) -> Iterator[tuple[tuple[int, int], JournalEntry]]:
     """The entries of states that are there with all that belongs to them, their row last, and where they lie."""
-    held: list[tuple[tuple[int, int], Entry]] = []
+    held: list[tuple[tuple[int, int], JournalEntry]] = []
     for begin, entries in journal:
         for row, entry in enumerate(entries):
             held.append(((begin, row), entry))

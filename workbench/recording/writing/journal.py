@@ -50,6 +50,7 @@ from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.machine.files import open_regular_file
 
 FOLDER = ".writing"
+SCENE_SUFFIX = ".scene"
 SYNC_SECONDS = 0.4
 """How long a row may wait before it is written."""
 _BATCH_BYTES = 2 << 20
@@ -59,13 +60,13 @@ _MOST_BATCHES = 4
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
 
-class Entry(NamedTuple):
+class JournalEntry(NamedTuple):
     kind: str
     number: int
     value: bytes
 
 
-Item = Entry | Future[list[Entry]]
+JournalItem = JournalEntry | Future[list[JournalEntry]]
 
 
 class Journal:
@@ -77,7 +78,7 @@ class Journal:
         self._descriptor = _create(path)
         self._closer = weakref.finalize(self, os.close, self._descriptor)
         self._size = 0
-        self._waiting: list[Item] = []
+        self._waiting: list[JournalItem] = []
         self._waiting_bytes = 0
         self._lock = threading.Lock()  # of what waits; never held while the disk works
         self._writing = threading.Lock()
@@ -90,14 +91,14 @@ class Journal:
             with contextlib.suppress(OSError):  # what is to be told is why it cannot be begun
                 self.remove()
             raise
-        _keeper.watch(self)
+        _journal_thread.watch(self)
 
     @property
     def size(self) -> int:
         """Bytes written and waiting."""
         return self._size + self._waiting_bytes
 
-    def append(self, *items: Item) -> None:
+    def append(self, *items: JournalItem) -> None:
         """What belongs together, and will be on the disk soon: a state, its row last.
 
         Entries that somebody is still working at keep their place, and whoever writes waits for them, not the owner.
@@ -107,13 +108,13 @@ class Journal:
         """
         if self._error is not None:
             raise self._error
-        added = sum([_size(item) for item in items if isinstance(item, Entry)])
+        added = sum([_size(item) for item in items if isinstance(item, JournalEntry)])
         with self._lock:
             self._waiting += items
             self._waiting_bytes += added
             full = self._waiting_bytes > _BATCH_BYTES
         for item in items:
-            if not isinstance(item, Entry):
+            if not isinstance(item, JournalEntry):
                 item.add_done_callback(self._weigh)
         if full:
             self.write()  # where that fails the next one is told: this one is kept
@@ -125,7 +126,7 @@ class Journal:
                 return
             with self._lock:
                 items, self._waiting = self._waiting, []
-            entries, done, error = _made(items)
+            entries, done, error = _resolve(items)
             if entries:
                 batch = pa.record_batch(
                     [
@@ -144,14 +145,14 @@ class Journal:
                 self._waiting_bytes -= sum(map(_size, entries))
             self._error = error
 
-    def _weigh(self, made: Future[list[Entry]]) -> None:
+    def _weigh(self, made: Future[list[JournalEntry]]) -> None:
         if not made.cancelled() and made.exception() is None:
             with self._lock:
                 self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
         """Write what was appended and make it last, also through a power cut. An error is raised by the next `append`."""
-        self._written(os.fsync)
+        self._flush(os.fsync)
 
     def finish(self) -> None:
         """Write everything and stop writing; the file stays locked until `close`.
@@ -159,13 +160,13 @@ class Journal:
         A process that dies loses nothing of it. For a power cut `sync` it, where it is not to be replaced by something better at once.
         What could not be written before is tried again. Raises OSError where something still cannot.
         """
-        _keeper.forget(self)
+        _journal_thread.forget(self)
         self._error = None
-        self._written(lambda _: None)
+        self._flush(lambda _: None)
         if self._error is not None:
             raise self._error
 
-    def _written(self, last: Callable[[int], None]) -> None:
+    def _flush(self, last: Callable[[int], None]) -> None:
         self.write()
         with self._writing:
             if self._error is not None or not self._closer.alive:
@@ -180,7 +181,7 @@ class Journal:
 
     def close(self) -> None:
         """Let go of the file."""
-        _keeper.forget(self)
+        _journal_thread.forget(self)
         with self._writing:
             self._closer()
 
@@ -200,12 +201,12 @@ class Journal:
         self._size = end
 
 
-def _made(items: Sequence[Item]) -> tuple[list[Entry], int, OSError | None]:
+def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSError | None]:
     """Their entries, and how many of them these are. Where one cannot be made, those of the states before it."""
-    entries: list[Entry] = []
+    entries: list[JournalEntry] = []
     whole, done = 0, 0
     for number, item in enumerate(items, 1):
-        if not isinstance(item, Entry):
+        if not isinstance(item, JournalEntry):
             try:
                 entries += item.result()
             except Exception as error:
@@ -218,7 +219,7 @@ def _made(items: Sequence[Item]) -> tuple[list[Entry], int, OSError | None]:
     return entries, len(items), None
 
 
-def _size(entry: Entry) -> int:
+def _size(entry: JournalEntry) -> int:
     return len(entry.value) + len(entry.kind) + 8
 
 
@@ -232,7 +233,7 @@ def _create(path: Path) -> int:
     raise FileNotFoundError(errno.ENOENT, "the folder vanishes as soon as it is made")
 
 
-class _Keeper:
+class _JournalThread:
     """The thread that writes what has gathered in all journals of this process, while there are any."""
 
     def __init__(self) -> None:
@@ -277,7 +278,7 @@ class _Keeper:
                 journal.sync()
 
 
-_keeper = _Keeper()
+_journal_thread = _JournalThread()
 
 
 def before_writing(flush: Callable[[], None]) -> None:
@@ -285,7 +286,7 @@ def before_writing(flush: Callable[[], None]) -> None:
 
     On the thread of the journals, so it must not raise.
     """
-    _keeper.before.append(weakref.WeakMethod(flush))
+    _journal_thread.before.append(weakref.WeakMethod(flush))
 
 
 class JournalReader:
@@ -297,7 +298,7 @@ class JournalReader:
         self._file = open_regular_file(path)
         self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
 
-    def __iter__(self) -> Iterator[tuple[int, list[Entry]]]:
+    def __iter__(self) -> Iterator[tuple[int, list[JournalEntry]]]:
         """Its entries, a batch at a time, and where that begins. Raises OSError."""
         try:
             self._file.seek(0)
@@ -306,7 +307,10 @@ class JournalReader:
             begin = self._file.tell()
             while True:
                 batch, end = self._batch(begin)
-                yield begin, [Entry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))]
+                yield (
+                    begin,
+                    [JournalEntry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))],
+                )
                 begin = end
         except (EOFError, pa.ArrowInvalid):
             return
@@ -326,6 +330,14 @@ class JournalReader:
     def close(self) -> None:
         self._batch.cache_clear()
         self._file.close()
+
+
+def remove_empty_folder(folder: Path) -> None:
+    """Take the folder of the journals away if nothing is in it."""
+    try:
+        os.rmdir(folder / FOLDER)
+    except OSError:  # not empty, or not there
+        pass
 
 
 def claim(path: Path) -> int | None:
@@ -360,7 +372,7 @@ _lock = threading.Lock()
 _last: tuple[weakref.ref[SceneGeometry], Path] | None = None
 
 
-def keep_scene(geometry: SceneGeometry, path: Path) -> None:
+def write_scene(geometry: SceneGeometry, path: Path) -> None:
     """Have `geometry` in the file `path`, which must not exist. Raises OSError."""
     global _last
     with _lock:
@@ -375,7 +387,7 @@ def keep_scene(geometry: SceneGeometry, path: Path) -> None:
 
 
 def read_visuals(path: Path) -> tuple[Visual, ...]:
-    """The visuals of what `keep_scene` kept; none where the file is missing or broken."""
+    """The visuals of what `write_scene` kept; none where the file is missing or broken."""
     try:
         with open_regular_file(path) as file, np.load(file, allow_pickle=False) as archive:
             return tuple(_visuals(archive))

@@ -37,7 +37,7 @@ def try_folder(folder: Path) -> None:
         raise RecordingError(f"Cannot record to {folder}: {reason(error, folder)}") from error
 
 
-def make_last(paths: Sequence[Path]) -> None:
+def sync_files(paths: Sequence[Path]) -> None:
     """Have the disk take all of `paths`; at the same time, since each alone waits a few milliseconds. Raises OSError."""
     errors: list[OSError] = []
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
-from workbench.recording.reader.reading import mend, recovered_in_words
+from workbench.recording.reader.reading import recover_confined, recovered_text
 from workbench.recording.writing.publish import RecordingError
 from workbench.session.record.keep_past import KeepStatus
 
@@ -195,13 +195,13 @@ class LiveRecorder:
         if not self._folder.is_dir():
             return
         try:
-            recovered = [str(file) for file in mend(self._folder)]
+            recovered = [str(file) for file in recover_confined(self._folder)]
         except RecordingError as error:
             message = f"what an earlier recording left could not be mended: {error}"
             with self._lock:
                 self._problem = message
         else:
-            message = recovered_in_words(recovered)
+            message = recovered_text(recovered)
             with self._lock:
                 self._recovered = tuple(recovered)
         if message:

@@ -32,8 +32,8 @@ from workbench.jobs.verdict import Rescore, Rescored, Verdict
 from workbench.recording.episode.document import WrongDocument, read_document
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.made_here import made_here
-from workbench.recording.episode.side_files import side_files_in_words
-from workbench.recording.episode.source import Source, UnreadableRecording
+from workbench.recording.episode.row import Source, UnreadableRecording
+from workbench.recording.episode.side_files import side_files_text
 from workbench.recording.reader.reading import read_source
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared, recorded_content
 from workbench.session.process.askers import Background
@@ -80,20 +80,20 @@ def group_episodes(
         recorded_source: each is judged by the text that it was recorded with.
     """
     groups: dict[str, Group] = {}
-    unread: list[Verdict[Source]] = []
+    broken_files: list[Verdict[Source]] = []
     for episode in files:
         try:
             info = _info_of(episode)
         except (UnreadableRecording, OSError) as error:
-            unread.append(Verdict(episode, why_not=str(error)))
+            broken_files.append(Verdict(episode, why_not=str(error)))
             continue
         try:
             text = recorded_content(info).hash if recorded_source else ""
         except NoText as error:
-            unread.append(Verdict(episode, task=info.task, why_not=str(error)))
+            broken_files.append(Verdict(episode, task=info.task, why_not=str(error)))
             continue
         options, note = rescore_options(options_of(info, 1, base))
-        if recorded_source and (besides := side_files_in_words(info.source_file, info.side_files)):
+        if recorded_source and (besides := side_files_text(info.source_file, info.side_files)):
             note = f"{note}. {besides}" if note else besides
         reference = task or (file and class_in(file, info.task)) or reference_of(info)
         # One that was made here must not vouch for one that was not.
@@ -104,7 +104,7 @@ def group_episodes(
     return [
         replace(g, options=replace(g.options, num_envs=max(1, min(num_envs, len(g.files)))))
         for g in groups.values()
-    ], unread
+    ], broken_files
 
 
 def hidden_in_words(reference: TaskName) -> list[str]:
@@ -211,13 +211,13 @@ class Rescorer:
             return
 
         def work(job: Job) -> None:
-            groups, unread = group_episodes(
+            groups, broken_files = group_episodes(
                 files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
             )
             notes = [f"with {_rescored_with(group)}" for group in groups[:MOST_NAMED]]
             notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
-            self._tell(job, unread, state="asking", notes=tuple(notes))
+            self._tell(job, broken_files, state="asking", notes=tuple(notes))
             try:
                 self._rescore_all(job, groups, use_env_states)
             except CannotEnterRecording as error:

@@ -13,7 +13,7 @@ import numpy as np
 
 from workbench.jobs.verdict import FLAGS, Verdict
 from workbench.machine.text import length, mean_text, number_text
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 
 PUT_IN = " With the recorded states put in at every step nothing drifts."
 """What can be done about drift from a recording."""

@@ -16,8 +16,7 @@ from workbench.core.scene.shapes import SharedShapes
 from workbench.machine.processes.family import allocated_memory
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.row import LibraryRow
-from workbench.recording.episode.source import UnreadableRecording
+from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_source
 from workbench.session.process.job_lane import Stopped
@@ -223,7 +222,7 @@ class Review:
                 episode = _shared(self._read(row, shapes), shapes)
                 opened.append(Opened(row.id, row.name, episode, find_events(episode)))
                 files.update(stamps)
-                problems += [broken.sentence for broken in episode.unread]
+                problems += [broken.sentence for broken in episode.broken_files]
             except (OSError, UnreadableRecording) as error:
                 problems.append(f"{row.name}: {error}")
             except Exception as error:

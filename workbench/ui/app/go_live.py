@@ -23,7 +23,7 @@ from workbench.jobs.from_recording import (
 )
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.side_files import side_files_in_words
+from workbench.recording.episode.side_files import side_files_text
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
 from workbench.session.review.view import ReviewView
@@ -288,7 +288,7 @@ class GoLivePart(PagePart[ReviewView]):
             self._about = info and info.id, self._go_live.recorded_source
             words = ""
             if info is not None and self._go_live.recorded_source:
-                words = side_files_in_words(info.source_file, info.side_files)
+                words = side_files_text(info.source_file, info.side_files)
             self._besides.content = render("note", text=words) if words else ""
 
     def _chosen(self) -> None:

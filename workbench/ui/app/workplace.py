@@ -14,7 +14,7 @@ import viser
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.watched_thread import watched_thread
 from workbench.recording.library.library import Library
-from workbench.recording.reader.reading import mend, recovered_in_words
+from workbench.recording.reader.reading import recover_confined, recovered_text
 from workbench.session.clearance import Clearances
 from workbench.session.live.session import Session
 from workbench.session.rescore.recordings import Rescorer
@@ -107,7 +107,7 @@ class Workplace:
     def _mend(self, shelf: Shelf) -> None:
         """Recover episodes of a writer that was killed."""
         try:
-            mended = [str(file) for file in mend(self._recordings)]
+            mended = [str(file) for file in recover_confined(self._recordings)]
         except OSError as error:
             shelf.review.add_problem(str(error))
             self._on_notice(str(error))
@@ -117,8 +117,8 @@ class Workplace:
             shelf.review.add_problem(
                 f"{what} left half written by a program that was killed can be seen again."
             )
-            self._on_notice(recovered_in_words(mended))
-            shelf.library.look_soon()
+            self._on_notice(recovered_text(mended))
+            shelf.library.request_scan()
 
     def task_files(self) -> tuple[Path, ...]:
         """The task files that this program was started with or has open."""
@@ -140,7 +140,7 @@ class Workplace:
 
     def _page(self, which: Which, dark: bool) -> Page | ReviewPage:
         if which == "review":
-            self.shelf.library.look_soon()
+            self.shelf.library.request_scan()
             return ReviewPage(self, dark)
         # Imported late: a review alone does not need it.
         from workbench.ui.app.live_page import Page

@@ -92,7 +92,7 @@ class LibraryEdits:
 
     def ask_delete(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
-        if not rows or not self._do(lambda: self._library.may_delete(ids)):
+        if not rows or not self._do(lambda: self._library.check_delete(ids)):
             return
         self._ask(
             "Delete recordings",

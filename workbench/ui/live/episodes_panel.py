@@ -6,7 +6,7 @@ import shlex
 
 import viser
 
-from workbench.recording.reader.reading import recovered_in_words
+from workbench.recording.reader.reading import recovered_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.record.live import RecordingStatus
@@ -144,7 +144,7 @@ def recording_html(recording: RecordingStatus) -> str:
         "recording",
         recording=recording,
         envs=_envs_in_words(recording.env_idx),
-        recovered=recovered_in_words(recording.recovered),
+        recovered=recovered_text(recording.recovered),
         command=recording.last_file and f"workbench view {shlex.quote(recording.last_file)}",
     )
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import viser
 
 from workbench.jobs.from_recording import ChangesOnDisk, version_of
-from workbench.recording.episode.episode import acted_by_in_words
+from workbench.recording.episode.episode import acted_by_text
 from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review.view import Opened, ReviewView, outcome_text
 from workbench.ui.widgets.click_targets import Presses
@@ -167,7 +167,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
         info=info,
         version=version_of(info) or info.source_hash,
         changed=changed,
-        acted_by=acted_by_in_words(info.acted_by),
+        acted_by=acted_by_text(info.acted_by),
         assignments=assignments,
         local_time=local_time,
     )

@@ -14,7 +14,7 @@ from workbench.authoring.loading.reference import RecordedTask, named_file
 from workbench.jobs.from_recording import class_in, reference_of, version_of
 from workbench.jobs.verdict import Verdict, in_order
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
 from workbench.session.rescore import verdict_text as words
 from workbench.session.rescore.background import RUNNING

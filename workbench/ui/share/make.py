@@ -23,7 +23,7 @@ from workbench.jobs.pool import Deal, PoolError, Processes, Share, Work
 from workbench.machine.files import new_file
 from workbench.machine.software_vulkan import ensure_render_device
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import Source
 from workbench.recording.films import (
     Eye,
     camera_of,
@@ -117,10 +117,10 @@ def _of_readable(wanted: MakeRequest, source: Source, on_progress: OnProgress) -
     try:
         return _of_one(wanted, source, episode, on_progress)
     except ValueError as error:
-        if not episode.unread:
+        if not episode.broken_files:
             raise
         raise ValueError(
-            " ".join(broken.sentence for broken in episode.unread)
+            " ".join(broken.sentence for broken in episode.broken_files)
         ) from error  # it does not lack pictures, they cannot be read
 
 

@@ -13,8 +13,7 @@ from typing import Any
 import viser
 
 from workbench.core.cameras.conventions import triple
-from workbench.recording.episode.row import LibraryRow
-from workbench.recording.episode.source import Source
+from workbench.recording.episode.row import LibraryRow, Source
 from workbench.recording.films import Eye, cameras_by_name
 from workbench.recording.lerobot.export import ExportOptions
 from workbench.recording.library.library import Library

@@ -15,8 +15,8 @@ from types import MappingProxyType
 import viser
 
 from workbench.machine.web_assets import web_assets_folder
-from workbench.recording.reader.reading import told_rerun
-from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
+from workbench.recording.reader.reading import read_rerun_info
+from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, viewer_file, viewer_is_cached
 from workbench.ui.server.file_response import Downloads, FileReply
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.widgets.click_targets import Presses
@@ -98,7 +98,7 @@ class RerunPages:
 
 def _blueprint(path: Path) -> bytes | None:
     try:
-        return told_rerun(path)[1]
+        return read_rerun_info(path)[1]
     except (ValueError, OSError) as error:
         log.info("%s shows no blueprint of its own before it is read: %s", path.name, error)
         return None
@@ -107,7 +107,7 @@ def _blueprint(path: Path) -> bytes | None:
 def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
     for path, step in moments.items():
         try:
-            store, _ = told_rerun(path)
+            store, _ = read_rerun_info(path)
         except (ValueError, OSError) as error:
             log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
             continue
@@ -213,7 +213,7 @@ class RerunView:
         with self._lock:
             if not paths or self._waiting:
                 return
-            self._waiting, self._problem = not is_kept(), ""
+            self._waiting, self._problem = not viewer_is_cached(), ""
         try:
             if self._waiting:
                 self.draw(paths, self._chosen, moments)

@@ -12,7 +12,7 @@ import viser
 
 from workbench.machine.files import new_file
 from workbench.recording.episode.episode import Episode
-from workbench.recording.films import Eye, usual_eye
+from workbench.recording.films import Eye, default_eye
 from workbench.session.review.view import outcome_text
 from workbench.ui.scene.bodies import SceneView
 from workbench.ui.scene.env_grid import lay_out
@@ -51,7 +51,7 @@ def write_scene_html(
     """
     if episode.geometry is None or episode.poses is None:
         raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to show.")
-    eye = eye or usual_eye(episode)
+    eye = eye or default_eye(episode)
     with new_file(path) as temporary:
         # viser needs a running server; its address is never shown.
         gated_server = open_server(ServerOptions(port=0))

@@ -16,9 +16,9 @@ from tests.drive.rows import append
 from tests.drive.waiting import until
 from workbench.core.camera_data import CameraInfo
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing import encode_pool
+from workbench.recording.writing import episode_writer
+from workbench.recording.writing.finish import recover
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.recover import recover
 
 Maker = Callable[..., Made]
 STATES = 7
@@ -38,13 +38,13 @@ def seen(make_episode: Maker) -> Made:
 @pytest.fixture
 def held_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """No picture is encoded before the event is set."""
-    go, encode = threading.Event(), encode_pool.encode
+    go, encode = threading.Event(), episode_writer.encode
 
     def wait(*args: Any) -> bytes:
         assert go.wait(60)
         return encode(*args)
 
-    monkeypatch.setattr(encode_pool, "encode", wait)
+    monkeypatch.setattr(episode_writer, "encode", wait)
     yield go
     go.set()
 
@@ -68,7 +68,7 @@ def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.E
 def test_what_is_too_much_to_wait_is_encoded_at_once(
     seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(encode_pool, "MOST_BYTES", 1)
+    monkeypatch.setattr(episode_writer, "MOST_PENDING_BYTES", 1)
     assert pictures_of(seen.write(tmp_path).json) == list(range(STATES))
 
 
@@ -88,14 +88,14 @@ def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Pat
 def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kept(
     seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    encode = encode_pool.encode
+    encode = episode_writer.encode
 
     def fails(modality: Any, picture: np.ndarray) -> bytes:
         if picture[0, 0] == 4:
             raise MemoryError("no room for a picture")
         return encode(modality, picture)
 
-    monkeypatch.setattr(encode_pool, "encode", fails)
+    monkeypatch.setattr(episode_writer, "encode", fails)
     writer = seen.writer(tmp_path)
     with pytest.raises(RecordingError, match="no room for a picture"):
         for row in seen.rows():
@@ -111,20 +111,22 @@ def test_what_was_encoded_does_not_wait_any_more(
 ) -> None:
     """However many pictures there were: only where too many wait at once are they encoded by whoever brings them."""
     picture = np.zeros((30, 40), np.int32)
-    monkeypatch.setattr(encode_pool, "_pool", None)
-    monkeypatch.setattr(encode_pool, "MOST_BYTES", 2 * picture.nbytes)
-    encode, by = encode_pool.encode, []
+    monkeypatch.setattr(episode_writer, "_pool", None)
+    monkeypatch.setattr(episode_writer, "MOST_PENDING_BYTES", 2 * picture.nbytes)
+    encode, by = episode_writer.encode, []
 
     def noted(*args: Any) -> bytes:
         by.append(threading.current_thread())
         return encode(*args)
 
-    monkeypatch.setattr(encode_pool, "encode", noted)
+    monkeypatch.setattr(episode_writer, "encode", noted)
     for number in range(8):
-        soon = encode_pool.encode_soon([("picture/0/segmentation", number, "segmentation", picture)])
+        soon = episode_writer.encode_async([("picture/0/segmentation", number, "segmentation", picture)])
         assert [entry.number for entry in soon.result(60)] == [number]
         # The last picture is done a moment before it is counted so.
-        until(lambda: encode_pool._pool is not None and encode_pool._pool._bytes == 0, "nothing to wait")
+        until(
+            lambda: episode_writer._pool is not None and episode_writer._pool._bytes == 0, "nothing to wait"
+        )
     assert threading.current_thread() not in by and len(by) == 8
 
 
@@ -133,12 +135,14 @@ def test_pictures_are_handed_over_as_soon_as_there_are_enough(
 ) -> None:
     """And each time anew: a thread that is woken for each takes longer than the pictures."""
     picture = np.zeros((30, 40), np.int32)
-    monkeypatch.setattr(encode_pool, "_pool", None)
-    monkeypatch.setattr(encode_pool, "_TOGETHER_BYTES", 3 * picture.nbytes)
-    first = encode_pool.encode_soon([])
+    monkeypatch.setattr(episode_writer, "_pool", None)
+    monkeypatch.setattr(episode_writer, "_TOGETHER_BYTES", 3 * picture.nbytes)
+    first = episode_writer.encode_async([])
     soons = [first]
     for number in range(7):
-        soons.append(encode_pool.encode_soon([("picture/0/segmentation", number, "segmentation", picture)]))
+        soons.append(
+            episode_writer.encode_async([("picture/0/segmentation", number, "segmentation", picture)])
+        )
     until(lambda: all(soon.done() for soon in soons[:7]), "six pictures")
-    assert encode_pool._pool is not None and encode_pool._pool._gathered == soons[7:]
+    assert episode_writer._pool is not None and episode_writer._pool._gathered == soons[7:]
     soons[7].result(60)

@@ -1,6 +1,6 @@
 """The process that readers are made of, which has imported what they need and has read nothing itself; and their loop.
 
-Started as ``python -m workbench.recording.reader.nursery SOCKET``, it forks a reader for each folder that somebody
+Started as ``python -m workbench.recording.reader.fork_server SOCKET``, it forks a reader for each folder that somebody
 wants to look into. That takes milliseconds where starting Python takes half a second, and a reader that was ended is
 replaced as quickly. It has one thread (numpy's threads are turned off in its environment), since a fork takes no other
 along, and ends when its socket closes; a reader ends with it.
@@ -21,40 +21,39 @@ from workbench.machine.processes.family import end_with_parent
 from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
 from workbench.recording.episode.encoded_pictures import EncodedPictures
 from workbench.recording.episode.episode import CameraTrack
-from workbench.recording.episode.row import text
-from workbench.recording.episode.source import Source, UnreadableRecording
-from workbench.recording.reader.episode_wire import SentShapes, packed
+from workbench.recording.episode.row import Source, UnreadableRecording, clean_text
+from workbench.recording.reader.episode_wire import SentShapes, pack_episode
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.requests import (
     Answer,
+    CloseEpisodes,
     Ended,
     EpisodeRead,
-    Forget,
-    ForRerun,
+    FindSources,
     NewReader,
-    Open,
-    PictureAt,
+    OpenEpisode,
     PictureRead,
     ReadFailed,
+    ReadPicture,
+    ReadRerunInfo,
+    ReadRows,
     Recover,
     Recovered,
     Request,
-    Rows,
+    RerunInfo,
     RowsRead,
-    Sources,
     SourcesFound,
-    ToldRerun,
 )
 from workbench.recording.reader.scan import Found
 
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
 LONGEST = 1 << 20
-MOST_MENDING = 4 << 30
+MOST_RECOVERY_MEMORY = 4 << 30
 """Of one that writes."""
 MOST_SHARED = 4
 """Groups of episodes whose shapes are remembered."""
-LONGEST_WORDS = 600
+LONGEST_MESSAGE = 600
 
 
 def main() -> None:
@@ -71,11 +70,11 @@ def main() -> None:
             _, status = os.waitpid(wanted.pid, 0)
             control.send(pack(os.waitstatus_to_exitcode(status)))
             continue
-        nursery = os.getpid()
+        fork_server = os.getpid()
         pid = os.fork()
         if pid == 0:
             control.close()
-            _be_a_reader(socket.socket(fileno=fds[0]), wanted, nursery)
+            _run_reader(socket.socket(fileno=fds[0]), wanted, fork_server)
         os.close(fds[0])
         try:
             os.setpgid(pid, pid)  # whoever ends it ends its group, perhaps before it has come to this itself
@@ -84,16 +83,16 @@ def main() -> None:
         control.send(pack(pid))
 
 
-def _be_a_reader(end: socket.socket, wanted: NewReader, nursery: int) -> None:
+def _run_reader(end: socket.socket, wanted: NewReader, fork_server: int) -> None:
     try:
-        end_with_parent(nursery)
+        end_with_parent(fork_server)
         os.setpgid(0, 0)
         if wanted.episodes:
-            warm_up()
+            import_episode_readers()
         if wanted.writes is None:
             confine(wanted.paths, MOST_MEMORY)
         else:
-            confine(wanted.paths, MOST_MENDING, [wanted.writes])
+            confine(wanted.paths, MOST_RECOVERY_MEMORY, [wanted.writes])
         serve(MessageSocket(end, get_args(Request)))
     finally:
         os._exit(0)
@@ -102,7 +101,7 @@ def _be_a_reader(end: socket.socket, wanted: NewReader, nursery: int) -> None:
 # --- a reader --------------------------------------------------------------------------------------
 
 
-def warm_up() -> None:
+def import_episode_readers() -> None:
     """Import what reads an episode."""
 
 
@@ -112,7 +111,7 @@ def serve(line: MessageSocket) -> None:
     while True:
         try:
             wanted = line.receive(None)
-            if isinstance(wanted, Forget):
+            if isinstance(wanted, CloseEpisodes):
                 reader.forget(wanted.opened)
                 continue
             line.send_bytes(reader.answer(wanted))
@@ -150,25 +149,25 @@ class _Reader:
         return pack_message(failed)
 
     def _answer(self, wanted: Request) -> Answer:
-        if isinstance(wanted, Rows):
+        if isinstance(wanted, ReadRows):
             found = Found(os.fsdecode(wanted.key), wanted.sizes, wanted.times)
             return RowsRead(read_found(wanted.folder, found))
-        if isinstance(wanted, Open):
+        if isinstance(wanted, OpenEpisode):
             return self._open(wanted)
-        if isinstance(wanted, PictureAt):
+        if isinstance(wanted, ReadPicture):
             return self._picture(wanted)
-        if isinstance(wanted, Sources):
+        if isinstance(wanted, FindSources):
             return _sources(wanted)
-        if isinstance(wanted, ForRerun):
-            return _told_rerun(wanted)
+        if isinstance(wanted, ReadRerunInfo):
+            return _rerun_info(wanted)
         assert isinstance(wanted, Recover)
-        from workbench.recording.writing.recover import recover
+        from workbench.recording.writing.finish import recover
 
         return Recovered([files.rrd.name for files in recover(wanted.folder)])
 
-    def _open(self, wanted: Open) -> EpisodeRead:
+    def _open(self, wanted: OpenEpisode) -> EpisodeRead:
         from workbench.recording.lerobot.read import read_lerobot
-        from workbench.recording.reader.read_episode import read_inert, read_maniskill
+        from workbench.recording.reader.read_episode import read_maniskill, read_without_task
 
         shapes = self._shapes.setdefault(wanted.sharing, SentShapes())
         self._shapes.move_to_end(wanted.sharing)
@@ -180,12 +179,12 @@ class _Reader:
         elif wanted.kind == "maniskill":
             episode = read_maniskill(wanted.path, wanted.part)
         else:
-            episode, source_path = read_inert(wanted.path, shapes.shapes)
+            episode, source_path = read_without_task(wanted.path, shapes.shapes)
         self._number += 1
         self._opened[self._number] = episode.cameras
-        return packed(episode, source_path, self._number, shapes)
+        return pack_episode(episode, source_path, self._number, shapes)
 
-    def _picture(self, wanted: PictureAt) -> PictureRead | ReadFailed:
+    def _picture(self, wanted: ReadPicture) -> PictureRead | ReadFailed:
         cameras = self._opened.get(wanted.opened, [])
         if not 0 <= wanted.camera < len(cameras):
             return _failed("gone", "That recording is not open.")
@@ -197,7 +196,7 @@ class _Reader:
         return PictureRead(pictures[wanted.index])
 
 
-def _sources(wanted: Sources) -> SourcesFound:
+def _sources(wanted: FindSources) -> SourcesFound:
     from workbench.recording.maniskill.read import trajectories
     from workbench.recording.reader.read_episode import sources_in
 
@@ -206,7 +205,7 @@ def _sources(wanted: Sources) -> SourcesFound:
     return SourcesFound(list(sources_in(wanted.path)))
 
 
-def _told_rerun(wanted: ForRerun) -> ToldRerun:
+def _rerun_info(wanted: ReadRerunInfo) -> RerunInfo:
     from workbench.recording.rerun.append_blueprint import blueprint_stream
     from workbench.recording.rerun.private_api import store_id
 
@@ -216,11 +215,11 @@ def _told_rerun(wanted: ForRerun) -> ToldRerun:
             found.append(ask(wanted.path))
         except (ValueError, OSError, RuntimeError, AssertionError):
             found.append(None)  # rerun then shows it in an arrangement of its own, from its first moment on
-    return ToldRerun(found[0], found[1])
+    return RerunInfo(found[0], found[1])
 
 
-def _failed(why: Literal["unreadable", "system", "gone"], words: str) -> ReadFailed:
-    return ReadFailed(why, text(words, LONGEST_WORDS))
+def _failed(why: Literal["unreadable", "system", "gone"], message: str) -> ReadFailed:
+    return ReadFailed(why, clean_text(message, LONGEST_MESSAGE))
 
 
 if __name__ == "__main__":
