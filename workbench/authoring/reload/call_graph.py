@@ -1,9 +1,4 @@
-"""Two versions of a task side by side: which symbols changed, and who may reach whom.
-
-A name that either version mentions may be used by whichever runs, so both versions make one graph: its nodes are
-the symbols of both by file and name, its edges the names that they mention. What is safe to exchange is asked of this
-graph (`workbench.authoring.reload.level`); nothing is decided here.
-"""
+"""The symbols of two versions of a task, and which of them changed and may reach each other."""
 
 from __future__ import annotations
 
@@ -15,7 +10,10 @@ from workbench.authoring.reload.symbols import Key, Symbol, read_symbols
 
 
 class TwoVersions:
-    """Pure: nothing is imported or executed."""
+    """One graph of both versions: nodes are symbols by file and name, edges the names that either version mentions.
+
+    A name that either version mentions may be used by whichever runs. Pure: nothing is imported or executed.
+    """
 
     def __init__(self, old: Mapping[str, str], new: Mapping[str, str]) -> None:
         """
@@ -28,29 +26,29 @@ class TwoVersions:
         keep_docstrings = any("__doc__" in text for text in (*old.values(), *new.values()))
         self.old = _read_all(old, keep_docstrings)
         self.new = _read_all(new, keep_docstrings)
-        self.of: dict[Key, list[Symbol]] = {}
-        """A symbol as it is in the versions that have it, the old one first."""
+        self.by_key: dict[Key, list[Symbol]] = {}
+        """The symbol in the versions that have it, the old one first."""
         self._named: dict[str, set[Key]] = {}
         for symbol in (*self.old.values(), *self.new.values()):
-            self.of.setdefault(symbol.key, []).append(symbol)
-            for name in symbol.shorts:
+            self.by_key.setdefault(symbol.key, []).append(symbol)
+            for name in symbol.short_names:
                 self._named.setdefault(name, set()).add(symbol.key)
-        self.symbols = [symbol for versions in self.of.values() for symbol in versions]
+        self.symbols = [symbol for versions in self.by_key.values() for symbol in versions]
         self._reached: dict[Key, set[Key]] = {}
         self.changed = [
             key
-            for key in self.of
+            for key in self.by_key
             if key not in self.old or key not in self.new or self.old[key].text != self.new[key].text
         ]
         self.libraries = self._imported_libraries({*old, *new})
-        """Names that are imported from elsewhere than the author's files."""
+        """Names that are imported from libraries."""
 
     def mentioned(self, symbol: Symbol) -> set[Key]:
-        """Everything that a name in `symbol` may mean."""
+        """All symbols that a name in `symbol` may mean."""
         return {key for name in symbol.mentions & self._named.keys() for key in self._named[name]}
 
     def reach(self, roots: Iterable[Key]) -> dict[Key, Key | None]:
-        """Everything that may be reached from `roots`, each with the one that it was reached from."""
+        """All symbols that can be reached from `roots`, each with the one it was reached from (None for a root)."""
         found: dict[Key, Key | None] = dict.fromkeys(roots)
         waiting = list(found)
         while waiting:
@@ -62,9 +60,9 @@ class TwoVersions:
         return found
 
     def affected(self) -> set[Key]:
-        """What changed, and everything that may reach it."""
+        """The changed symbols, and all that may reach one of them."""
         users: dict[Key, set[Key]] = {}
-        for key in self.of:
+        for key in self.by_key:
             for used in self._edges(key):
                 users.setdefault(used, set()).add(key)
         found, waiting = set(self.changed), list(self.changed)
@@ -76,20 +74,20 @@ class TwoVersions:
         return found
 
     def members(self, classes: Collection[Key], names: Collection[str]) -> set[Key]:
-        """Members of these classes that have one of these names."""
+        """Members of `classes` that have one of these names."""
         return {
             key
-            for key, (symbol, *_) in self.of.items()
+            for key, (symbol, *_) in self.by_key.items()
             if symbol.owner is not None and (symbol.path, symbol.owner) in classes and symbol.short in names
         }
 
     def siblings(self, family: set[Key]) -> set[Key]:
-        """Tasks in the files that are not of the `family`: there is no live env of them."""
+        """Other tasks in the files, which have no live env."""
         found: set[Key] = set()
         tasks, before = {"BaseEnv", *(name for _, name in family)}, -1
         while before != len(found):
             before = len(found)
-            for key, versions in self.of.items():
+            for key, versions in self.by_key.items():
                 if versions[0].kind == "class" and key not in family and versions[0].mentions & tasks:
                     found.add(key)
                     tasks.add(key[1])
@@ -97,7 +95,7 @@ class TwoVersions:
 
     def _edges(self, key: Key) -> set[Key]:
         if key not in self._reached:
-            self._reached[key] = {k for symbol in self.of[key] for k in self.mentioned(symbol)} - {key}
+            self._reached[key] = {k for symbol in self.by_key[key] for k in self.mentioned(symbol)} - {key}
         return self._reached[key]
 
     def _imported_libraries(self, files: Collection[str]) -> frozenset[str]:
@@ -111,7 +109,7 @@ class TwoVersions:
                 else:
                     assert isinstance(node, ast.Import)
                     own = any(set(alias.name.split(".")) & stems for alias in node.names)
-                found |= set() if own else symbol.shorts
+                found |= set() if own else symbol.short_names
         return frozenset(found)
 
 
@@ -122,31 +120,31 @@ def _read_all(texts: Mapping[str, str], keep_docstrings: bool) -> dict[Key, Symb
     return found
 
 
-# --- Where a line of one version of a file is in another, if the function that it is in is the same ---
+# --- lines in another version --------------------------------------------------------------------
 
 
 def line_in(old: str, new: str, line: int) -> int | None:
-    """The 1-based line of `new` that is what `line` of `old` was; None where its function says something else now.
+    """The 1-based line of `new` that corresponds to `line` of `old`; None if its function changed.
 
-    Comments, docstrings and layout do not count. A line outside of all functions is compared as a statement of the
-    file. Nothing that the texts may hold raises.
+    Comments, docstrings and layout do not count. A line outside of functions is compared as a statement of the file. No
+    content of the texts raises.
     """
     try:
         before, after = ast.parse(old), ast.parse(new)
     except (SyntaxError, ValueError, RecursionError):  # ValueError: a null byte
         return None
-    found = _around(before, line)
+    found = _block_at(before, line)
     if found is None:
         return None
     names, node = found
     for others, other in _blocks(after, ()):
-        if others == names and _says(other) == _says(node):
-            return _nearest(old, new, line, node, other)
+        if others == names and _code_text(other) == _code_text(node):
+            return _matching_line(old, new, line, node, other)
     return None
 
 
-def _around(tree: ast.Module, line: int) -> tuple[tuple[str, ...], ast.stmt] | None:
-    """The innermost function around a line, or the statement of the file, with the names that lead to it."""
+def _block_at(tree: ast.Module, line: int) -> tuple[tuple[str, ...], ast.stmt] | None:
+    """The innermost function (or top-level statement) that contains a line, with its qualified name."""
     inner = None
     for names, node in _blocks(tree, ()):
         first = min((d.lineno for d in getattr(node, "decorator_list", [])), default=node.lineno)
@@ -156,7 +154,7 @@ def _around(tree: ast.Module, line: int) -> tuple[tuple[str, ...], ast.stmt] | N
 
 
 def _blocks(tree: ast.AST, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], ast.stmt]]:
-    """Functions by their names, outer ones first; and what else stands in a file or a class, by its text."""
+    """Functions by qualified name, outer ones first; other statements of a file or class by their text."""
     for node in getattr(tree, "body", []):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             yield (*names, node.name), node
@@ -167,15 +165,15 @@ def _blocks(tree: ast.AST, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, 
             yield (*names, ast.dump(node)), node
 
 
-def _says(node: ast.stmt) -> str:
+def _code_text(node: ast.stmt) -> str:
     if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
         return ast.dump(node)
     body = node.body[ast.get_docstring(node) is not None :]
     return "\n".join(map(ast.dump, [*node.decorator_list, node.args, *body]))
 
 
-def _nearest(old: str, new: str, line: int, before: ast.stmt, after: ast.stmt) -> int:
-    """Of the lines of `after` that read as this one, the one that is as far into it; that far into it if none does."""
+def _matching_line(old: str, new: str, line: int, before: ast.stmt, after: ast.stmt) -> int:
+    """The line of `after` with the same text that is nearest to the same offset; the offset itself if none has it."""
     text = old.splitlines()[line - 1].strip()
     at = after.lineno + line - before.lineno
     end = after.end_lineno or after.lineno

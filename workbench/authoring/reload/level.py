@@ -1,44 +1,33 @@
-"""What a save changed, and how little must be done about it.
-
-Building a scene takes a second and throws away the moment that the author looks at; most saves change a line
-of the reward. So the two versions are compared symbol by symbol, and the cheapest way to the new one is
-chosen that cannot leave a stale mixture of both:
-
-    same        only comments, docstrings or layout changed
-    patched     only what runs at steps and resets changed: the new class can be put on the live env
-    cameras     the cameras' configs changed too: the scene stays
-    rebuilt     all else
-
-The new file is executed whole in every case, so new code sees new constants and new helpers. What is left of the
-old version on a live env is what its *building* made: `_load_scene` and the other hooks that ManiSkill calls while it
-builds, robots and other classes, statements at the top, and whatever those mention, and what that mentions, and so
-on. A change in there means rebuilt. The rest can be exchanged, unless something may outlive the exchange: values
-that hooks keep between calls (`workbench.authoring.reload.memoizing`), dicts and lists at the top that are filled
-while the task runs, attributes that the old version wrote and the new one only reads, objects of the
-author's own classes. Where code may reach further than its names say (``exec``), nothing is exchanged. The heavier
-level when unsure: a wrong "rebuilt" costs a second, a wrong "patched" an afternoon.
-"""
+"""Classifies what a save changed, and how much of the env must be rebuilt for it."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Collection, Iterable, Mapping
+import sys
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from types import CodeType, FunctionType
+from typing import Any, Literal
 
 from workbench.authoring.problem import hooks_of
 from workbench.authoring.reload.call_graph import TwoVersions
-from workbench.authoring.reload.memoizing import remembers, root_name
-from workbench.authoring.reload.mutable_globals import changed_while_running, written_attributes
+from workbench.authoring.reload.kept_state import (
+    changed_while_running,
+    memoizing_statement,
+    root_name,
+    written_attributes,
+)
 from workbench.authoring.reload.symbols import STATEMENTS, Key, file_name
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
+"""same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets: the new class is
+put on the live env. cameras: configs of cameras too: the scene stays. rebuilt: everything else."""
 
 RESET_HOOKS = frozenset(hooks_of("reset"))
 STEP_HOOKS = frozenset(hooks_of("step"))
 REWARD_HOOKS = frozenset(hooks_of("reward"))
 SCORING_HOOKS = REWARD_HOOKS.union(hooks_of("evaluate"), hooks_of("observation"))
-"""They run at every step and only look; `BaseEnv.__init__` calls some of them in its first reset."""
+"""They run at every step and change nothing; `BaseEnv.__init__` calls some of them in its first reset."""
 CAMERA_HOOKS = frozenset(
     {
         *("_default_sensor_configs", "_default_human_render_camera_configs"),
@@ -46,17 +35,17 @@ CAMERA_HOOKS = frozenset(
     }
 )
 _RUNS_LATER = RESET_HOOKS | STEP_HOOKS | SCORING_HOOKS
-_CAMERAS_THEMSELVES = frozenset(
+_CAMERA_ATTRIBUTES = frozenset(
     (
         "_sensors _human_render_cameras _sensor_configs _human_render_camera_configs sensors "
         "human_render_cameras set_local_pose"
     ).split()
 )
-_DRAWS = frozenset(
+_RANDOM_NAMES = frozenset(
     "rand randn randint randperm uniform normal random choice _batched_episode_rng _episode_rng".split()
 )
 _MOVES = frozenset("pose get_pose raw_pose qpos get_qpos qvel linear_velocity".split())
-_PECULIAR = frozenset(
+_UNUSUAL_MEMBERS = frozenset(
     (
         "__getattr__ __getattribute__ __setattr__ __delattr__ __init_subclass__ __new__ __class_getitem__ "
         "__set_name__ __slots__ __prepare__ __del__"
@@ -66,46 +55,55 @@ _PECULIAR = frozenset(
 
 @dataclass(frozen=True)
 class Inherited:
-    """What the task's class has of classes that are not in the author's files."""
+    """Names that the task's class inherits from classes of libraries."""
 
     names: frozenset[str]
     used_at_build: frozenset[str] = frozenset()
-    """Names that such classes use in their own code, BaseEnv's apart: they may call them while they build."""
+    """Names that the code of such classes (except BaseEnv) uses: they may call them while they build."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """From one version of a task to the next."""
+    """The difference between two versions of a task."""
 
     level: Level
     reason: str
     """For the page: ``only compute_dense_reward changed``."""
     hooks: frozenset[str] = frozenset()
-    """Hooks of a task that may run differently now."""
+    """Hooks of the task that may behave differently."""
 
     @property
     def tried_hooks(self) -> frozenset[str]:
-        """Those of `hooks` that a look at the present moment does not try."""
+        """Those of `hooks` that computing the current moment's reward, evaluation and observation does not run."""
         return self.hooks & (RESET_HOOKS | STEP_HOOKS)
 
 
-class _Heavier(Exception):
-    """Why it must be rebuilt."""
+class _NeedsRebuild(Exception):
+    """The reason why the env must be rebuilt."""
 
 
 def find_change(
     old: Mapping[str, str], new: Mapping[str, str], file: str, class_name: str, inherited: Inherited
 ) -> Change:
-    """Compare two versions of a task: texts by path, of its `file` and the modules beside it.
+    """The cheapest level that leaves no mixture of two versions of a task, given as texts by path.
 
-    Pure: nothing is imported or executed, and nothing that the texts may hold raises.
+    Building a scene takes a second and loses the current moment, and most saves change a line of the reward. So the two
+    versions are compared symbol by symbol. The new file is executed as a whole at every level; what remains of the old
+    version on a live env is what *building* made: `_load_scene` and the other build hooks, robots and other classes,
+    statements at the top, and everything that those mention, transitively. A change in there means rebuilt. The rest can be
+    exchanged unless something may outlive the exchange (`workbench.authoring.reload.kept_state`): values that hooks keep
+    between calls, dicts and lists at the top that are filled while the task runs, attributes that only the old version
+    writes, objects of the author's classes. If code may reach further than its names (``exec``), nothing is exchanged. In
+    doubt it is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" an afternoon.
+
+    Pure: nothing is imported or executed, and no content of the texts raises.
     """
     if dict(old) == dict(new):
         return Change("same", "nothing changed")
     try:
         return _Comparison(old, new, (file, class_name), inherited).classify()
-    except _Heavier as heavier:
-        return Change("rebuilt", str(heavier))
+    except _NeedsRebuild as reason:
+        return Change("rebuilt", str(reason))
     except (SyntaxError, ValueError):  # ValueError: a null byte
         return Change("rebuilt", "the version before cannot be read as Python")
     except RecursionError:
@@ -116,27 +114,27 @@ class _Comparison:
     def __init__(
         self, old: Mapping[str, str], new: Mapping[str, str], task: Key, inherited: Inherited
     ) -> None:
-        self._both = TwoVersions(old, new)
+        self._versions = TwoVersions(old, new)
         self._task, self._inherited = task, inherited
 
     def classify(self) -> Change:
         family = self._family()
         self._refuse_another_order(family)
-        if self._both.changed:
-            self._refuse_peculiar(family)
+        if self._versions.changed:
+            self._refuse_unusual_classes(family)
             self._refuse_if_built_of_it(family)
-        # These hold for the smallest edit too: the new file's names begin anew with whatever level.
+        # Also for the smallest edit: at every level the names of the file are created again.
         self._refuse_kept_between_calls(family)
-        if not self._both.changed:
+        if not self._versions.changed:
             return Change("same", "only comments, docstrings or layout changed")
-        affected = self._both.affected()
-        self._refuse_remembered(affected)
+        affected = self._versions.affected()
+        self._refuse_memoized(affected)
         hooks = frozenset(key[1].rpartition(".")[2] for key in affected if self._is_hook(key, family))
-        seen = self._both.reach(self._both.members(family, CAMERA_HOOKS))
-        cameras = any(key in seen for key in self._both.changed)
+        seen = self._versions.reach(self._versions.members(family, CAMERA_HOOKS))
+        cameras = any(key in seen for key in self._versions.changed)
         if cameras:
             self._refuse_cameras_of_the_moment(seen)
-        reason = f"only {_listed([self._say(key) for key in self._both.changed])} changed"
+        reason = f"only {_joined([self._label(key) for key in self._versions.changed])} changed"
         if not hooks and not cameras:
             reason += ", which no hook uses"
         elif hooks <= RESET_HOOKS and not cameras:
@@ -144,9 +142,9 @@ class _Comparison:
         return Change("cameras" if cameras else "patched", reason, hooks)
 
     def _family(self) -> set[Key]:
-        """The task's class and those of its bases that are the author's."""
-        if self._task not in self._both.old or self._task not in self._both.new:
-            raise _Heavier(
+        """The task's class and its bases in the author's files."""
+        if self._task not in self._versions.old or self._task not in self._versions.new:
+            raise _NeedsRebuild(
                 f"the class {self._task[1]} is not defined at the top of the file in both versions"
             )
         found: set[Key] = set()
@@ -156,27 +154,29 @@ class _Comparison:
             if key in found:
                 continue
             found.add(key)
-            for symbol in self._both.of[key]:
+            for symbol in self._versions.by_key[key]:
                 if symbol.kind != "class":
-                    raise _Heavier(f"{self._say(key)} is not an ordinary class")
-                waiting += [k for k in self._both.mentioned(symbol) if self._both.of[k][0].kind == "class"]
+                    raise _NeedsRebuild(f"{self._label(key)} is not an ordinary class")
+                waiting += [
+                    k for k in self._versions.mentioned(symbol) if self._versions.by_key[k][0].kind == "class"
+                ]
         return found
 
     def _is_hook(self, key: Key, family: set[Key]) -> bool:
-        return key in self._both.members(family, _RUNS_LATER | CAMERA_HOOKS)
+        return key in self._versions.members(family, _RUNS_LATER | CAMERA_HOOKS)
 
-    # --- what a live env was built of ---------------------------------------------------------------
+    # --- code that the live env was built by ---------------------------------------------------------
 
     def _build_roots(self, family: set[Key]) -> set[Key]:
-        """What may run while the file is imported or the env is built."""
+        """Symbols that may run while the file is imported or the env is built."""
         found: set[Key] = set()
-        siblings = self._both.siblings(family)
-        for symbol in self._both.symbols:
+        siblings = self._versions.siblings(family)
+        for symbol in self._versions.symbols:
             if symbol.key in siblings or (symbol.path, symbol.owner) in siblings:
                 continue
             foreign_member = symbol.owner is not None and (symbol.path, symbol.owner) not in family
             if symbol.kind in ("statements", "class") or foreign_member:
-                # A robot is found by its uid, an enum's members by their place: nobody need name them.
+                # Used without being named: a robot by its uid, an enum's members by their position.
                 runs = True
             elif symbol.owner is None:
                 runs = any(getattr(node, "decorator_list", ()) for node in symbol.nodes)
@@ -189,114 +189,124 @@ class _Comparison:
         return found
 
     def _refuse_if_built_of_it(self, family: set[Key]) -> None:
-        built = self._both.reach(self._build_roots(family))
-        for key in self._both.changed:
+        built = self._versions.reach(self._build_roots(family))
+        for key in self._versions.changed:
             if key not in built:
                 continue
-            by, how = built[key], self._how(key)
+            by, how = built[key], self._change_kind(key)
             if by is None:
-                raise _Heavier(f"{self._say(key)} {how}")
+                raise _NeedsRebuild(f"{self._label(key)} {how}")
             while (before := built[by]) is not None:
                 by = before
-            raise _Heavier(f"{self._say(key)} {how}, which {self._say(by)} uses")
+            raise _NeedsRebuild(f"{self._label(key)} {how}, which {self._label(by)} uses")
         for owner in sorted(family):
-            for symbol in self._both.of.get((owner[0], f"{owner[1]}.__init__"), ()):
+            for symbol in self._versions.by_key.get((owner[0], f"{owner[1]}.__init__"), ()):
                 if _goes_on_after_super(symbol.nodes):
-                    raise _Heavier(f"{symbol.name} goes on after super().__init__(), which has run a reset")
-        rewards = self._both.members(family, REWARD_HOOKS)
-        for key in self._both.changed:
-            if key in rewards and self._how(key) != "changed":
-                raise _Heavier(f"{self._say(key)} {self._how(key)}, so the reward mode is chosen anew")
+                    raise _NeedsRebuild(
+                        f"{symbol.name} goes on after super().__init__(), which has run a reset"
+                    )
+        rewards = self._versions.members(family, REWARD_HOOKS)
+        for key in self._versions.changed:
+            if key in rewards and self._change_kind(key) != "changed":
+                raise _NeedsRebuild(
+                    f"{self._label(key)} {self._change_kind(key)}, so the reward mode is chosen again"
+                )
 
-    # --- what cannot be told ------------------------------------------------------------------------
+    # --- code that cannot be analysed ----------------------------------------------------------------
 
     def _refuse_another_order(self, family: set[Key]) -> None:
-        """An enum counts its members by their place, a dataclass its arguments."""
-        for key, versions in self._both.of.items():
-            if versions[0].kind != "class" or key in family or key in self._both.changed:
+        """The order of members matters: it numbers an enum's members and a dataclass's arguments."""
+        for key, versions in self._versions.by_key.items():
+            if versions[0].kind != "class" or key in family or key in self._versions.changed:
                 continue
             before, after = (
                 [member.name for member in version.values() if (member.path, member.owner) == key]
-                for version in (self._both.old, self._both.new)
+                for version in (self._versions.old, self._versions.new)
             )
             if before != after:
-                raise _Heavier(f"the members of {self._say(key)} changed, or their order")
+                raise _NeedsRebuild(f"the members of {self._label(key)} changed, or their order")
 
-    def _refuse_peculiar(self, family: set[Key]) -> None:
+    def _refuse_unusual_classes(self, family: set[Key]) -> None:
         for key in sorted(family):
-            for symbol in self._both.of[key]:
+            for symbol in self._versions.by_key[key]:
                 (node,) = symbol.nodes
                 assert isinstance(node, ast.ClassDef)
                 if node.keywords or getattr(node, "type_params", ()):
-                    raise _Heavier(f"the class {symbol.name} is made with arguments")
+                    raise _NeedsRebuild(f"the class {symbol.name} is made with arguments")
                 for decorator in node.decorator_list:
                     if not ast.unparse(decorator).partition("(")[0].endswith("register_env"):
-                        raise _Heavier(f"the class {symbol.name} is decorated with {ast.unparse(decorator)}")
-                for name in sorted(_PECULIAR):
-                    if (symbol.path, f"{symbol.name}.{name}") in self._both.of:
-                        raise _Heavier(f"the class {symbol.name} has {name}")
-        for symbol in self._both.symbols:
-            # A library's names, whatever they are, reach nothing of the author's.
-            from_library = symbol.kind == "import" and symbol.shorts <= self._both.libraries
+                        raise _NeedsRebuild(
+                            f"the class {symbol.name} is decorated with {ast.unparse(decorator)}"
+                        )
+                for name in sorted(_UNUSUAL_MEMBERS):
+                    if (symbol.path, f"{symbol.name}.{name}") in self._versions.by_key:
+                        raise _NeedsRebuild(f"the class {symbol.name} has {name}")
+        for symbol in self._versions.symbols:
+            # A library's names do not reach the author's code.
+            from_library = symbol.kind == "import" and symbol.short_names <= self._versions.libraries
             if symbol.dynamic is not None and not from_library:
-                raise _Heavier(f"{self._say(symbol.key)} uses `{symbol.dynamic}`, which may reach anything")
-
-    # --- what may outlive an exchange of the code -----------------------------------------------------
-
-    def _refuse_kept_between_calls(self, family: set[Key]) -> None:
-        found = changed_while_running(self._both.symbols, self._both.libraries)
-        if found is not None:
-            value, code = found
-            raise _Heavier(
-                f"{self._say(value.key)} may be changed while the task runs, by {self._say(code.key)}: "
-                "it would begin anew with the new file"
-            )
-        running = self._both.reach(self._both.members(family, _RUNS_LATER))
-        for key, by in running.items():
-            if by is not None and key not in family and self._both.of[key][0].kind == "class":
-                raise _Heavier(
-                    f"{self._say(by)} uses the class {self._say(key)}, of which there may be objects"
+                raise _NeedsRebuild(
+                    f"{self._label(symbol.key)} uses `{symbol.dynamic}`, which may reach anything"
                 )
 
-    def _refuse_remembered(self, affected: set[Key]) -> None:
-        libraries = self._both.libraries
-        for key in self._both.reach(affected):
-            for symbol in self._both.of[key]:
+    # --- state that may outlive an exchange of the code -----------------------------------------------
+
+    def _refuse_kept_between_calls(self, family: set[Key]) -> None:
+        found = changed_while_running(self._versions.symbols, self._versions.libraries)
+        if found is not None:
+            value, code = found
+            raise _NeedsRebuild(
+                f"{self._label(value.key)} may be changed while the task runs, by {self._label(code.key)}: "
+                "it would start again with the new file"
+            )
+        running = self._versions.reach(self._versions.members(family, _RUNS_LATER))
+        for key, by in running.items():
+            if by is not None and key not in family and self._versions.by_key[key][0].kind == "class":
+                raise _NeedsRebuild(
+                    f"{self._label(by)} uses the class {self._label(key)}, of which there may be objects"
+                )
+
+    def _refuse_memoized(self, affected: set[Key]) -> None:
+        libraries = self._versions.libraries
+        for key in self._versions.reach(affected):
+            for symbol in self._versions.by_key[key]:
                 if symbol.kind != "function":
                     continue
                 for node in symbol.nodes:
-                    kept = remembers(node, libraries)
+                    kept = memoizing_statement(node, libraries)
                     if kept is not None:
-                        raise _Heavier(f"{self._say(key)} may keep what the old version computed ({kept})")
-        still_read = {name for symbol in self._both.new.values() for name in symbol.mentions}
-        for key in self._both.changed:
-            before, after = self._both.old.get(key), self._both.new.get(key)
+                        raise _NeedsRebuild(
+                            f"{self._label(key)} may keep what the old version computed ({kept})"
+                        )
+        still_read = {name for symbol in self._versions.new.values() for name in symbol.mentions}
+        for key in self._versions.changed:
+            before, after = self._versions.old.get(key), self._versions.new.get(key)
             lost = written_attributes(before) - written_attributes(after)
             for name in sorted(lost & still_read):
-                raise _Heavier(f"{self._say(key)} no longer writes {name}, which is still read")
+                raise _NeedsRebuild(f"{self._label(key)} no longer writes {name}, which is still read")
 
     def _refuse_cameras_of_the_moment(self, seen: Collection[Key]) -> None:
-        """Cameras that are made now must be those that would have been made when the scene was."""
-        for symbol in self._both.symbols:
-            said = self._say(symbol.key)
+        """New cameras must equal those that a new env would make, so their code may not depend on the moment."""
+        for symbol in self._versions.symbols:
+            label = self._label(symbol.key)
             if symbol.key not in seen:
-                for name in sorted(symbol.mentions & _CAMERAS_THEMSELVES):
-                    raise _Heavier(f"{said} uses {name}, so cameras are not as configured")
+                for name in sorted(symbol.mentions & _CAMERA_ATTRIBUTES):
+                    raise _NeedsRebuild(f"{label} uses {name}, so cameras are not as configured")
                 continue
-            for name in sorted(symbol.mentions & _DRAWS):
-                raise _Heavier(f"{said} uses {name}: the cameras would be drawn anew")
+            for name in sorted(symbol.mentions & _RANDOM_NAMES):
+                raise _NeedsRebuild(f"{label} uses {name}: the cameras would be drawn again")
             for node in (node for part in symbol.nodes for node in ast.walk(part)):
                 moves = isinstance(node, ast.Attribute) and node.attr in _MOVES
                 if moves and root_name(node) == "self":
-                    raise _Heavier(f"{said} looks where something is when the scene is built")
+                    raise _NeedsRebuild(f"{label} reads a pose when the scene is built")
 
-    # --- words --------------------------------------------------------------------------------------
+    # --- texts --------------------------------------------------------------------------------------
 
-    def _how(self, key: Key) -> str:
-        old, new = self._both.old, self._both.new
+    def _change_kind(self, key: Key) -> str:
+        old, new = self._versions.old, self._versions.new
         return "is new" if key not in old else "is gone" if key not in new else "changed"
 
-    def _say(self, key: Key) -> str:
+    def _label(self, key: Key) -> str:
         path, name = key
         if name.endswith(STATEMENTS):
             within = name.removesuffix(STATEMENTS).rstrip(".")
@@ -307,7 +317,7 @@ class _Comparison:
 
 
 def _goes_on_after_super(nodes: Iterable[ast.AST]) -> bool:
-    """Whether an ``__init__`` does more than set constants once BaseEnv's has built and reset the env."""
+    """Whether an ``__init__`` does more than set constants after BaseEnv's has built and reset the env."""
     for node in nodes:
         if not isinstance(node, ast.FunctionDef):
             return True
@@ -323,7 +333,43 @@ def _goes_on_after_super(nodes: Iterable[ast.AST]) -> bool:
     return False
 
 
-def _listed(names: list[str]) -> str:
+def _joined(names: list[str]) -> str:
     if len(names) > 4:
         return f"{', '.join(names[:3])} and {len(names) - 3} more"
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+# --- names of library classes ---------------------------------------------------------------------
+
+
+def inherited_names(task: type, files: Collection[str]) -> Inherited:
+    """Names that the class `task` inherits from classes of libraries; `files` are the author's."""
+    from mani_skill.envs.sapien_env import BaseEnv  # the rest of this module does without a simulator
+
+    libraries = [cls for cls in task.__mro__ if cls is not object and _file_of(cls) not in files]
+    names = {name for cls in libraries for name in (*vars(cls), *vars(cls).get("__annotations__", ()))}
+    basic = {*BaseEnv.__mro__}
+    used = {name for cls in libraries if cls not in basic for name in _used_in(cls)}
+    return Inherited(frozenset(names), frozenset(used))
+
+
+def _file_of(cls: type) -> str | None:
+    return getattr(sys.modules.get(cls.__module__), "__file__", None)
+
+
+def _used_in(cls: type) -> Iterator[str]:
+    for member in vars(cls).values():
+        functions: list[Any] = [member]
+        if isinstance(member, property):
+            functions = [member.fget, member.fset]
+        for function in functions:
+            function = getattr(function, "__func__", function)
+            if isinstance(function, FunctionType):
+                yield from _names_in(function.__code__)
+
+
+def _names_in(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _names_in(inner)

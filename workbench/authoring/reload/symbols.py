@@ -1,13 +1,4 @@
-"""The source of a task as symbols: what it defines, each as text that is equal exactly when the code is.
-
-To know what a save changed, two versions of a file are compared by what they define: functions, methods,
-constants, class attributes, imports. Each is kept as the dump of its syntax tree, so comments, docstrings,
-layout and place make no difference; and with the names that it mentions, which say whom it may reach.
-
-Names are only names. ``x.reset`` may be anybody's ``reset``, so it is taken to be everybody's, in all files;
-and a string that could be a name is one (``getattr(self, "reset")``). Where not even that is enough, because a
-name is computed or the program looks at itself, `Symbol.dynamic` says so.
-"""
+"""Splits a source file into symbols, each with its syntax tree's text and the names that it mentions."""
 
 from __future__ import annotations
 
@@ -23,9 +14,9 @@ Key = tuple[str, str]
 """File and name within it: ``("/x/push.py", "PushEnv.evaluate")``."""
 
 STATEMENTS = "(statements)"
-"""Name of what is no plain definition: it runs when the file is imported, in the order in which it stands."""
+"""Name of the symbol of all statements that are no definition, and run in order when the file is imported."""
 
-_LOOKS_AT_ITSELF = frozenset(
+_INTROSPECTION = frozenset(
     (
         "globals locals vars eval exec compile __import__ dir breakpoint __dict__ __getattribute__ __code__ "
         "__globals__ __subclasses__ __mro__ __bases__ __defaults__ __kwdefaults__ __closure__ __wrapped__ "
@@ -33,7 +24,7 @@ _LOOKS_AT_ITSELF = frozenset(
         "__annotations__ __func__ __reduce__ __getstate__ __setstate__ __builtins__ modules"
     ).split()
 )
-_LOOKING_MODULES = frozenset(
+_INTROSPECTION_MODULES = frozenset(
     (
         "inspect importlib gc ctypes pickle dill cloudpickle marshal builtins runpy pkgutil threading "
         "multiprocessing asyncio concurrent atexit signal traceback linecache"
@@ -43,21 +34,28 @@ _LOOKING_MODULES = frozenset(
 
 @dataclass(frozen=True)
 class Symbol:
+    """A function, method, constant, class attribute or import.
+
+    Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as all of them, in all files, and a string that is
+    an identifier counts as a name (``getattr(self, "reset")``). If a name is computed or code inspects itself, see
+    `dynamic`.
+    """
+
     path: str
     name: str
     kind: Kind
     parts: Sequence[ast.AST]
-    """What its text is of: of a class, not what is in it."""
+    """The nodes that make its text; for a class without its members."""
     nodes: Sequence[ast.AST]
-    """What it is made of: a property with its setter is one symbol."""
-    shorts: frozenset[str]
-    """Names under which others may mention it."""
+    """Its nodes: a property with its setter is one symbol."""
+    short_names: frozenset[str]
+    """Names by which other code may mention it."""
     owner: str | None = None
-    """The class that it is a member of."""
+    """The class of a member."""
 
     @cached_property
     def text(self) -> str:
-        """Equal in two versions exactly when the code is."""
+        """Equal in two versions if and only if the code is: without comments, docstrings and layout."""
         return "\n".join([self.kind, *map(ast.dump, self.parts)])
 
     @cached_property
@@ -66,12 +64,12 @@ class Symbol:
 
     @property
     def mentions(self) -> frozenset[str]:
-        """Names in it, of variables and attributes, and strings that could be names."""
+        """Names of variables and attributes in it, and strings that are identifiers."""
         return self._mentions[0]
 
     @property
     def dynamic(self) -> str | None:
-        """Something in it that may reach what it does not name."""
+        """A name in it by which it may reach code that it does not mention; None if there is none."""
         return self._mentions[1]
 
     @property
@@ -85,7 +83,7 @@ class Symbol:
 
 
 def read_symbols(path: str, text: str, keep_docstrings: bool = False) -> dict[Key, Symbol]:
-    """The symbols of one file, in order. Raises SyntaxError, as ``compile`` does."""
+    """The symbols of one file, in order. Raises SyntaxError, as ``compile``."""
     tree = ast.parse(text, path)
     if not keep_docstrings:
         _remove_docstrings(tree)
@@ -105,7 +103,7 @@ def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbo
     for name, statements in list(groups.items()):
         several = len(statements) > 1 and not all(isinstance(s, ast.FunctionDef) for s in statements)
         if name in taken or several:
-            # Which of them holds depends on what ran: they are told apart no further.
+            # Which definition holds depends on what ran, so they are not separated.
             loose += groups.pop(name)
     prefix = "" if owner is None else f"{owner}."
     for name, statements in groups.items():
@@ -134,7 +132,7 @@ def _bound(statements: Iterable[ast.AST]) -> frozenset[str]:
 
 
 def _defines(statement: ast.stmt, at_top: bool) -> str | None:
-    """The name of a plain definition."""
+    """The name of a plain definition; None for other statements."""
     if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef)):
         return statement.name
     if isinstance(statement, ast.ClassDef):
@@ -153,10 +151,10 @@ def _defines(statement: ast.stmt, at_top: bool) -> str | None:
 
 
 def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """``from x import a, b`` as two statements: who adds a name to it has not touched the others."""
+    """``from x import a, b`` as two statements, so that adding a name does not change the others."""
     for statement in body:
         if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
-            # Annotations are not looked at, and the other futures are long past.
+            # Annotations are ignored, and the other features are the default now.
             continue
         if isinstance(statement, ast.Import):
             yield from (ast.copy_location(ast.Import([alias]), statement) for alias in statement.names)
@@ -190,14 +188,14 @@ def bound_names(statement: ast.AST) -> set[str]:
 
 
 def _runs_as_script_only(statement: ast.stmt) -> bool:
-    """``if __name__ == "__main__":``, since here nothing runs as a script."""
+    """``if __name__ == "__main__":``, which does not run here."""
     if not isinstance(statement, ast.If) or statement.orelse:
         return False
     return ast.unparse(statement.test) in ("__name__ == '__main__'", "'__main__' == __name__")
 
 
 def _mentions(parts: Iterable[ast.AST]) -> tuple[frozenset[str], str | None]:
-    """The names in `parts`, and what may reach further than they say."""
+    """The names in `parts`, and the first one that may reach more than is named."""
     names: set[str] = set()
     dynamic: list[str] = []
     modules: set[str] = set()
@@ -230,13 +228,13 @@ def _mentions(parts: Iterable[ast.AST]) -> tuple[frozenset[str], str | None]:
                     called.add(id(node.func))
             elif node.func.id == "type" and len(node.args) != 1:
                 dynamic.append("type")
-    dynamic += sorted(names & _LOOKS_AT_ITSELF)
-    dynamic += sorted(module for module in modules if module.partition(".")[0] in _LOOKING_MODULES)
+    dynamic += sorted(names & _INTROSPECTION)
+    dynamic += sorted(module for module in modules if module.partition(".")[0] in _INTROSPECTION_MODULES)
     return frozenset(names), dynamic[0] if dynamic else None
 
 
 def _walk_code(node: ast.AST) -> Iterator[ast.AST]:
-    """As ``ast.walk``, parents first, without annotations: they say what is meant and do nothing."""
+    """``ast.walk``, parents first, without annotations, which have no effect."""
     yield node
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns"):
@@ -251,7 +249,7 @@ def file_name(path: str) -> str:
 
 
 def _remove_docstrings(tree: ast.Module) -> None:
-    """Statements that are only a constant do nothing."""
+    """Remove statements that are only a constant."""
     for node in ast.walk(tree):
         for name in ("body", "orelse", "finalbody"):
             block = getattr(node, name, None)

@@ -19,8 +19,7 @@ from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.problem import Interrupted, TaskError
 from workbench.authoring.reload.call_graph import line_in
-from workbench.authoring.reload.inherited import inherited_by
-from workbench.authoring.reload.level import RESET_HOOKS, Change, find_change
+from workbench.authoring.reload.level import RESET_HOOKS, Change, find_change, inherited_names
 from workbench.core.broken_rule import BrokenRules
 from workbench.core.cameras.render import list_cameras
 from workbench.core.env import actions
@@ -170,7 +169,7 @@ def _what_changed(
     if replace(running.request.options, seed=0) != replace(request.options, seed=0):
         return Change("rebuilt", "the options changed")
     files = {*before.source, *loaded.source}
-    inherited = inherited_by(loaded.cls, files)
+    inherited = inherited_names(loaded.cls, files)
     texts = {**_still_there(before, request), **loaded.source}
     change = find_change(before.source, texts, str(loaded.file), loaded.class_name, inherited)
     if loaded.robot is not None and change.level != "same":
