@@ -7,9 +7,9 @@ import io
 from rich.console import Console
 
 from workbench.cli.terminal import print_question, print_texts
-from workbench.session.clearance import AskedFile, Since, TrustQuestion
+from workbench.session.clearance import CodeFile, Since, TrustQuestion
 
-MANY = tuple(AskedFile(f"m{k}.py", f"{k:012}", "") for k in range(60))
+MANY = tuple(CodeFile(f"m{k}.py", f"{k:012}", "") for k in range(60))
 
 
 def printed(question: TrustQuestion, what: object = print_question) -> str:
@@ -20,7 +20,7 @@ def printed(question: TrustQuestion, what: object = print_question) -> str:
 
 
 def test_every_file_is_named_with_its_hash_and_what_became_of_it() -> None:
-    main = AskedFile("/w/push.py", "a" * 12, "", Since.CHANGED)
+    main = CodeFile("/w/push.py", "a" * 12, "", Since.CHANGED)
     said = printed(TrustQuestion("Push-v1", False, (main, *MANY), trusted_before=True, gone=("old.py",)))
     lines = said.splitlines()
     assert f"    /w/push.py  {main.hash}  changed since" in lines
@@ -32,5 +32,5 @@ def test_every_file_is_named_with_its_hash_and_what_became_of_it() -> None:
 
 def test_a_text_is_printed_as_it_is_and_no_more_than_text() -> None:
     text = "x = '[bold] :x: \x1b[2J \u202e'\n\treturn 1\n"
-    said = printed(TrustQuestion("Push-v1", True, (AskedFile("push.py", "0" * 12, text),)), print_texts)
+    said = printed(TrustQuestion("Push-v1", True, (CodeFile("push.py", "0" * 12, text),)), print_texts)
     assert r"x = '[bold] :x: \x1b[2J \u202e'" in said and "\x1b" not in said and "return 1" in said

@@ -33,7 +33,7 @@ from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
 from workbench.recording.reader.read_episode import read_episode, read_maniskill
 from workbench.recording.reader.reading import find_all_sources
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.recordings import Rescorer
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -265,7 +265,7 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         view = rescored(rescorer, "done", "failed")
         assert view.why == "" and len(view.verdicts) == view.total == EPISODES
         assert view.steps == EPISODES * STEPS and all(verdict.differs for verdict in view.verdicts)
-        assert words.summary(view.verdicts).startswith("3 of 3 episodes differ")
+        assert verdict_text.summary(view.verdicts).startswith("3 of 3 episodes differ")
 
         edit(author, REWARD, "return 1 / 0")
         rescorer.start(find_all_sources((author / "recordings",)))
@@ -300,6 +300,6 @@ def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(
     verdicts, _ = rescore_all(RescoreOptions((tmp_path / "r",), task=str(author / "push_cube.py")))
     by_name = {verdict.of.path.stem: verdict for verdict in verdicts}
     assert not by_name[one.stem].why_not and not by_name[one.stem].differs
-    assert f"{one.stem}.h5: was cut short or changed" in words.not_carried(verdicts)[0]
+    assert f"{one.stem}.h5: was cut short or changed" in verdict_text.not_carried(verdicts)[0]
     assert f"{other.stem}.h5 was cut short or changed" in by_name[other.stem].why_not
     assert not by_name[whole.stem].why_not and by_name[whole.stem].missed == {}

@@ -18,7 +18,7 @@ from workbench.jobs.verdict import (
     in_order,
     single_numbers,
 )
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 
 REWARD = [0.0, 1.0, 2.0, 3.0]
 
@@ -36,7 +36,7 @@ def test_what_is_the_same_differs_nowhere() -> None:
     assert found.success == found.fail == (None, None) and found.look_at is None
     assert (found.metres, found.radians, found.drift_at) == (None, 0, None) and not found.drifted
     assert (found.task, found.seed, found.start_differs, found.missed) == ("", -1, False, {})
-    assert words.what_changed(found) == "as it was"
+    assert verdict_text.change_text(found) == "as it was"
 
 
 @pytest.mark.parametrize(("share", "differs"), [(0.9e-5, False), (1.1e-5, True)])
@@ -58,7 +58,7 @@ def test_where_all_is_zero_a_number_is_another_from_a_hair_on(change: float, dif
 def test_the_reward_differs_first_and_most_at_steps_of_the_episode() -> None:
     found = compare(0, said(), said([0.0, 1.5, 4.0, 3.5]), begin=10)
     assert (found.first_difference, found.look_at, found.largest) == (12, 13, 2)
-    assert words.what_changed(found) == "reward by up to 2, from step 12"
+    assert verdict_text.change_text(found) == "reward by up to 2, from step 12"
 
 
 def test_success_and_fail_are_named_by_the_step_after_which_they_are_first_true() -> None:
@@ -66,7 +66,10 @@ def test_success_and_fail_are_named_by_the_step_after_which_they_are_first_true(
     found = compare(0, old, said(success=[0, 0, 0, 1, 0], fail=[0, 1, 0, 0, 0]), begin=5)
     assert found.success == (7, 8) and found.fail == (None, 6)
     assert (found.first_difference, found.look_at) == (6, 8) and found.differing == ("success", "fail")
-    assert words.what_changed(found) == "success now at step 8, was at step 7, fail now at step 6, was never"
+    assert (
+        verdict_text.change_text(found)
+        == "success now at step 8, was at step 7, fail now at step 6, was never"
+    )
     gone = compare(0, said([1, 1, 1, 1], fail=[0, 0, 1, 1, 1]), said([1, 1, 1, 9]))
     assert gone.fail == (2, None) and gone.look_at == 2 and gone.first_difference == 2
     assert not gone.has_success
@@ -76,17 +79,17 @@ def test_a_flag_that_is_first_true_as_before_and_then_otherwise_is_said() -> Non
     found = compare(0, said(success=[0, 1, 1, 1, 1]), said(success=[0, 1, 1, 0, 1]))
     assert found.success == (1, 1) and found.differing == ("success",)
     assert (found.first_difference, found.look_at) == (3, 3)
-    assert words.what_changed(found) == "success at other steps, from step 3"
+    assert verdict_text.change_text(found) == "success at other steps, from step 3"
     assert not compare(0, said(success=[0.5] * 5), said(success=[0.0] * 5)).differs, "half a truth is none"
     both = compare(0, said(success=[1, 1, 1, 1, 1]), said([9, 1, 2, 3], success=[1, 0, 1, 1, 1]))
-    assert words.what_changed(both) == "reward by up to 9, from step 1" and both.look_at == 1
+    assert verdict_text.change_text(both) == "reward by up to 9, from step 1" and both.look_at == 1
 
 
 def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
     old = said(height=[0.1] * 5, speed=[1.0] * 5, gone=[1] * 5)
     found = compare(0, old, said(height=[0.1, 0.1, 0.2, 0.1, 0.1], speed=[1.0] * 5, new=[2] * 5))
     assert not found.differs and found.differing == found.others == ("height",)
-    assert words.what_changed(found) == "as it was, but for height"
+    assert verdict_text.change_text(found) == "as it was, but for height"
 
 
 def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
@@ -106,14 +109,14 @@ def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
         {"cube": "gone"},
     )
     assert found.has_success and compare(0, said(success=[0] * 5), said()).has_success
-    assert words.not_carried([found, found]) == ("cube: gone",)
+    assert verdict_text.not_carried([found, found]) == ("cube: gone",)
 
 
 def test_one_that_was_not_judged_says_nothing_else() -> None:
     found = Verdict("it", why_not="it has no step")
     assert (found.seed, found.length, found.returns, found.largest, found.differing) == (-1, 0, (0, 0), 0, ())
     assert len(found.old_reward) == len(found.new_reward) == 0 and found.metres is None
-    assert words.what_changed(found) == "not judged: it has no step"
+    assert verdict_text.change_text(found) == "not judged: it has no step"
 
 
 def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:
@@ -128,7 +131,7 @@ def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_f
     lost = compare(0, said(), said([0.0, nan, 2.0, 3.0]))
     assert (
         lost.look_at == lost.first_difference == 2
-        and words.what_changed(lost) == "reward NaN now, from step 2"
+        and verdict_text.change_text(lost) == "reward NaN now, from step 2"
     )
 
 
@@ -136,7 +139,7 @@ def test_without_recorded_rewards_there_is_nothing_to_compare_them_with() -> Non
     found = compare(0, said([], success=[0] * 5), said(success=[0, 0, 0, 0, 1]))
     assert found.differing == ("success",) and found.largest == 0
     assert np.isnan(found.old_reward).all() and len(found.old_reward) == 4
-    assert words.returns(found) == "none → 6"
+    assert verdict_text.returns_text(found) == "none → 6"
 
 
 def test_it_is_compared_as_far_as_it_is_said_now() -> None:

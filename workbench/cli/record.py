@@ -18,7 +18,7 @@ from workbench.jobs.pool import PoolError
 from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, record, with_given_actions
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
-from workbench.session.rescore.recordings import hidden_in_words
+from workbench.session.rescore.recordings import hidden_modules_text
 
 
 class _RecordBar:
@@ -63,7 +63,7 @@ def record_in_terminal(what: RecordOptions) -> int:
         asked, _ = with_given_actions(what)
         if mended := recover_confined(what.out):
             err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
-        for notice in hidden_in_words(what.task):
+        for notice in hidden_modules_text(what.task):
             warn(notice)
         if (left_alone := unused_gpu_text(what.options.backend)) is not None:
             warn(left_alone)

@@ -32,11 +32,11 @@ from workbench.machine.text import plain_text
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.recordings import (
     Group,
     group_episodes,
-    hidden_in_words,
+    hidden_modules_text,
     rescore_each,
     with_renderer,
 )
@@ -97,7 +97,7 @@ def rescore_all(
 
     def rescore_group(group: Group, reference: TaskName) -> None:
         nonlocal steps
-        for notice in hidden_in_words(reference):
+        for notice in hidden_modules_text(reference):
             if notice not in told:
                 told.add(notice)
                 on_notice(notice)
@@ -129,7 +129,7 @@ def rescore_all(
 
 def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
     """What may be opened for each of the groups. Before any of them runs: who is not there to be asked gets all or nothing."""
-    cleared = clearances.clear_all([group.wanted for group in groups])
+    cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
     refused = [one.question for one in not_cleared if one.question is not None]
     reasons = [str(one) for one in not_cleared if one.trust_helps]
@@ -167,15 +167,15 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
             warn,
         )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
-    for path, text in ((csv, words.as_csv), (json, words.as_json)):
+    for path, text in ((csv, verdict_text.as_csv), (json, verdict_text.as_json)):
         if path is not None:
             with here.again():
                 replace_file(path, text(verdicts).encode())
     print_verdicts(verdicts, out)
-    for note in (*notes, *words.not_carried(verdicts)):
+    for note in (*notes, *verdict_text.not_carried(verdicts)):
         warn(note)
-    if words.is_doubtful(verdicts):
-        warn(words.doubts(verdicts, words.PUT_IN))
+    if verdict_text.count_drifted(verdicts):
+        warn(verdict_text.drift_summary(verdicts, verdict_text.PUT_IN))
     return Exit.DONE
 
 
@@ -195,7 +195,7 @@ def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
     else:
         for verdict in verdicts:
             _print_lines(verdict, out)
-    out.print(escape(words.summary(verdicts)), soft_wrap=True)
+    out.print(escape(verdict_text.summary(verdicts)), soft_wrap=True)
 
 
 def _cells(verdict: Verdict[Source]) -> list[str]:
@@ -204,9 +204,9 @@ def _cells(verdict: Verdict[Source]) -> list[str]:
         verdict.of.name,
         str(verdict.seed) if verdict.seed >= 0 else "",
         str(verdict.length) if rescored else "",
-        words.returns(verdict) if rescored else "",
-        words.what_changed(verdict),
-        words.drift(verdict) if rescored else "",
+        verdict_text.returns_text(verdict) if rescored else "",
+        verdict_text.change_text(verdict),
+        verdict_text.drift_text(verdict) if rescored else "",
     ]
     return [plain_text(cell) for cell in cells]
 

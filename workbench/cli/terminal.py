@@ -29,7 +29,7 @@ from contextlib import AbstractContextManager
 
 from rich.text import Text
 
-from workbench.session.clearance import AskedFile, Consent, NotTrusted, Since, TrustQuestion, in_words
+from workbench.session.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
 
 
 class Exit(IntEnum):
@@ -261,7 +261,7 @@ def not_trusted(error: NotTrusted) -> list[str]:
         return [*said, "Nothing was run: you agreed to none of it."]
     named: list[str] = []
     for question in questions[:MOST_NAMED]:
-        named.append(f"    {in_words(question)}")
+        named.append(f"    {question_text(question)}")
         named += [f"        with {module.name} ({module.hash})" for module in question.modules]
     if len(questions) > MOST_NAMED:
         named.append(f"    and {len(questions) - MOST_NAMED} more")
@@ -282,5 +282,5 @@ def _about_modules(question: TrustQuestion) -> str:
     return "It imports from beside it:"
 
 
-def _marks(file: AskedFile) -> str:
+def _marks(file: CodeFile) -> str:
     return file.hash if file.since is Since.SAME else f"{file.hash}  [yellow]{file.since.value} since[/]"

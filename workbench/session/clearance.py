@@ -1,11 +1,4 @@
-"""Whether code that a recording names or holds may run: every way to it goes through `Clearances`, and is asked once.
-
-A recording is somebody else's file until its seal says that it was made here. What it names is opened without a question
-if it is an id of an installed package, a file that a person named (on the command line, or that is open live), or the file
-that this installation had open when it recorded. Of anything else the texts are read, not run, and a person is asked about
-these very texts; the answer is kept by what they say. What was agreed to is what runs, whatever becomes of the file:
-but where the file is to be followed, as by going live, its saves run too, and that is a question of its own.
-"""
+"""Decides whether code that a recording names or holds may run, and asks a person if need be."""
 
 from __future__ import annotations
 
@@ -26,25 +19,25 @@ from workbench.recording.episode.made_here import MadeHere, made_here
 
 SHORT_HASH = 12
 LONGEST = 400
-"""Characters of a name that is shown."""
+"""Characters of a shown name."""
 FOLLOWED = (
     "From then on, for as long as it is open live, every save of this file and of the modules beside it runs without asking, "
     "whoever saves it, and Judge again takes the file as it is."
 )
-"""What going live means for a file that a recording names."""
+"""Warning before going live with a file that a recording names."""
 
 
 class Consent(Enum):
     NO = "no"
     NONE = "none"
-    """Neither this nor any other of those that are asked about together."""
+    """No to this and to all other questions of the same call."""
     ONCE = "once"
     """Until the program ends."""
     ALWAYS = "always"
 
 
 class Since(Enum):
-    """What became of a file since another version of it and the files beside it was trusted."""
+    """How a file differs from the version that was trusted before."""
 
     SAME = "same"
     CHANGED = "changed"
@@ -52,42 +45,42 @@ class Since(Enum):
 
 
 @dataclass(frozen=True)
-class AskedFile:
-    """One of the texts that would run."""
+class CodeFile:
+    """A source text that would run."""
 
     name: str
-    """The path of the task's own file; of a module as seen from there."""
+    """Path of the task's own file; of a module, relative to it."""
     hash: str
-    """The first digits of what ``sha256sum`` says of it."""
+    """First digits of its SHA-256."""
     text: str
-    """As it is: whoever shows it has to escape it."""
+    """Unescaped: escape it before showing it."""
     since: Since = Since.SAME
 
 
 @dataclass(frozen=True)
 class TrustQuestion:
-    """What a person is to be asked. Texts out of recordings are printable, and not escaped."""
+    """A question to a person. Texts from recordings are made printable, not escaped."""
 
     task: str
-    """Of the recording that wants it."""
+    """Of the recording that names the code."""
     recorded_text: bool
-    """The texts are those that the recording holds, and not files on the disk."""
-    files: tuple[AskedFile, ...]
+    """The texts are those that the recording holds, not files on disk."""
+    files: tuple[CodeFile, ...]
     """What would run; the task's own file first."""
     unseen: tuple[str, ...] = ()
-    """What may run and is not among them."""
+    """Code that may run and is not among `files`."""
     computed: bool = False
-    """The modules are all that lie beside the file, since it cannot be told which of them it imports."""
+    """The task computes what it imports, so its modules are all files of its folder."""
     trusted_before: bool = False
-    """Another version of the same files was trusted; `AskedFile.since` says what changed, unless nothing is known of it."""
+    """Another version of the same files was trusted; see `CodeFile.since`, unless `nothing_known`."""
     gone: tuple[str, ...] = ()
-    """Modules of that version that are not there any more."""
+    """Modules of that version that no longer exist."""
     followed: bool = False
-    """Whatever is saved to these files runs from then on."""
+    """Later saves of these files run too."""
     agreed: bool = False
-    """These very texts may run already; that they are followed is new."""
+    """These texts may run already; only `followed` is new."""
     more: int = 0
-    """Questions that follow this one."""
+    """Number of questions after this one."""
 
     @property
     def file(self) -> str:
@@ -100,20 +93,22 @@ class TrustQuestion:
         return self.files[0].hash
 
     @property
-    def modules(self) -> tuple[AskedFile, ...]:
+    def modules(self) -> tuple[CodeFile, ...]:
         """The files besides the task's own."""
         return self.files[1:]
 
     @property
     def nothing_known(self) -> bool:
-        """What was trusted before is not known file by file."""
+        """The version trusted before is not known file by file."""
         return self.trusted_before and not self.gone and all(one.since is Since.SAME for one in self.files)
 
 
 class NotCleared(Exception):
-    """Code is not to run; the message is the reason, `question` what would have to be agreed to, if that would help.
+    """Code may not run; the message is the reason.
 
-    Where `trust_helps`, nobody is asked, but ``--trust`` agrees.
+    Attributes:
+        question: The question whose yes would allow it, if there is one.
+        trust_helps: No question is asked about it, but ``--trust`` allows it.
     """
 
     def __init__(self, why: str, question: TrustQuestion | None = None, trust_helps: bool = False) -> None:
@@ -122,32 +117,33 @@ class NotCleared(Exception):
 
 
 class NotTrusted(Exception):
-    """Nothing was run, because there is code that nobody agreed to, or, for these `reasons`, without ``--trust``."""
+    """Nothing was run: some code has no consent (`questions`) or would need ``--trust`` (`reasons`)."""
 
     def __init__(self, questions: Sequence[TrustQuestion], reasons: Sequence[str] = ()) -> None:
-        super().__init__("; ".join((*map(in_words, questions), *reasons)))
+        super().__init__("; ".join((*map(question_text, questions), *reasons)))
         self.questions, self.reasons = tuple(questions), tuple(reasons)
 
 
 Ask = Callable[[TrustQuestion, Callable[[], bool]], Consent]
-"""Puts a question to a person and waits for the answer; gives up, which is a no, when its second argument says so."""
+"""Asks a person and waits for the answer. Answers no as soon as its second argument, "stopped", returns true."""
 
 
 @dataclass(frozen=True)
 class CodeToRun:
-    """Something that would run."""
+    """Code that a recording names or holds."""
 
     reference: TaskName
-    """What is opened; not looked at where it is the recorded text."""
+    """The task to open; ignored if `recorded_text`."""
     info: EpisodeInfo
-    """Of the recording that wants it."""
+    """Of the recording."""
     recorded_text: bool = False
+    """Run the text that the recording holds."""
     followed: bool = False
-    """What is saved to the file runs from then on."""
+    """Later saves of the file run too."""
 
 
 @dataclass(frozen=True)
-class _Open:
+class _Undecided:
     """Texts that a person has to be asked about."""
 
     content: TaskContent
@@ -156,10 +152,17 @@ class _Open:
 
 
 class Clearances:
-    """
+    """Decides about all code of recordings; each text is asked about once.
+
+    A recording is untrusted unless its seal says that it was made here. Its task is opened without a question if it is an
+    id of an installed package, a file that a person named (on the command line, or open live), or the file that this
+    installation had open when it recorded. Of anything else the texts are read, not run, and a person is asked about
+    them; the answer is stored by their hash. The agreed texts run even if the file changes. Only where the file is
+    followed (going live) later saves run too, which is a question of its own.
+
     Args:
         named: The files that a person named: on the command line, or by having them open live.
-        ask: Puts a question to a person; None where there is nobody: the answer is no then.
+        ask: Asks a person; None if there is none: the answer is no then.
         all_trusted: Every answer is yes, for this run (``--trust``).
     """
 
@@ -178,10 +181,10 @@ class Clearances:
         return self._ask is not None
 
     def clear(self, wanted: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
-        """What may be opened for it; asks if need be, and waits for the answer.
+        """What to open for it; asks if need be, and waits for the answer.
 
         Raises:
-            NotCleared: nothing may, and why.
+            NotCleared: it may not run.
         """
         (cleared,) = self.clear_all([wanted], stopped)
         if isinstance(cleared, NotCleared):
@@ -192,46 +195,47 @@ class Clearances:
         self, wanted: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
     ) -> list[TaskName | NotCleared]:
         """The same for several; each text is asked about once."""
-        found = [self._without_asking(one) for one in wanted]
-        open_ones: dict[str, tuple[CodeToRun, _Open]] = {}
-        for one, its in zip(wanted, found):
-            if isinstance(its, _Open):
-                open_ones.setdefault(its.content.hash, (one, its))
+        decisions = [self._without_asking(one) for one in wanted]
+        to_ask: dict[str, tuple[CodeToRun, _Undecided]] = {}
+        for one, decision in zip(wanted, decisions):
+            if isinstance(decision, _Undecided):
+                to_ask.setdefault(decision.content.hash, (one, decision))
         refused: dict[str, NotCleared] = {}
         none_of_them = False
-        for place, (hash, (about, its)) in enumerate(open_ones.items()):
-            question = replace(self._question(about, its), more=len(open_ones) - place - 1)
+        for place, (hash, (code, undecided)) in enumerate(to_ask.items()):
+            question = replace(self._question(code, undecided), more=len(to_ask) - place - 1)
             answer = (
                 Consent.NO if none_of_them or self._ask is None or stopped() else self._ask(question, stopped)
             )
             none_of_them = none_of_them or answer is Consent.NONE
             if answer in (Consent.NO, Consent.NONE):
-                refused[hash] = NotCleared(f"{in_words(question)} is not trusted", question)
+                refused[hash] = NotCleared(f"{question_text(question)} is not trusted", question)
             elif answer is Consent.ALWAYS:
-                self._store.trust(its.content, about.followed)
+                self._store.trust(undecided.content, code.followed)
             else:
-                self._store.trust_once(its.content, about.followed)
+                self._store.trust_once(undecided.content, code.followed)
         cleared: list[TaskName | NotCleared] = []
-        for one, its in zip(wanted, found):
-            if not isinstance(its, _Open):
-                cleared.append(its)
-            elif its.content.hash in refused:
-                cleared.append(refused[its.content.hash])
-            elif not one.recorded_text and not _is_as_it_was(its.content):
+        for one, decision in zip(wanted, decisions):
+            if not isinstance(decision, _Undecided):
+                cleared.append(decision)
+            elif decision.content.hash in refused:
+                cleared.append(refused[decision.content.hash])
+            elif not one.recorded_text and not _is_unchanged(decision.content):
                 cleared.append(
                     NotCleared(
-                        f"the code of {_printable(its.content.main)} was changed while you were asked about it; try it again"
+                        f"the code of {_printable(decision.content.main)} was changed while you were asked about it; "
+                        "try it again"
                     )
                 )
             else:
-                cleared.append(_approved(one, its.content))
+                cleared.append(_approved(one, decision.content))
         return cleared
 
-    def why_not_its_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
-        """Why an env cannot be made as this recording was; None where it can: arguments from elsewhere name no files."""
+    def refused_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
+        """Why an env may not get the arguments of this recording, or None: those from elsewhere may name no files."""
         if self._all_trusted or (made or made_here(info)) is not MadeHere.NO:
             return None
-        named = [_printable(text) for text in files_named(info)]
+        named = [_printable(text) for text in paths_in_arguments(info)]
         if not named:
             return None
         return (
@@ -239,10 +243,10 @@ class Clearances:
             f"({', '.join(named[:3])}), which it may only with --trust on the command line"
         )
 
-    def _without_asking(self, wanted: CodeToRun) -> TaskName | NotCleared | _Open:
-        """What may be opened; or the texts that have to be asked about."""
+    def _without_asking(self, wanted: CodeToRun) -> TaskName | NotCleared | _Undecided:
+        """The decision, if it needs no question."""
         made = made_here(wanted.info)
-        if (why := self.why_not_its_arguments(wanted.info, made)) is not None:
+        if (why := self.refused_arguments(wanted.info, made)) is not None:
             return NotCleared(why, trust_helps=True)
         if wanted.recorded_text:
             try:
@@ -258,54 +262,54 @@ class Clearances:
                 return _registered(reference)
             if made is MadeHere.CONTENT_AND_PLACE and reference.file == wanted.info.source_file:
                 return str(reference)
-            if _is_one_of(reference.file, self._named()):
+            if _is_named(reference.file, self._named()):
                 return str(reference)
             try:
                 content = read_content(Path(reference.file))
             except CannotRead as error:
                 return NotCleared(str(error))
-            trusted = made is not MadeHere.NO and _as_recorded(content, wanted.info)
+            trusted = made is not MadeHere.NO and _equals_recorded(content, wanted.info)
         agreed = trusted or self._all_trusted or self._store.trusts(content)
         if agreed and (not wanted.followed or self._all_trusted or self._store.follows(content)):
             return _approved(wanted, content)
-        return _Open(content, agreed)
+        return _Undecided(content, agreed)
 
-    def _question(self, wanted: CodeToRun, its: _Open) -> TrustQuestion:
-        content = its.content
-        before = None if wanted.recorded_text or its.agreed else self._store.trusted_before(content)
+    def _question(self, wanted: CodeToRun, undecided: _Undecided) -> TrustQuestion:
+        content = undecided.content
+        before = None if wanted.recorded_text or undecided.agreed else self._store.trusted_before(content)
         return TrustQuestion(
             _printable(wanted.info.task),
             wanted.recorded_text,
-            asked_files(content, before),
+            code_files(content, before),
             tuple(map(_printable, content.unseen)),
             content.computed,
             before is not None,
             tuple(_printable(name) for name in before or () if name not in content.file_sums),
             wanted.followed,
-            its.agreed,
+            undecided.agreed,
         )
 
 
-def asked_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[AskedFile, ...]:
-    """What would run, file by file: the task's own first, then the modules, those that changed before the others.
+def code_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[CodeFile, ...]:
+    """The files that would run: the task's own first, then changed modules, then the others.
 
     Args:
-        before: `TaskContent.file_sums` of what was trusted before, if anything was; empty where that is not known.
+        before: `TaskContent.file_sums` of the version trusted before, if any; empty if its files are not known.
     """
     paths = {content.name(path): path for path in content.texts}
-    files: list[AskedFile] = []
+    files: list[CodeFile] = []
     for name, found in content.file_sums.items():
         since = Since.SAME
         if before and before.get(name) != found:
             since = Since.CHANGED if name in before else Since.NEW
         shown = content.main if paths[name] == content.main else name
-        files.append(AskedFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
-    # What is new to a person is not to be looked for in a long list.
+        files.append(CodeFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
+    # Changed modules first, so that nobody has to find them in a long list.
     return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
 
 
 def _registered(reference: RecordedTask) -> TaskName | NotCleared:
-    """What is opened by its id, if an installed package has registered it."""
+    """The reference, unless its env id is a path."""
     if not looks_like_file(reference.env_id):
         return reference
     return NotCleared(
@@ -314,16 +318,16 @@ def _registered(reference: RecordedTask) -> TaskName | NotCleared:
     )
 
 
-def _is_as_it_was(content: TaskContent) -> bool:
-    """Whether opening the file would still run what was read."""
+def _is_unchanged(content: TaskContent) -> bool:
+    """Whether the file and its modules still have these texts."""
     try:
         return read_content(Path(content.main)).hash == content.hash
     except CannotRead:
         return False
 
 
-def files_named(info: EpisodeInfo) -> list[str]:
-    """What in the arguments of a recording's env looks like a path: a task may open it, whatever it is."""
+def paths_in_arguments(info: EpisodeInfo) -> list[str]:
+    """Texts in the recorded arguments of an env that look like a path: a task may open them."""
     found: list[str] = []
     waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
     while waiting:
@@ -347,10 +351,10 @@ def _is_like_a_path(text: str) -> bool:
 
 
 def recorded_content(info: EpisodeInfo) -> TaskContent:
-    """The text that a recording holds.
+    """The source text in a recording.
 
     Raises:
-        NoText: it holds none.
+        NoText: it has none.
     """
     if not info.source or info.source_file is None:
         raise NoText("this recording does not hold the text of its task")
@@ -364,8 +368,8 @@ def _approved(wanted: CodeToRun, content: TaskContent) -> TaskName:
     return replace(wanted.reference, file=content.main, approved=content.texts)
 
 
-def _as_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
-    """Whether a file says what the recording holds: then the seal speaks for it, wherever it lies."""
+def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
+    """Whether a file has the recorded text: then the recording's seal covers it, in any folder."""
     try:
         return content.hash == recorded_content(info).hash
     except NoText:
@@ -376,13 +380,13 @@ def _printable(text: str) -> str:
     return short_line(text, LONGEST)
 
 
-def _is_one_of(file: str, named: Iterable[Path]) -> bool:
+def _is_named(file: str, named: Iterable[Path]) -> bool:
     real = os.path.realpath(file)
     return any(os.path.realpath(one) == real for one in named)
 
 
-def in_words(question: TrustQuestion) -> str:
-    """The code that a question is about, with its hash."""
+def question_text(question: TrustQuestion) -> str:
+    """Name and hash of the code that a question is about."""
     if question.recorded_text:
         return f"the text of {question.file} in recordings of {question.task} ({question.hash})"
     return f"{question.file} ({question.hash})"

@@ -144,9 +144,9 @@ def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> 
     jumped[3, 1] = True
     rescored = RescoredPast(recorded(old, jumped))
     assert rescored.runs() == [range(6, 9), range(6)]
-    jump = rescored.to_rescore(3)
+    jump = rescored.moment_to_rescore(3)
     assert jump.snapshot is not None and jump.env_idx == (1,) and jump.action is None
-    assert rescored.to_rescore(4).snapshot is None
+    assert rescored.moment_to_rescore(4).snapshot is None
     assert rescored.steps == 6
 
 
@@ -156,7 +156,7 @@ def test_a_snapshot_that_many_runs_begin_with_goes_to_the_worker_once() -> None:
     jumped[0], jumped[4, :2] = True, True
     rescored = RescoredPast(recorded(old, jumped))
     (rows,) = rescored.runs()
-    sent = {row: rescored.to_rescore(row) for row in rows}
+    sent = {row: rescored.moment_to_rescore(row) for row in rows}
     assert {row: one.env_idx for row, one in sent.items() if one.snapshot} == {0: tuple(range(64)), 4: (0, 1)}
     for row in rows:
         rescored.add(row, new[row])
@@ -168,7 +168,7 @@ def test_a_record_that_begins_in_the_middle_of_an_episode_begins_with_its_first_
     old, _, _ = drawn(1, 5, 2)
     rescored = RescoredPast(recorded(old, np.zeros((5, 2), bool)))
     assert rescored.runs() == [range(5)]
-    assert rescored.to_rescore(0).snapshot is not None and rescored.steps == 4
+    assert rescored.moment_to_rescore(0).snapshot is not None and rescored.steps == 4
 
 
 def test_the_record_ends_at_a_jump_that_cannot_be_put_back() -> None:

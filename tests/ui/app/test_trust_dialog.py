@@ -11,12 +11,12 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
-from workbench.session.clearance import AskedFile, Consent, Since, TrustQuestion
+from workbench.session.clearance import CodeFile, Consent, Since, TrustQuestion
 from workbench.ui.app import trust_dialog
 from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
-PUSH = AskedFile("/home/me/push.py", "0123456789ab", "import helper\n")
-HELPER = AskedFile("helper.py", "ba9876543210", "A = 1\n")
+PUSH = CodeFile("/home/me/push.py", "0123456789ab", "import helper\n")
+HELPER = CodeFile("helper.py", "ba9876543210", "A = 1\n")
 PLAIN = TrustQuestion("Push-v1", False, (PUSH, HELPER))
 
 
@@ -115,21 +115,21 @@ def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDia
 
 
 def test_the_window_says_what_would_run_and_escapes_it() -> None:
-    many = tuple(AskedFile(f"m{k}.py", f"{k:012}", f"# {k}\n") for k in range(300))
-    evil = AskedFile("/w/<script>.py", "0123456789ab", "x = '</pre><script>alert(1)</script>\u202e'\n")
+    many = tuple(CodeFile(f"m{k}.py", f"{k:012}", f"# {k}\n") for k in range(300))
+    evil = CodeFile("/w/<script>.py", "0123456789ab", "x = '</pre><script>alert(1)</script>\u202e'\n")
     said = question_html(TrustQuestion("Push-v1", False, (evil, *many), ("<b>",)))
     assert "<script>" not in said and "<b><" not in said and "&lt;script&gt;.py" in said
     assert "&lt;/pre&gt;" in said and "\\u202e" in said, "the text, escaped"
     assert all(one.name in said and one.hash in said and one.text in said for one in many)
     assert "It imports from beside it (300)" in said and "trusted" not in said and "every save" not in said
-    held = (AskedFile("push.py", "0" * 12, ""), HELPER)
+    held = (CodeFile("push.py", "0" * 12, ""), HELPER)
     said = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
     assert "&lt;i&gt;Push" in said and "hold the text of their task" in said
     assert "what it may import (1)" in said and "It imports" not in said
 
 
 def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
-    other = AskedFile("new.py", "1" * 12, "", Since.NEW)
+    other = CodeFile("new.py", "1" * 12, "", Since.NEW)
     files = (PUSH, replace(HELPER, since=Since.CHANGED), other)
     said = question_html(replace(PLAIN, files=files, trusted_before=True, gone=("old.py",)))
     main, helper, new = said.split("<details>")[1:]

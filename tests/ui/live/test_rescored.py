@@ -13,7 +13,7 @@ from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
 from workbench.jobs.verdict import Verdict
 from workbench.session.live.timeline import TimelineView
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
 from workbench.ui.live.rescored import PastRescorePanel, chart_data, in_a_line
@@ -103,17 +103,21 @@ def test_one_line_says_how_far_it_is_and_what_came_of_it(rescored: RescoreView, 
 
 def test_outcomes_are_said_before_rewards() -> None:
     moved = episode(success=(None, 41), fail=(7, None))
-    assert words.what_changed(moved) == "success now at step 41, was never, fail never now, was at step 7"
-    assert words.what_changed(episode()) == "reward by up to 0.25, from step 5"
+    assert (
+        verdict_text.change_text(moved) == "success now at step 41, was never, fail never now, was at step 7"
+    )
+    assert verdict_text.change_text(episode()) == "reward by up to 0.25, from step 5"
 
 
 def test_nothing_that_differs_is_one_sentence() -> None:
     both = same(0), same(1)
     says = "Nothing differs in 2 episodes: reward, success and fail are as they were."
-    assert words.headline(both) == says and words.numbers(both) == ["mean return: 1"]
-    assert words.headline([same(0), same(1, differing=("height",))]).endswith("Other entries differ: height.")
-    assert "2 episodes so far:" in words.headline(both, so_far=True)
-    assert words.headline([episode(0), episode(1)], so_far=True) == "2 of 2 episodes differ so far."
+    assert verdict_text.headline(both) == says and verdict_text.totals(both) == ["mean return: 1"]
+    assert verdict_text.headline([same(0), same(1, differing=("height",))]).endswith(
+        "Other entries differ: height."
+    )
+    assert "2 episodes so far:" in verdict_text.headline(both, so_far=True)
+    assert verdict_text.headline([episode(0), episode(1)], so_far=True) == "2 of 2 episodes differ so far."
 
 
 @pytest.mark.parametrize(
@@ -130,10 +134,10 @@ def test_drift_is_told_and_doubted_where_it_is_large(
     metres: float, radians: float, says: str, far: bool
 ) -> None:
     found = [same(1), same(7, metres=metres, radians=radians)]
-    assert says in words.doubts(found)
-    assert words.is_doubtful(found) == far
-    assert ("In 1 episode" in words.doubts(found)) == far
-    assert metres == 0 or ("env 7" in words.doubts(found)) == far
+    assert says in verdict_text.drift_summary(found)
+    assert verdict_text.count_drifted(found) == far
+    assert ("In 1 episode" in verdict_text.drift_summary(found)) == far
+    assert metres == 0 or ("env 7" in verdict_text.drift_summary(found)) == far
 
 
 def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
@@ -225,7 +229,9 @@ def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
         ((nan, 1.0), "no longer NaN"),
         ((nan, nan), "NaN at other steps"),
     ):
-        assert words.what_changed(episode(largest=lost, returns=returns)) == f"reward {says}, from step 5"
+        assert (
+            verdict_text.change_text(episode(largest=lost, returns=returns)) == f"reward {says}, from step 5"
+        )
     told = [episode(returns=(1.0, 2.0)), episode(1, returns=(1.0, nan))]
-    assert words.numbers(told) == ["mean return: 1 → 2, NaN in 1 of 2"]
-    assert words.numbers(told[1:]) == ["mean return: 1 → NaN in 1 of 1"]
+    assert verdict_text.totals(told) == ["mean return: 1 → 2, NaN in 1 of 2"]
+    assert verdict_text.totals(told[1:]) == ["mean return: 1 → NaN in 1 of 1"]

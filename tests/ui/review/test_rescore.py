@@ -18,7 +18,7 @@ from workbench.authoring.problem import Problem
 from workbench.jobs.verdict import Verdict
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.review.review import Review
 from workbench.ui.review.rescore import (
@@ -46,13 +46,15 @@ def verdict(id: str = "a", **changes: Any) -> Verdict:
 
 def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> None:
     moved = verdict(success=(None, 41), fail=(7, None), first_difference=7)
-    assert words.what_changed(moved) == "success now at step 41, was never, fail never now, was at step 7"
+    assert (
+        verdict_text.change_text(moved) == "success now at step 41, was never, fail never now, was at step 7"
+    )
     reward = verdict(largest=0.25, first_difference=4, differing=("reward",))
-    assert words.what_changed(reward) == "reward by up to 0.25, from step 4"
-    assert words.what_changed(verdict()) == "as it was"
-    assert words.what_changed(verdict(differing=("height",))) == "as it was, but for height"
-    assert words.what_changed(verdict(why_not="it has no step")) == "not judged: it has no step"
-    assert words.returns(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
+    assert verdict_text.change_text(reward) == "reward by up to 0.25, from step 4"
+    assert verdict_text.change_text(verdict()) == "as it was"
+    assert verdict_text.change_text(verdict(differing=("height",))) == "as it was, but for height"
+    assert verdict_text.change_text(verdict(why_not="it has no step")) == "not judged: it has no step"
+    assert verdict_text.returns_text(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
 
 
 def test_all_of_them_are_one_sentence() -> None:
@@ -61,20 +63,20 @@ def test_all_of_them_are_one_sentence() -> None:
         verdict("b", success=(None, 3), has_success=True, first_difference=3, returns=(1.0, 5.0)),
         verdict("c", why_not="x"),
     ]
-    assert words.summary(many) == (
+    assert verdict_text.summary(many) == (
         "1 of 2 episodes differs. Episodes with success: 0 → 1. Mean return: 5.5 → 7.5. 1 episode not judged."
     )
-    assert words.summary(many[:1]).startswith("Nothing differs in 1 episode:")
-    assert words.summary(many[2:]) == "No episode could be judged."
-    assert "to the last bit" in words.doubts(many) and not words.is_doubtful(many)
-    assert words.doubts([verdict(metres=None)]) == ""
-    told = words.doubts([verdict(metres=0.032)], words.PUT_IN)
-    assert "3.2 cm" in told and "furthest in push_a" in told and told.endswith(words.PUT_IN)
+    assert verdict_text.summary(many[:1]).startswith("Nothing differs in 1 episode:")
+    assert verdict_text.summary(many[2:]) == "No episode could be judged."
+    assert "to the last bit" in verdict_text.drift_summary(many) and not verdict_text.count_drifted(many)
+    assert verdict_text.drift_summary([verdict(metres=None)]) == ""
+    told = verdict_text.drift_summary([verdict(metres=0.032)], verdict_text.PUT_IN)
+    assert "3.2 cm" in told and "furthest in push_a" in told and told.endswith(verdict_text.PUT_IN)
 
 
 def test_numbers_that_are_none_are_null_in_json() -> None:
-    assert '"return_now": null' in words.as_json([verdict(returns=(1.0, float("nan")))])
-    assert words.as_csv([]) == "\n"
+    assert '"return_now": null' in verdict_text.as_json([verdict(returns=(1.0, float("nan")))])
+    assert verdict_text.as_csv([]) == "\n"
 
 
 def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
@@ -82,10 +84,10 @@ def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
     lost = verdict(
         "lost", largest=float("inf"), first_difference=4, returns=(1.0, nan), differing=("reward",)
     )
-    assert words.what_changed(lost) == "reward NaN now, from step 4"
-    assert words.returns(lost) == "1 → NaN"
+    assert verdict_text.change_text(lost) == "reward NaN now, from step 4"
+    assert verdict_text.returns_text(lost) == "1 → NaN"
     other = verdict("other", returns=(2.0, 2.0))
-    assert "Mean return: 1.5 → 2, NaN in 1 of 2." in words.summary([lost, other])
+    assert "Mean return: 1.5 → 2, NaN in 1 of 2." in verdict_text.summary([lost, other])
 
 
 def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
@@ -203,7 +205,7 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
         (["wb-same"], "|seed 5||as it was||10|"),
         (["wb-same"], "|seed 6||not judged: it has no step|||"),
     ]
-    assert words.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
+    assert verdict_text.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
 
 
 def test_before_anything_was_judged_the_page_says_how_and_shows_no_list(rescoring: Rescoring) -> None:

@@ -53,7 +53,7 @@ from workbench.session.protocol.messages import (
 from workbench.session.record.keep_past import PastKeeper
 from workbench.session.record.live import LiveRecorder
 from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import PastRescorer, RescoredPast, what_a_load_means
+from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
 
 HISTORY_BYTES = 256 * 1024**2
 """What the past may take unless somebody says otherwise."""
@@ -376,7 +376,7 @@ class Session:
         with self._lock:
             s = self._state
             restored, stale = self.versions.came_in(event.task)
-            meaning = what_a_load_means(s.now.task, event, self.rescorer.rescoring.view)
+            meaning = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
             rescored = None
             if meaning == "rescore" and s.timeline is not None:
                 rescored = RescoredPast(s.timeline.history)

@@ -1,1 +1,1 @@
-"""Past moments and recordings rescored with today's code."""
+"""Rescores past moments and recordings with today's code."""

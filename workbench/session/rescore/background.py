@@ -1,4 +1,4 @@
-"""Runs judged again for a page, of the past or of recordings: in the background, with progress, and to be stopped."""
+"""A rescoring job in the background, and what the page reads of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from workbench.session.process.job_lane import Job, JobFailed, JobLane
 
 
 class StoppedBy(Enum):
-    """Why it ended before it was done; the value is what the page says."""
+    """Why a job ended early; the value is the page's text."""
 
     HAND = "stopped by hand"
     SAVE = "the file was saved again"
@@ -29,52 +29,54 @@ RUNNING: tuple[RescoreState, ...] = ("asking", "loading", "rescoring")
 
 @dataclass(frozen=True)
 class RescoreView:
+    """State and results of the last rescoring job."""
+
     state: RescoreState = "none"
-    """``asking`` whether the code may run; ``loading``: it is being loaded by the process that judges."""
+    """``asking`` whether the code may run; ``loading`` it in the background process."""
     serial: int = 0
     """Grows with every change."""
     verdicts: tuple[Verdict[Any], ...] = ()
-    """Those that are known, also of a part of a run that is not judged whole."""
+    """Results so far, also of runs that are rescored in part."""
     done: int = 0
     total: int = 0
     unit: str = "steps"
-    """What is counted: control steps of the batch, or ``episodes``."""
+    """Unit of `done` and `total`: control ``steps`` of the batch, or ``episodes``."""
     steps: int = 0
-    """Control steps that were made."""
+    """Control steps made so far."""
     seconds: float = 0.0
-    """That they took, without loading."""
+    """Time for them, without loading."""
     task: str = ""
-    """What is judged with."""
+    """The code that rescores."""
     stopped_by: StoppedBy | None = None
     why: str = ""
-    """Why it stopped or failed, in words."""
+    """Why it stopped or failed, as text."""
     problem: Problem | None = None
     """What the code raised."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """A sentence each: what could not be put back, and files beside a task that no import finds."""
+    """A sentence each: state that could not be restored, modules that a library's name hides."""
     names: tuple[str, ...] = ()
-    """What the past has a curve of: ``reward`` first, then what differs, then the rest."""
+    """Names for `RescoredPast.curve`: ``reward`` first, then what differs, then the rest."""
     differing_names: frozenset[str] = frozenset()
 
     @property
     def rate(self) -> float:
-        """Control steps a second; 0 while that is not known."""
+        """Control steps a second; 0 while unknown."""
         return self.steps / self.seconds if self.seconds > 0.5 else 0.0
 
 
 class Rescoring:
-    """One job at a time; a new one takes the place of the one before. All methods but `close` return at once."""
+    """Runs one job at a time; a new one replaces the one before. All methods but `close` return at once."""
 
     def __init__(self, name: str, on_change: Callable[[], None] = lambda: None) -> None:
         """
         Args:
-            name: of the thread that does all of it.
-            on_change: called when `view` has something new.
+            name: of the thread.
+            on_change: called when `view` has changed.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
-        """Of `view`: what a job that was stopped still has to say is not heard."""
+        """Of `view`: updates of a stopped job are dropped under it."""
         self._view = RescoreView()
         self._job_lane = JobLane(name, on_change, self._failed)
 
@@ -83,20 +85,20 @@ class Rescoring:
         return self._view
 
     def begin(self, view: RescoreView, work: Callable[[Job], None]) -> None:
-        """Do this in place of what was done before; `view` is what is to be seen first."""
+        """Start `work`, cancelling the job before; `view` is shown first."""
 
-        def whole(job: Job) -> None:
+        def run(job: Job) -> None:
             work(job)
             self.tell(job, state="done")
 
         with self._lock:
-            # Under the lock, or the job might tell how far it is before it is said that it begins.
-            self._job_lane.start("rescoring", whole)
+            # Under the lock, or the job's first update might come before `view`.
+            self._job_lane.start("rescoring", run)
             self._view = replace(view, serial=self._view.serial + 1)
         self._on_change()
 
     def tell(self, job: Job, **values: Any) -> None:
-        """What is new in `view`."""
+        """Change fields of `view`, unless the job was stopped."""
         with self._lock:
             if job.stopped:
                 return
@@ -104,7 +106,7 @@ class Rescoring:
         self._on_change()
 
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
-        """Go no further with what is under way; what is known by now stays to be seen."""
+        """Cancel the running job; results so far stay."""
         with self._lock:
             self._job_lane.stop()
             if self._view.state not in RUNNING:
@@ -114,14 +116,14 @@ class Rescoring:
         self._on_change()
 
     def forget(self) -> None:
-        """Stop, and have nothing to show."""
+        """Cancel the running job and clear the view."""
         self.stop(StoppedBy.LOSS)
         with self._lock:
             self._view = RescoreView(serial=self._view.serial + 1)
         self._on_change()
 
     def close(self) -> None:
-        """End it all; returns when the thread has ended."""
+        """Stop; returns when the thread has ended."""
         self.stop(StoppedBy.CLOSING)
         self._job_lane.close()
 

@@ -1,20 +1,4 @@
-"""The past judged again: the recorded moments lived through with the new code, and compared with the record.
-
-After an edit of a reward the question is what it would have said of the episodes that one has just watched. They
-are all in the history: a snapshot for every beginning, and every action. So they are run again with the new code. Some
-moments are sent, the answer is compared, and the next are sent: so one stops it by not sending more, and a process that
-does not answer (the new code may loop for ever) is ended.
-
-A `RescoredPast` is begun from a history and filled as the moments come back from the worker. Each is a row: the reward, every
-number that ``evaluate`` returned, and how far the bodies are from where they were, since what is judged is the run anew
-and not the record itself. That drift is what makes a comparison good or bad, so it is kept for every moment and every
-env. Where an episode begins at a kept reset it is mostly zero to the last bit, because the envs get the same physics without a past there (measured: PushCube,
-PickCube and StackCube none, PushT 7e-8 m, PushCube with a going back among its moments 6e-8 m). It may grow where the
-oldest kept moment is in the middle of an episode, and for tasks whose state a snapshot cannot hold whole (see
-`core.snapshots.snapshot`).
-
-A *run* here is what one env lived through without a jump, up to its reset or to going back.
-"""
+"""Rescores the history: replays its moments with the new code and compares them with the record."""
 
 from __future__ import annotations
 
@@ -41,47 +25,54 @@ from workbench.session.protocol.questions import MomentToRescore, RescoredMoment
 from workbench.session.rescore.background import RescoreView, Rescoring, StoppedBy
 
 MOST_ENTRIES = 24
-"""Entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
+"""Compared entries of ``evaluate``; each takes 8 bytes for every moment and env."""
 
 
 @dataclass(frozen=True, eq=False)
 class PastRun:
-    """What one env lived through without a jump."""
+    """Successive moments of one env without a jump (a reset, or going back)."""
 
     env: int
     begin: int
     """Control steps of its episode before its first moment."""
     serials: NDArray[np.int64]
-    """(T + 1,) of its moments."""
+    """(T + 1,) serials of its moments."""
 
     @property
     def name(self) -> str:
         return f"env {self.env}"
 
     def at(self, step: int) -> int:
-        """Serial of the moment after a step of its episode."""
+        """Serial of the moment after a control step of its episode."""
         return int(self.serials[step - self.begin])
 
 
 @dataclass(frozen=True)
 class RescoredCurve:
-    """One number of one env at the control steps of the record, oldest first."""
+    """One number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
     """(T,) as `Curves.tick`."""
     serial: NDArray[np.int64]
-    """(T,) of the moments."""
+    """(T,) serials of the moments."""
     old: NDArray[np.float32]
     """(T,) NaN where the old code did not have it."""
     new: NDArray[np.float32]
-    """(T,) NaN where it is not judged (yet)."""
+    """(T,) NaN where it is not rescored (yet)."""
 
 
 class RescoredPast:
-    """The record and what is said of it now, side by side. Not thread-safe: its owner locks."""
+    """Old and new scores of the history, one row a moment, filled as results come. Not thread-safe: its owner locks.
+
+    The bodies' drift from the record is kept for each moment and env, since it decides whether a comparison is good. From
+    a kept reset on it is mostly zero to the last bit: there envs have the same physics without a past (measured:
+    PushCube, PickCube and StackCube none, PushT 7e-8 m, PushCube with a going back among its moments 6e-8 m). It may
+    grow where the oldest kept moment is in the middle of an episode, and for tasks whose state does not fit a snapshot
+    (see `core.snapshots.snapshot`).
+    """
 
     def __init__(self, history: History) -> None:
-        """Take everything that `history` has, up to the first jump whose snapshot could not be made."""
+        """Take the moments of `history`, up to the first jump without a snapshot."""
         self._moments: list[Moment] = []
         for moment in history.between(history.first, history.last):
             if moment.snapshot is None and (not self._moments or moment.jumped.any()):
@@ -109,12 +100,12 @@ class RescoredPast:
         sizes = within[-1] + 1 if count else np.zeros(0, np.int64)
         self._run = within + (np.cumsum(sizes) - sizes)
         self._changed: set[int] = set()
-        """Numbers of runs of which more was judged since `verdicts` was asked."""
+        """Numbers of runs with new rows since the last call of `verdicts`."""
         self._verdicts: dict[int, Verdict[PastRun]] = {}
 
     @property
     def steps(self) -> int:
-        """Control steps of the batch that there are to judge."""
+        """Control steps of the batch in total."""
         return int(self._is_step.sum())
 
     @property
@@ -122,9 +113,9 @@ class RescoredPast:
         return int((self._is_step & self._rescored).sum())
 
     def runs(self) -> list[range]:
-        """Rows to be lived through in order, each run beginning with a jump of all envs; the newest run first.
+        """Rows to be replayed in order; each run begins with a jump of all envs. The newest run comes first.
 
-        What a person looks at is mostly what was last, and a history may hold minutes of simulation.
+        People mostly look at the newest, and a history may hold minutes of simulation.
         """
         begins = [int(row) for row in np.flatnonzero(self._jumped.all(axis=1))]
         ends = [*begins[1:], len(self._serial)]
@@ -134,18 +125,18 @@ class RescoredPast:
     def num_envs(self) -> int:
         return self._jumped.shape[1]
 
-    def to_rescore(self, row: int) -> MomentToRescore:
-        """This row, for whoever lives through it again."""
+    def moment_to_rescore(self, row: int) -> MomentToRescore:
+        """What a worker needs to replay this row."""
         if self._is_step[row]:
             return MomentToRescore(self._moments[row].step.action)
         envs = tuple(int(env) for env in np.flatnonzero(self._jumped[row]))
         return MomentToRescore(None, pickle.dumps(self._moments[row].snapshot), envs)
 
     def add(self, row: int, step: StepResult) -> None:
-        """What the new code says of this row.
+        """Take the new scores of a row.
 
         Raises:
-            ValueError: the bodies are not those of the record, so that nothing can be compared.
+            ValueError: the env has other bodies than the record, so the two cannot be compared.
         """
         was = self._moments[row].step.poses
         if step.poses.shape != was.shape:
@@ -156,12 +147,12 @@ class RescoredPast:
         self._rescored[row] = True
         self._changed.update(self._run[row].tolist())
 
-    def let_go(self) -> None:
-        """Forget the moments and their snapshots, when no more rows will come."""
+    def release(self) -> None:
+        """Free the moments and their snapshots; no more rows may come."""
         self._moments = []
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
-        """One number of one env; None if neither version has one of this name."""
+        """Curve of one number of one env; None if neither version has that number."""
         old, new = self._old.get(name), self._new.get(name)
         if (old is None and new is None) or not 0 <= env < self.num_envs:
             return None
@@ -173,10 +164,10 @@ class RescoredPast:
             missing if new is None else new[steps, env],
         )
 
-    # --- what it comes to --------------------------------------------------------------------------
+    # --- results -----------------------------------------------------------------------------------
 
     def verdicts(self) -> list[Verdict[PastRun]]:
-        """Of each run of which a step was judged, as far as it was."""
+        """One for each run with a rescored step, over its rescored part."""
         for number in self._changed:
             if (verdict := self._compared(number)) is not None:
                 self._verdicts[number] = verdict
@@ -184,7 +175,7 @@ class RescoredPast:
         return [*self._verdicts.values()]
 
     def names(self) -> tuple[tuple[str, ...], frozenset[str]]:
-        """What `curve` has: ``reward`` first, then what differs, then the rest; and what differs."""
+        """Names for `curve` (``reward`` first, then what differs, then the rest), and those that differ."""
         names = dict.fromkeys(["reward", *self._old, *self._new])
         differing = {name for verdict in self.verdicts() for name in verdict.differing}
         if self._new:
@@ -194,12 +185,12 @@ class RescoredPast:
         )
 
     def _compared(self, number: int) -> Verdict[PastRun] | None:
-        """A run by the rows of it that are judged, its jump and its control steps; None before there are two."""
+        """Compare the rescored rows of a run (its jump and its control steps); None below two rows."""
         env = int(self._run[0].searchsorted(number, side="right")) - 1
         first, end = self._run[:, env].searchsorted([number, number + 1])
         counts = self._rescored[first:end] & self._is_step[first:end]
         counts[0] = self._rescored[first]
-        # A run that nobody else's jump is in is a slice, which is ten times as quick.
+        # A run without jumps of other envs in between is a slice, which is ten times as fast.
         rows = slice(first, end) if counts.all() else first + counts.nonzero()[0]
         serials = self._serial[rows]
         if len(serials) < 2:
@@ -224,53 +215,53 @@ class RescoredPast:
 
 
 _CHUNK_SECONDS = 0.1
-"""About how long one answer takes: how soon progress is seen, and stopping heard."""
+"""Aim for the duration of one question: how soon progress is shown and a stop takes effect."""
 _MOST_AT_ONCE = 64
 _SUMMARY_EVERY = 0.5
-"""Seconds between two looks at what it comes to so far."""
+"""Seconds between two summaries."""
 
 
-def what_a_load_means(
+def rescore_after_load(
     before: TaskDescription | None, loaded: Loaded, view: RescoreView
 ) -> Literal["rescore", "keep", "forget"]:
-    """Whether the episodes of the version before are to be judged with the one that was loaded.
-
-    If not, what the last judgement said is kept to be seen, or forgotten with the episodes.
-    """
+    """Whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes."""
     level = None if before is None or loaded.reload is None else loaded.reload.level
     if level == "patched":
         return "rescore"
     if level in ("same", "cameras"):
-        # Saved again without a change that matters: what that stopped is to be had all the same.
+        # Saved again without a relevant change: resume the job that the save stopped.
         return "rescore" if view.stopped_by is StoppedBy.SAVE else "keep"
     return "forget"
 
 
 class PastRescorer:
-    """Judges the past."""
+    """Rescores the history in the background process, some moments at a time.
+
+    To stop, it sends no more; a process that does not answer (the new code may loop for ever) is ended.
+    """
 
     def __init__(self, on_change: Callable[[], None], process: Background) -> None:
         """
         Args:
-            on_change: called when `rescoring` has something new.
-            process: in which it is judged. Whoever else wants it need not wait.
+            on_change: called when `rescoring` has changed.
+            process: where it runs; other jobs come first.
         """
         self.rescoring = Rescoring("rescore", on_change)
         self._process, self._lock = process, threading.Lock()
         self._rescored: RescoredPast | None = None
-        """What is shown: what is being judged, or was last."""
+        """Of the running or the last job."""
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
-        """See `RescoredPast.curve`; None also while nothing is judged."""
+        """As `RescoredPast.curve`; None also before the first job."""
         with self._lock:
             return None if self._rescored is None else self._rescored.curve(name, env)
 
     def rescore(self, load: Load, rescored: RescoredPast) -> None:
-        """Begin, in place of whatever was judged before.
+        """Start a job, replacing the one before.
 
         Args:
             load: the new code.
-            judgement: of the record; it is this object's from now on.
+            rescored: made from the history; belongs to this object from now on.
         """
         if rescored.steps == 0:
             return
@@ -285,10 +276,10 @@ class PastRescorer:
         self.rescoring.stop(why)
         with self._lock:
             if self._rescored is not None:
-                self._rescored.let_go()  # a job that still waited does not come to it
+                self._rescored.release()  # a job that had not started does not do it
 
     def forget(self) -> None:
-        """Stop, and have nothing to show: the record is gone."""
+        """Stop and clear the view: the history is gone."""
         self.rescoring.forget()
         with self._lock:
             self._rescored = None
@@ -296,14 +287,14 @@ class PastRescorer:
     # --- on the lane ---------------------------------------------------------------------------------
 
     def _rescore(self, job: Job, load: Load, rescored: RescoredPast) -> None:
-        looked, missed = 0.0, dict[str, str]()
+        summed_up, missed = 0.0, dict[str, str]()
 
-        def tell(answer: RescoredMoments, seconds: float) -> None:
-            nonlocal looked
+        def on_answer(answer: RescoredMoments, seconds: float) -> None:
+            nonlocal summed_up
             missed.update(answer.not_carried)
             now, done = time.monotonic(), rescored.rescored_steps
-            if answer.problem is not None or done == rescored.steps or now - looked > _SUMMARY_EVERY:
-                looked = now
+            if answer.problem is not None or done == rescored.steps or now - summed_up > _SUMMARY_EVERY:
+                summed_up = now
                 with self._lock:
                     names, differing = rescored.names()
                     verdicts = tuple(rescored.verdicts())
@@ -321,22 +312,22 @@ class PastRescorer:
 
         def rescore_rows(rows: range) -> None:
             self._load(job, load, rescored)
-            self._replay_steps(job, rescored, rows, tell)
+            self._replay_steps(job, rescored, rows, on_answer)
 
         try:
             for rows in rescored.runs():
                 self._process.in_turns(job, partial(rescore_rows, rows), aside=True)
         finally:
             with self._lock:
-                rescored.let_go()
+                rescored.release()
 
     def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
         if self._process.has(load):
             return
         self.rescoring.tell(job, state="loading")
         if self._process.num_envs == rescored.num_envs:
-            # A version is tried at the moment at which the env stands, which is where the judgement before
-            # ended: there the new code may raise or loop though it runs from the beginnings in the record.
+            # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
+            # loop although it runs from the recorded beginnings: so go to one of these first.
             self._ask(job, rescored, rescored.runs()[0][:1])
         try:
             self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
@@ -346,7 +337,11 @@ class PastRescorer:
             raise JobFailed("the new code could not be loaded to judge with", failure.problem) from failure
 
     def _replay_steps(
-        self, job: Job, rescored: RescoredPast, rows: range, tell: Callable[[RescoredMoments, float], None]
+        self,
+        job: Job,
+        rescored: RescoredPast,
+        rows: range,
+        on_answer: Callable[[RescoredMoments, float], None],
     ) -> None:
         at, count = rows.start, 2
         while at < rows.stop:
@@ -361,13 +356,13 @@ class PastRescorer:
                         rescored.add(row, step)
                     except ValueError as error:
                         raise JobFailed(f"the episodes cannot be compared: {error}") from error
-            tell(answer, took)
-            wanted = count * _CHUNK_SECONDS / max(took, 1e-3)
-            count = max(1, min(int(wanted), 2 * count, _MOST_AT_ONCE))
+            on_answer(answer, took)
+            in_time = count * _CHUNK_SECONDS / max(took, 1e-3)
+            count = max(1, min(int(in_time), 2 * count, _MOST_AT_ONCE))
             at = chunk.stop
 
     def _ask(self, job: Job, rescored: RescoredPast, rows: range) -> RescoredMoments:
         with self._lock:
             job.check()
-            moments = tuple(rescored.to_rescore(row) for row in rows)
+            moments = tuple(rescored.moment_to_rescore(row) for row in rows)
         return self._process.ask(job.check, RescoreMoments(moments))

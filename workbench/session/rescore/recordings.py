@@ -1,9 +1,4 @@
-"""Which recorded episodes are judged again, in which env each is, and a page's judging of them in the background.
-
-The envs that live through them are in `rescore_run`. For a page a process loads one task after the other and judges its
-episodes. To stop is to end the process: what is known by then stays. It ends with the job: the code of recordings is not
-to stay.
-"""
+"""Groups recorded episodes by the env that rescores them, and rescores them in the background."""
 
 from __future__ import annotations
 
@@ -44,21 +39,22 @@ from workbench.session.rescore.background import RescoreView, Rescoring
 
 @dataclass(frozen=True)
 class Group:
-    """Episodes that are judged in one env."""
+    """Episodes that are rescored in one env."""
 
     reference: TaskName
-    """What is opened when it is cleared, unless it is `info`'s recorded text."""
+    """The task to open, unless `recorded_source`."""
     options: TaskOptions
     info: EpisodeInfo
     """Of the first of them."""
     files: tuple[Source, ...]
     note: str = ""
-    """What is not as it was recorded, on purpose."""
+    """Options that differ from the recorded ones on purpose."""
     recorded_source: bool = False
+    """Open the text that `info` holds instead."""
 
     @property
-    def wanted(self) -> CodeToRun:
-        """What has to be cleared before it is judged."""
+    def code(self) -> CodeToRun:
+        """What has to be cleared before it runs."""
         return CodeToRun(self.reference, self.info, self.recorded_source)
 
 
@@ -71,13 +67,13 @@ def group_episodes(
     file: Path | None = None,
     recorded_source: bool = False,
 ) -> tuple[list[Group], list[Verdict[Source]]]:
-    """Which env each episode is judged in; and those that cannot be read, with the reason.
+    """Group episodes by env, and return those that cannot be read with the reason.
 
     Args:
-        num_envs: at most so many at once.
-        task: is opened for all of them, in place of what each names.
-        file: is opened for those whose task is in it.
-        recorded_source: each is judged by the text that it was recorded with.
+        num_envs: most envs of a group.
+        task: opened for all of them, in place of the recorded task.
+        file: opened for those whose task is in it.
+        recorded_source: rescore each with the text that it was recorded with.
     """
     groups: dict[str, Group] = {}
     broken_files: list[Verdict[Source]] = []
@@ -96,7 +92,7 @@ def group_episodes(
         if recorded_source and (besides := side_files_text(info.source_file, info.side_files)):
             note = f"{note}. {besides}" if note else besides
         reference = task or (file and class_in(file, info.task)) or reference_of(info)
-        # One that was made here must not vouch for one that was not.
+        # Recordings that were made here are trusted: they must not share a group with others.
         about = [str(reference), info.task, options.env_kwargs, text, made_here(info).value]
         key = json.dumps(about, sort_keys=True, default=str)
         group = groups.get(key) or Group(reference, options, info, (), note, recorded_source)
@@ -107,8 +103,8 @@ def group_episodes(
     ], broken_files
 
 
-def hidden_in_words(reference: TaskName) -> list[str]:
-    """What lies beside the task's file and cannot be imported because a library has its name, in sentences."""
+def hidden_modules_text(reference: TaskName) -> list[str]:
+    """A sentence for each module next to the task's file that cannot be imported, since a library has its name."""
     file = named_file(reference)
     return (
         []
@@ -124,15 +120,15 @@ def rescore_each(
     known: Callable[[], Iterable[Verdict[Source]]],
     not_rescored: Callable[[list[Verdict[Source]]], None],
 ) -> None:
-    """Judge each of these with what was cleared for it, or with its recorded text; one that fails leaves the others.
+    """Rescore each group with the code cleared for it, or its recorded text. A group that fails leaves the others: a
+    folder holds recordings of many tasks, and one of them may be gone.
 
     Args:
-        known: all verdicts so far.
-        not_judged: gets those of episodes that have none because theirs failed: a folder holds recordings of many
-            tasks, and one of them may be gone.
+        known: returns all verdicts so far.
+        not_rescored: gets a verdict for each episode that has none because its group failed.
 
     Raises:
-        JobFailed, TaskError, CannotStepIn: of the first, where all fail.
+        JobFailed, TaskError, CannotEnterRecording: of the first group, if all fail.
     """
     failures: list[JobFailed | TaskError | CannotEnterRecording] = []
     for group, reference in zip(groups, cleared, strict=True):
@@ -155,7 +151,7 @@ def rescore_each(
 
 
 def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
-    """The same env without pictures, which cost most of the time and which no reward looks at; and what was changed."""
+    """The same env without pictures, which take most of the time and which no reward reads; and a note on the change."""
     kwargs, note = dict(options.env_kwargs), ""
     mode = kwargs.get("obs_mode")
     if mode is not None and mode not in ("state", "state_dict", "none"):
@@ -166,12 +162,12 @@ def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
 
 
 def with_renderer(options: TaskOptions) -> TaskOptions:
-    """For a task that cannot be built without one: PushT-v1 makes materials of SAPIEN's renderer for its shapes."""
+    """The same with a renderer, which some tasks need to be built: PushT-v1 makes render materials for its shapes."""
     return replace(options, env_kwargs={k: v for k, v in options.env_kwargs.items() if k != "render_backend"})
 
 
 def _info_of(source: Source) -> EpisodeInfo:
-    """Raises as `read_source`, which it spares where it can: pictures and meshes need not be read for it."""
+    """Read from the small .json if it is there, else by `read_source`, which reads pictures and meshes too. Raises as that."""
     try:
         return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
@@ -181,17 +177,20 @@ def _info_of(source: Source) -> EpisodeInfo:
 MOST_AT_ONCE = 16
 """Envs."""
 MOST_NAMED = 3
-"""Of the versions that are judged with, where there are many."""
+"""Versions that a note lists."""
 
 
 class Rescorer:
-    """Judges recordings."""
+    """Rescores recordings in a process of its own, one task after the other.
+
+    The process ends with the job, so that code of recordings does not stay; to stop is to end it early.
+    """
 
     def __init__(self, clearances: Clearances | None = None, base: TaskOptions | None = None) -> None:
         """
         Args:
-            clearances: says what of the code that recordings name may run; None asks nobody.
-            base: what is the same for all that is opened.
+            clearances: decides which code may run; None without a person to ask.
+            base: options of every opened task.
         """
         self.rescoring = Rescoring("rescore")
         self._process = Background()
@@ -206,7 +205,7 @@ class Rescorer:
         recorded_source: bool = False,
         use_env_states: bool = False,
     ) -> None:
-        """Judge these; see `group_episodes` for the arguments."""
+        """Rescore these; arguments as in `group_episodes`."""
         if not files:
             return
 
@@ -214,7 +213,7 @@ class Rescorer:
             groups, broken_files = group_episodes(
                 files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
             )
-            notes = [f"with {_rescored_with(group)}" for group in groups[:MOST_NAMED]]
+            notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
             notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
             self._tell(job, broken_files, state="asking", notes=tuple(notes))
@@ -230,7 +229,7 @@ class Rescorer:
     # --- on the lane ---------------------------------------------------------------------------------
 
     def _rescore_all(self, job: Job, groups: list[Group], use_env_states: bool) -> None:
-        cleared = self._clearances.clear_all([group.wanted for group in groups], lambda: job.stopped)
+        cleared = self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
         job.check()
 
         rescore_each(
@@ -243,9 +242,9 @@ class Rescorer:
 
     def _rescore(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
         process = self._process
-        warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden_in_words(reference))))
-        self._tell(job, state="loading", task=_rescored_with(group), warnings=warnings)
-        # Never patched into what the last episodes were judged in.
+        warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden_modules_text(reference))))
+        self._tell(job, state="loading", task=_code_text(group), warnings=warnings)
+        # Never patched into the env of the group before.
         load = Load(reference, group.options, level="rebuilt")
         try:
             process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
@@ -258,24 +257,24 @@ class Rescorer:
         self._tell(job, state="rescoring")
         began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps
 
-        def told(now: Rescored) -> None:
+        def on_part(part: Rescored) -> None:
             seconds = before + time.monotonic() - began
-            self._tell(job, now.verdicts, steps=steps + now.steps, seconds=seconds)
+            self._tell(job, part.verdicts, steps=steps + part.steps, seconds=seconds)
 
         question = Rescore(group.files, use_env_states)
-        last = process.ask(job.check, question, lambda done, total, now: told(now))
-        told(last)
+        last = process.ask(job.check, question, lambda done, total, part: on_part(part))
+        on_part(last)
         if last.problem is not None:
             raise JobFailed(f"the code of {group.info.task} raised", last.problem)
 
     def _tell(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
-        """What is new, and these verdicts besides those that are known."""
+        """Change fields of the view, and add these verdicts."""
         known = (*self.rescoring.view.verdicts, *verdicts)
         self.rescoring.tell(job, verdicts=known, done=len(known), **values)
 
 
-def _rescored_with(group: Group) -> str:
-    """What is opened, in words."""
+def _code_text(group: Group) -> str:
+    """The code that rescores a group, as text."""
     if group.recorded_source:
         return f"{group.info.task} as it was recorded"
     file = named_file(group.reference)

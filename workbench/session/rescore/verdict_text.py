@@ -1,4 +1,4 @@
-"""What a verdict says, in words and as rows: the page, the terminal and files show these."""
+"""Formats verdicts as text, CSV and JSON, for the page, the terminal and files."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from workbench.machine.text import length, mean_text, number_text
 from workbench.recording.episode.row import Source
 
 PUT_IN = " With the recorded states put in at every step nothing drifts."
-"""What can be done about drift from a recording."""
+"""Advice about drift from a recording."""
 _MOST_NAMED = 4
 
 
-def what_changed(verdict: Verdict[Any]) -> str:
-    """Success and fail, or else the reward; ``as it was`` where nothing is another."""
+def change_text(verdict: Verdict[Any]) -> str:
+    """The change of success and fail, or else of the reward; ``as it was`` if nothing differs."""
     if verdict.why_not:
         return f"not judged: {verdict.why_not}"
     flags = (("success", verdict.success), ("fail", verdict.fail))
-    told = [_turned(name, was, now) for name, (was, now) in flags if was != now]
-    if told:
-        return ", ".join(told)
+    changes = [_flag_text(name, was, now) for name, (was, now) in flags if was != now]
+    if changes:
+        return ", ".join(changes)
     if verdict.differs:
         at = f", from step {verdict.first_difference}"
         if "reward" in verdict.differing:
@@ -38,14 +38,14 @@ def what_changed(verdict: Verdict[Any]) -> str:
     return "as it was"
 
 
-def _turned(name: str, was: int | None, now: int | None) -> str:
-    """When a flag turned true, and turns true now; None is never."""
+def _flag_text(name: str, was: int | None, now: int | None) -> str:
+    """The steps at which a flag turned true, in the record and now; None is never."""
     before = "never" if was is None else f"at step {was}"
     return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
 
 
 def _reward_change(verdict: Verdict[Any]) -> str:
-    """By how much the rewards changed, or that they are no finite numbers now or were not."""
+    """By how much the rewards changed, or which of the two returns is not finite."""
     if math.isfinite(verdict.largest):
         return f"reward by up to {number_text(verdict.largest)}"
     was, now = verdict.returns
@@ -58,14 +58,14 @@ def _reward_change(verdict: Verdict[Any]) -> str:
     )
 
 
-def returns(verdict: Verdict[Any]) -> str:
+def returns_text(verdict: Verdict[Any]) -> str:
     if math.isnan(verdict.returns[0]) and np.isnan(verdict.old_reward).all():
         return f"none → {number_text(verdict.returns[1])}"
     return _was_now(*map(number_text, verdict.returns))
 
 
-def drift(verdict: Verdict[Any]) -> str:
-    """How far the bodies were from the record."""
+def drift_text(verdict: Verdict[Any]) -> str:
+    """How far the bodies drifted from the record."""
     if verdict.metres is None:
         return "not known"
     return "none" if verdict.metres == 0 else length(verdict.metres)
@@ -75,7 +75,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     """One sentence on what differs.
 
     Args:
-        others: further entries that differ, such as those that one version has not.
+        others: further differing entries, such as those that only one version has.
     """
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
     if not rescored:
@@ -88,30 +88,30 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     return sentence + (f" Other entries differ: {', '.join(named)}." if named else "")
 
 
-def numbers(verdicts: Sequence[Verdict[Any]]) -> list[str]:
-    """Success and return over all of them, then and now; and how many were not judged."""
+def totals(verdicts: Sequence[Verdict[Any]]) -> list[str]:
+    """Successes and mean return, recorded and now, and the number of episodes without a result; a text each."""
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
-    told: list[str] = []
+    texts: list[str] = []
     if any(verdict.has_success for verdict in rescored):
         successes = (sum(verdict.success[k] is not None for verdict in rescored) for k in (0, 1))
-        told.append(f"episodes with success: {_was_now(*map(str, successes))}")
+        texts.append(f"episodes with success: {_was_now(*map(str, successes))}")
     if rescored:
         means = (mean_text([verdict.returns[k] for verdict in rescored]) for k in (0, 1))
-        told.append(f"mean return: {_was_now(*means)}")
+        texts.append(f"mean return: {_was_now(*means)}")
     skipped = len(verdicts) - len(rescored)
-    return told + ([f"{counted(skipped, 'episode')} not judged"] if rescored and skipped else [])
+    return texts + ([f"{counted(skipped, 'episode')} not judged"] if rescored and skipped else [])
 
 
 def summary(verdicts: Sequence[Verdict[Any]]) -> str:
-    """All of that in one line."""
-    return " ".join((headline(verdicts), *(f"{told[0].upper()}{told[1:]}." for told in numbers(verdicts))))
+    """Headline and totals in one line."""
+    return " ".join((headline(verdicts), *(f"{text[0].upper()}{text[1:]}." for text in totals(verdicts))))
 
 
-def doubts(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
-    """How far the bodies came from the record, and where that makes the comparison doubtful; empty if not known.
+def drift_summary(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
+    """How far the bodies drifted from the record, and whether that makes the comparison doubtful; empty if unknown.
 
     Args:
-        advice: a sentence for where it does.
+        advice: a sentence that is added if it does.
     """
     known = [verdict for verdict in verdicts if verdict.metres is not None]
     if not known:
@@ -121,7 +121,7 @@ def doubts(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
     if metres == 0 and radians == 0:
         return "Every body is where it was, to the last bit: what differs comes of the code."
     amount = f"{length(metres)} and {math.degrees(radians):.2g}°"
-    if not (far := is_doubtful(known)):
+    if not (far := count_drifted(known)):
         return f"States drifted by at most {amount}: the rewards are comparable."
     return (
         f"In {counted(far, 'episode')} bodies came up to {amount} from where they were, furthest in {furthest.of.name}: "
@@ -129,18 +129,18 @@ def doubts(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
     )
 
 
-def is_doubtful(verdicts: Sequence[Verdict[Any]]) -> int:
-    """In how many of them what differs may come of other states."""
+def count_drifted(verdicts: Sequence[Verdict[Any]]) -> int:
+    """Number of episodes whose differences may come from drift and not from the code."""
     return sum(verdict.drifted for verdict in verdicts)
 
 
 def not_carried(verdicts: Sequence[Verdict[Any]]) -> tuple[str, ...]:
-    """What could not be put back, each once with its reason."""
+    """State that could not be restored, each once with its reason."""
     return tuple(dict.fromkeys(f"{what}: {why}" for v in verdicts for what, why in v.missed.items()))
 
 
 def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
-    """One flat dict an episode, as JSON can say it."""
+    """One flat dict an episode, of values that JSON can hold."""
     return [
         {
             "episode": verdict.of.name,
@@ -179,7 +179,7 @@ def as_csv(verdicts: Sequence[Verdict[Source]]) -> str:
 
 
 def as_json(verdicts: Sequence[Verdict[Source]]) -> str:
-    """With ``NaN`` and infinities as null, which JSON has not."""
+    """A list of rows; NaN and infinities, which JSON lacks, become null."""
     rows = [{key: _finite(value) for key, value in row.items()} for row in as_rows(verdicts)]
     return json.dumps(rows, indent=1) + "\n"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
 from workbench.recording.episode.episode import Episode
-from workbench.session.clearance import files_named
+from workbench.session.clearance import paths_in_arguments
 from workbench.session.process.askers import Background, OnProgress
 from workbench.session.process.job_lane import JobFailed
 from workbench.session.protocol.questions import MakeScene, SceneMade
@@ -72,7 +72,7 @@ class SceneProcess:
         self, process: Background, episode: Episode, check: Callable[[], None], on_progress: OnProgress
     ) -> SceneMade:
         info = episode.info
-        if named := files_named(info):
+        if named := paths_in_arguments(info):
             # Opening a row must not let an env read files that a recording names: native code may parse them.
             raise SceneError(
                 f"It names files for {info.task} to read ({', '.join(named[:3])}), which is not done for looking at it, so "

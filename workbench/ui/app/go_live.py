@@ -126,7 +126,7 @@ class GoLive:
             self._say(str(error))
             return
         info = one.episode.info
-        if (why := self._clearances.why_not_its_arguments(info)) is not None:
+        if (why := self._clearances.refused_arguments(info)) is not None:
             self._say(sentence(why))
             return
         if self.recorded_source:

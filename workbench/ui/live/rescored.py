@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from workbench.jobs.verdict import Verdict, in_order
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
 from workbench.ui.widgets.line_chart import part_round
@@ -130,7 +130,7 @@ def in_a_line(rescored: RescoreView) -> str:
         # In tenths: each change is sent to the page.
         return f"The past is judged again: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
     if rescored.state == "done":
-        return f"{TITLE}: {words.headline(rescored.verdicts, others=rescored.differing_names)}"
+        return f"{TITLE}: {verdict_text.headline(rescored.verdicts, others=rescored.differing_names)}"
     return f"{TITLE}: {rescored.why}" if rescored.why else ""
 
 

@@ -16,7 +16,7 @@ from workbench.jobs.verdict import Verdict, in_order
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RUNNING
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.review import Review
@@ -113,7 +113,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         known: Further task files that the server knows.
     """
 
-    advice = words.PUT_IN
+    advice = verdict_text.PUT_IN
 
     def __init__(
         self,

@@ -9,7 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.jobs.verdict import Verdict
-from workbench.session.rescore import verdict_text as words
+from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RUNNING, RescoreView
 from workbench.ui.widgets.click_targets import Paged, Presses
 from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
@@ -79,9 +79,9 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         told = self._failed_since and verdict.why_not.startswith(self._failed_since)
         return {
             "badge": None,
-            "changed": "not judged" if told else words.what_changed(verdict),
-            "returns": "" if verdict.why_not else words.returns(verdict),
-            "drift": f"drifted {words.drift(verdict)}" if verdict.drifted else "",
+            "changed": "not judged" if told else verdict_text.change_text(verdict),
+            "returns": "" if verdict.why_not else verdict_text.returns_text(verdict),
+            "drift": f"drifted {verdict_text.drift_text(verdict)}" if verdict.drifted else "",
             "same": not verdict.differs,
             "press": self._presses.id_of(("row", row), lambda _: self._go(row)),
             **self._of_row(verdict),
@@ -108,4 +108,6 @@ def status_html(rescored: RescoreView, title: str = "", idle: str = "", advice: 
         idle: What is said before anything was judged.
         advice: As `RescoredPanel.advice`.
     """
-    return render("rescored", rescored=rescored, title=title, idle=idle, advice=advice, words=words)
+    return render(
+        "rescored", rescored=rescored, title=title, idle=idle, advice=advice, verdict_text=verdict_text
+    )
