@@ -453,7 +453,7 @@ def test_without_a_folder_to_keep_it_in_it_is_asked_every_run_and_recording_goes
     write(foreign.parents[1] / "recordings", made(3), pictures=False)
     assert made_here(info_of(again)) is MadeHere.NO
     told = [record.message for record in caplog.records]
-    assert len([message for message in told if "not known as recorded here" in message]) == 1
+    assert len([message for message in told if "cannot be sealed as made here" in message]) == 1
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without a home")

@@ -1,18 +1,4 @@
-"""Films: frames in, one mp4 out (H.264, as every player, browser and messenger shows it); and frames out of a part of one.
-
-ffmpeg comes with imageio-ffmpeg, which ManiSkill brings along anyway; PyAV would be one more thing to install. As a
-process of its own it encodes on another core, and what it says when it fails can be read. It gets the frames through
-a pipe, one at a time, so an hour of film takes no more memory than a second.
-
-A ``.mp4`` that somebody was sent may be a playlist that names other files and addresses, or claim pictures of any size. So
-the ffmpeg that takes one apart is told the format, may open files alone, and has limits on pixels, frames and time.
-Frames come as PPM, which says with each how large it is.
-
-drawn without a browser from the recorded meshes and poses.
-
-SAPIEN draws that (`workbench.core.cameras.render_recorded`), on a graphics card or in software, so it belongs into a process of its
-own: the one that serves the page imports no renderer.
-"""
+"""Films of episodes: mp4 files, frames taken out of them, contact sheets, and frames of the 3-D view."""
 
 from __future__ import annotations
 
@@ -42,21 +28,21 @@ from workbench.recording.episode.row import UnreadableRecording
 
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 29
-"""Of all frames of one part, encoded."""
+"""Of all encoded frames of one part."""
 MOST_SECONDS = 60.0
-"""Of ffmpeg, for one part."""
+"""Time limit of ffmpeg for one part."""
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How an mp4 is made; the usual one is for people."""
+    """Settings of an mp4; the default is for watching."""
 
     crf: int = 18
-    """H.264's measure of loss; 18 can hardly be told from the frames themselves."""
+    """H.264's quality, lower is better; 18 is visually almost lossless."""
     key_every: int | None = None
-    """Frames between two that are whole; None leaves it to the encoder. Few make seeking slow."""
+    """Interval of key frames; None leaves it to the encoder. A long interval makes seeking slow."""
     exact_size: bool = False
-    """Keep an odd width or height, at the price of a pixel format that not every player has; else a row is added."""
+    """Keep an odd width or height, in a pixel format that not every player supports; else pad by a pixel."""
 
 
 def write_mp4(
@@ -65,14 +51,13 @@ def write_mp4(
     """Write the frames to a new file at `path`; returns how many there were.
 
     Args:
-        path: where; must not exist.
+        path: must not exist.
         frames: (H, W, 3) each, all of one size.
-        fps: frames a second.
-        encoding: how.
+        fps: frames per second.
 
     Raises:
         ValueError: there is no frame, or one has another size.
-        OSError: it cannot be written there; the message says why.
+        OSError: the file cannot be written.
     """
     coming = iter(frames)
     first = next(coming, None)
@@ -86,9 +71,12 @@ def write_mp4(
 
 
 class FilmWriter:
-    """An ffmpeg that writes an mp4 at `path` and takes frames until `close`; see `write_mp4` for what is raised.
+    """Writes frames to an mp4 (H.264) by an ffmpeg process; raises as `write_mp4`.
 
-    As a context it closes at the end of the block, and ends ffmpeg at once where the block raised.
+    ffmpeg comes with imageio-ffmpeg, a dependency of ManiSkill. As a process it encodes on another core, and its error
+    messages can be read. Frames go through a pipe, so memory use does not grow with the film.
+
+    As a context manager it closes at the end of the block, and kills ffmpeg when the block raised.
     """
 
     def __init__(self, path: Path, shape: tuple[int, ...], fps: float, encoding: Encoding) -> None:
@@ -110,7 +98,7 @@ class FilmWriter:
         ]
         command += ["-s", f"{width}x{height}", "-r", f"{rate.numerator}/{rate.denominator}", "-i", "-"]
         command += ["-c:v", "libx264", "-crf", str(encoding.crf), "-pix_fmt"]
-        # Half resolution of colour is what all players have; it needs an even size.
+        # Every player supports colour at half resolution, which needs an even size.
         command += ["yuv444p" if odd and encoding.exact_size else "yuv420p", "-movflags", "+faststart"]
         command += [] if encoding.key_every is None else ["-g", str(encoding.key_every), "-bf", "0"]
         self._stderr = tempfile.TemporaryFile()
@@ -119,7 +107,7 @@ class FilmWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
-            # Ctrl-C is for us; ffmpeg would end the file as if all were well.
+            # On Ctrl-C ffmpeg would finish the file as if it were complete.
             start_new_session=True,
         )
 
@@ -141,14 +129,14 @@ class FilmWriter:
         self._count += 1
 
     def __len__(self) -> int:
-        """Frames so far."""
+        """Frames added so far."""
         return self._count
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         self.close(abandoned=error is not None)
 
     def close(self, abandoned: bool = False) -> None:
-        """Finish the file; one that is `abandoned` is left as it is. Can be called twice."""
+        """Finish the file, or with `abandoned` kill ffmpeg. Can be called twice."""
         if self._stderr.closed:
             return
         assert self._process.stdin is not None
@@ -158,7 +146,7 @@ class FilmWriter:
             try:
                 self._process.stdin.close()
             except OSError:
-                pass  # it is gone; its exit status says why
+                pass  # ffmpeg has ended; its exit status is checked below
             if self._process.wait() and not abandoned:
                 raise self._error()
         finally:
@@ -167,19 +155,19 @@ class FilmWriter:
     def _error(self) -> OSError:
         self._stderr.seek(0)
         lines = self._stderr.read().decode(errors="replace").strip().splitlines()
-        # Its last line names the temporary file; the reason stands at the end.
+        # The last line names the temporary file first and ends with the reason.
         reason = lines[-1].rpartition(": ")[2] if lines else f"ffmpeg ended with {self._process.returncode}"
         return OSError(f"The film could not be written: {reason}.")
 
 
-# --- taken apart -----------------------------------------------------------------------------------
+# --- frames of a film ------------------------------------------------------------------------------
 
 
 class FilmPart:
-    """The frames of a part of a film as JPEG; all of the part is taken out when one is first asked for."""
+    """The frames of a part of a film as JPEG; all are extracted on the first access."""
 
     def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
-        """Raises ValueError where no film has such a part."""
+        """`begin` in seconds, `count` in frames. Raises ValueError when they are out of range."""
         if not 0 <= count <= MOST_FRAMES or not 0 <= begin < 1e9 or not 0 < fps < 1e6:
             raise ValueError(f"it claims {count} frames from {begin} s on, {fps} a second, of {film.name}")
         self._film, self._begin, self._count, self._fps = film, begin, count, fps
@@ -187,7 +175,7 @@ class FilmPart:
         self._taking = threading.Lock()
 
     def one(self, number: int) -> bytes:
-        """Raises UnreadableRecording where the film cannot be read."""
+        """Frame `number`. Raises UnreadableRecording when the film cannot be read."""
         with self._taking:
             if self._blobs is None:
                 self._blobs = self._take_out()
@@ -197,7 +185,7 @@ class FilmPart:
         blobs: list[bytes] = []
         size = 0
         try:
-            # Half a frame early, so that rounding cannot skip the first one.
+            # Start half a frame early, or rounding may skip the first frame.
             for frame in film_frames(self._film, max(0.0, self._begin - 0.5 / self._fps), self._count):
                 blobs.append(encode_jpeg(frame))
                 size += len(blobs[-1])
@@ -215,16 +203,20 @@ class FilmPart:
 def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uint8]]:
     """At most `count` frames (H, W, 3) from `begin` seconds on.
 
+    An untrusted ``.mp4`` may be a playlist that names other files and addresses, or claim pictures of any size. So
+    ffmpeg is given the format, may open files only, and has limits on pixels, frames and time. It outputs PPM, which
+    states the size of each frame.
+
     Raises:
-        OSError: it is no MP4 that can be read, or took too long.
+        OSError: it cannot be read as MP4, or takes too long.
     """
     open_regular_file(film).close()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-max_alloc", str(1 << 29)]
-    # "mov" is the format of MP4: a playlist that is called so is none.
+    # "mov" is MP4's demuxer: it refuses a playlist that is named .mp4.
     command += ["-protocol_whitelist", "file", "-f", "mov", "-threads", "1", "-max_pixels", str(MOST_PIXELS)]
     command += ["-ss", f"{begin:.6f}", "-i", f"file:{film}", "-map", "0:v:0", "-frames:v", str(count)]
     command += ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
-    # In memory: who reads recordings of others writes no files.
+    # In memory: confined readers may not write files.
     with os.fdopen(os.memfd_create("ffmpeg"), "w+b") as stderr:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr)
         late = threading.Timer(MOST_SECONDS, process.kill)
@@ -250,7 +242,7 @@ def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
         return None
     size = stream.readline(32).split()
     if magic != b"P6\n" or len(size) != 2 or stream.readline(16) != b"255\n":
-        raise OSError("ffmpeg gave something that is no picture")
+        raise OSError("ffmpeg's output is not a PPM picture")
     width, height = int(size[0]), int(size[1])
     if not 0 < width * height <= MOST_PIXELS:
         raise OSError(f"it has pictures of {width} x {height}")
@@ -268,11 +260,10 @@ def _failure(stderr: BinaryIO, status: int) -> str:
     return lines[-1][:200] if lines else f"ffmpeg ended with {status}"
 
 
-# --- An episode as pictures: what its cameras saw, frame by frame or on one sheet, a row a camera; and its 3-D view as frames, ---
-
+# --- pictures of an episode's cameras ---------------------------------------------------------------
 
 SMALLEST_SIDE = 256
-"""Pixels. What a policy sees is often 128 wide, which no player shows well; whole pixels are repeated."""
+"""Pixels. Policies often see 128 pixels, which players blur; pixels are repeated up to this size."""
 COLUMNS = 8
 CELL = 176
 """Pixels of a picture's longer side."""
@@ -282,7 +273,7 @@ GOOD, BAD = (43, 138, 62), (201, 42, 42)
 
 
 def cameras_by_name(episode: Episode) -> dict[str, CameraTrack]:
-    """The cameras that have colour pictures, by their `camera_names`; sensors first."""
+    """Cameras with colour pictures by `camera_names`, sensors first."""
     seen = [camera for camera in episode.cameras if camera.rgb is not None and len(camera.rgb)]
     seen.sort(key=lambda camera: camera.info.kind != "sensor")
     return dict(zip(camera_names([camera.info for camera in seen]), seen))
@@ -292,7 +283,7 @@ def camera_of(episode: Episode, name: str) -> CameraTrack:
     """The camera of that name.
 
     Raises:
-        ValueError: there is none with pictures; the message says which there are.
+        ValueError: there is none with pictures; the message lists those that have some.
     """
     cameras = cameras_by_name(episode)
     if name not in cameras:
@@ -302,12 +293,12 @@ def camera_of(episode: Episode, name: str) -> CameraTrack:
 
 
 def picture_index(camera: CameraTrack, state: int) -> int:
-    """The newest picture at `state`; the first where there is none yet."""
+    """Index of the newest picture at `state`, or of the first if there is none yet."""
     return max(int(np.searchsorted(camera.frame, state, side="right")) - 1, 0)
 
 
 def frames(episode: Episode, camera: CameraTrack) -> Iterator[NDArray[np.uint8]]:
-    """One picture (H, W, 3) a state; a state of which there is none shows the one before."""
+    """One picture (H, W, 3) per state; a state without one repeats the last."""
     assert camera.rgb is not None, "`cameras_by_name` gives only cameras that have colour"
     last, picture = -1, None
     for state in range(episode.length + 1):
@@ -323,11 +314,11 @@ def enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return picture if times <= 1 else picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
-# --- on one picture --------------------------------------------------------------------------------
+# --- contact sheet ---------------------------------------------------------------------------------
 
 
 def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
-    """The sheet.
+    """Pictures of every camera at `columns` states on one sheet, a row per camera.
 
     Raises:
         ValueError: the episode was recorded without pictures.
@@ -377,7 +368,7 @@ def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
 
 
 def chosen_states(episode: Episode, columns: int) -> list[int]:
-    """`columns` states or fewer from the first to the last, evenly; the first success or fail in place of its neighbour."""
+    """At most `columns` evenly spaced states; the first success and the first fail replace their nearest neighbour."""
     states = sorted(set(np.linspace(0, episode.length, columns).round().astype(int).tolist()))
     for name in ("success", "fail"):
         moment = _first(episode, name)
@@ -403,19 +394,19 @@ def _title(episode: Episode) -> str:
     return f"{info.task}{seed}   {episode.length} steps   return {total:.2f}{ended}"
 
 
-# --- its 3-D view ----------------------------------------------------------------------------------
+# --- frames of the 3-D view ------------------------------------------------------------------------
 
 SIZE = (960, 720)
 """Width and height in pixels."""
 FOVY = 0.75
-"""Radians, vertical; the page's own."""
+"""Radians, vertical; as in the page's 3-D view."""
 FROM_THE_FRONT = np.array([1.0, 0.55, 0.75])
-"""ManiSkill's robots look along +x, so their front is seen from there."""
+"""Direction to the camera: ManiSkill's robots face +x."""
 
 
 @dataclass(frozen=True)
 class Eye:
-    """A camera that does not move."""
+    """A fixed camera; metres in the env's frame."""
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
@@ -434,7 +425,7 @@ class Eye:
 
 
 def default_eye(episode: Episode) -> Eye:
-    """The recorded human-render camera's where there is one, else one that has all that moves in view."""
+    """The recorded human-render camera's, or else one that sees all movable bodies."""
     for camera in episode.cameras:
         if camera.info.kind == "human" and len(camera.pose):
             position, forward = camera.pose[0, :3], quat2mat(camera.pose[0, 3:])[:, 0]
@@ -443,25 +434,27 @@ def default_eye(episode: Episode) -> Eye:
     assert episode.poses is not None and episode.geometry is not None
     low, high = box_of_moving(episode.poses, episode.geometry.body_kinds)
     middle = (low + high) / 2
-    # Origins of bodies, not their outlines: half as far again holds a hand or a cube around its origin.
+    # The box holds origins of bodies, not their outlines: leave a margin.
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1
     direction = FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
     return Eye(triple(middle + direction * radius / np.sin(FOVY / 2)), triple(middle))
 
 
 def scene_frames(episode: Episode, eye: Eye | None = None) -> Iterator[NDArray[np.uint8]]:
-    """One picture (H, W, 3) a state.
+    """One picture (H, W, 3) per state, rendered by SAPIEN from the recorded meshes and poses.
+
+    Call it in a job process: the server imports no renderer.
 
     Raises:
         ValueError: the recording holds no scene.
-        RuntimeError: this machine has nothing to render with.
+        RuntimeError: this machine has no render device.
     """
     from workbench.core.cameras.render_recorded import RecordedScene
 
     if episode.geometry is None or episode.poses is None:
         raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to film.")
     eye = eye or default_eye(episode)
-    # A recording that was read holds its env alone, as env 0 of 1; one in memory may still hold the batch.
+    # Read from a file, the scene holds this env alone as env 0 of 1; in memory it may hold the batch.
     env = 0 if episode.geometry.num_envs == 1 else episode.info.env_index
     scene = RecordedScene(episode.geometry, env, *SIZE, eye.fovy)
     for poses in episode.poses:

@@ -48,9 +48,7 @@ def test_any_changed_byte_is_said_and_the_other_file_is_read(
         flip(file, at)
         found = read_episode(path)
         (said,) = found.broken_files
-        assert said.sentence.startswith(
-            f"{file.name} was cut short or changed (its checksum is not the one"
-        ), at
+        assert said.sentence.startswith(f"{file.name} was cut short or changed (its checksum differs"), at
         assert (found.poses is None) == (suffix == ".rrd")
         assert (found.env_states == {}) == (suffix == ".h5")
         np.testing.assert_array_equal(found.action, episode.action)
@@ -96,5 +94,5 @@ def test_a_checksum_is_of_the_whole_file(tmp_path: Path, size: int) -> None:
     check(path, described)
     if size:
         flip(path, size - 1)
-        with pytest.raises(OSError, match="its checksum is not the one"):
+        with pytest.raises(OSError, match="its checksum differs"):
             check(path, described)

@@ -299,5 +299,5 @@ def test_a_file_of_another_length_is_said_with_both_and_one_that_is_not_describe
         check(path, {".h5": Checksum(6)})
     check(path, {".h5": Checksum(5)})
     check(path, {".rrd": Checksum(6, "0")})
-    with pytest.raises(OSError, match="its checksum is not the one"):
+    with pytest.raises(OSError, match="its checksum differs"):
         check(path, {".h5": Checksum(5, "0")})

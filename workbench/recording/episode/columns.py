@@ -1,16 +1,4 @@
-"""Rows to bytes while an episode happens, and bytes to columns when it is over.
-
-A control step of one env is thirty to fifty small arrays: poses, an action, entries of ``evaluate()``, env states,
-observations. Writing each with its name and type would cost more than the step; but from one step to
-the next names and types are the same. So a row is the bytes of its arrays one behind the other, and a *layout*, kept
-once, says what they are. A layout is a numpy structured type, so a thousand rows become columns by one call. Envs of a
-batch step together, so their rows are packed together: each array of the batch is copied once, to its place in rows that
-stay from step to step.
-
-``evaluate()`` of a task under way is not tidy: entries come, go and change their type while the author edits. Each change is
-a new layout. A column that every row has in one shape keeps its type. Otherwise it becomes
-floating point and holds NaN where a row lacks it; rows of differing shape are flattened and padded with NaN.
-"""
+"""Packs the rows of a running episode into bytes, and turns them into columns when it is over."""
 
 from __future__ import annotations
 
@@ -37,7 +25,14 @@ FIXED = ("poses", "action", "reward", "terminated", "truncated")
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """What the bytes of a row are; one object a packer and key, so that it is known by identity."""
+    """Names, types and shapes of the arrays that a row consists of.
+
+    A control step of one env is thirty to fifty small arrays, and writing each with its name and type would cost more
+    than the step. Names and types stay the same from step to step, so a row is only the bytes of its arrays, and a
+    layout, kept once, describes them. It is a numpy structured type: a thousand rows become columns by one call.
+
+    A packer makes one object per key: compare by identity.
+    """
 
     key: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
     """Name, type and shape of each array of a row."""
@@ -47,7 +42,7 @@ class Layout:
         return json.dumps([[name, dtype.str, shape] for name, dtype, shape in self.key])
 
     def check(self, bodies: int, actions: int) -> None:
-        """Raises ValueError where its rows do not fit a scene of so many bodies and actions, or hold what is no number."""
+        """Raises ValueError when its rows do not fit a scene of so many bodies and actions, or hold anything but numbers."""
         shapes = {name: shape for name, _, shape in self.key}
         if shapes["poses"] != (bodies, 7):
             raise ValueError(
@@ -66,7 +61,7 @@ class Layout:
 
 
 class BatchPacker:
-    """Packs the rows of a batch, one step after the other."""
+    """Packs the rows of a batch, step by step; each array of the batch is copied once, into a reused buffer."""
 
     def __init__(self) -> None:
         self._layouts: dict[object, Layout] = {}
@@ -76,7 +71,7 @@ class BatchPacker:
         """Where in `_rows` each column goes."""
 
     def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
-        """The layout and (N) rows of `columns`, each a name and an array (N, ...): those of `FIXED`, then the others."""
+        """Layout and N rows of `columns`, each a name and an array (N, ...): those of `FIXED` first."""
         key = tuple([(name, values.dtype, values.shape[1:]) for name, values in columns])
         layout, count = self._last, len(columns[0][1])
         if layout is None or layout.key != key or len(self._rows) != count:
@@ -91,12 +86,17 @@ class BatchPacker:
 
 
 def layout_type(text: str) -> np.dtype:
-    """The structured type of rows of the layout `text`. Raises ValueError or TypeError where it is none."""
+    """The structured type of rows of the layout `text`. Raises ValueError or TypeError when it is invalid."""
     return np.dtype([(name, dtype, tuple(shape)) for name, dtype, shape in json.loads(text)])
 
 
 def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
-    """The rows of `runs`, each structured (n,), as columns (sum of n, ...) in the order in which their names first appear."""
+    """Columns (sum of n, ...) of `runs`, each a structured array (n,); in the order in which names first appear.
+
+    Entries of ``evaluate()`` come, go and change their type while the author edits; each change is a new layout. A
+    column that every row has in one shape keeps its type. Any other column is floating point, NaN where a row lacks
+    it; rows of differing shape are flattened and padded with NaN.
+    """
     names = dict.fromkeys(name for run in runs for name in run.dtype.names or ())
     return {
         name: _column([run[name] if name in (run.dtype.names or ()) else len(run) for run in runs])
@@ -105,7 +105,7 @@ def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
 
 
 def _column(parts: Sequence[NDArray | int]) -> NDArray:
-    """Of the runs of rows that have it, and how many rows there are of those that lack it."""
+    """One column from its parts: rows, or the number of rows that lack it."""
     there = [part for part in parts if isinstance(part, np.ndarray)]
     shapes = {part.shape[1:] for part in there}
     if len(there) == len(parts) and len(shapes) == 1:
@@ -126,27 +126,26 @@ def _column(parts: Sequence[NDArray | int]) -> NDArray:
     return out
 
 
-# --- entries that are no numbers -------------------------------------------------------------------
+# --- entries of evaluate() that are not numbers ----------------------------------------------------
 #
-# A string or None seldom changes from one state to the next, so a journal gets a line where one does, and the recording's
-# description holds those lines. A library reads the descriptions of thousands of recordings for its rows, so what an
-# episode may say is bounded; an entry that says more is named as one that is not recorded further.
+# A string or None rarely changes from state to state, so the journal gets a line only where it does. These lines go
+# into the recording's description, which a library reads for thousands of recordings: their size is bounded.
 
 TEXT = "entry"
-"""Kind of a line in a journal that tells a text."""
+"""Kind of a journal entry that holds a text."""
 MOST_BYTES = 64 << 10
 """Of one episode's texts."""
 MOST_LINES = MOST_BYTES
-"""A line has a byte at least; a recording with more was not written here."""
+"""A line has at least a byte; a recording with more was not written by the workbench."""
 CUT = "not recorded from here on: it changes too often"
 
 Line = tuple[int, bytes]
-"""The state from which on a text holds, and what a journal has of it. A plain pair, since a reader of rows must not
-import what writes journals: Arrow would start a thread in the process that forks."""
+"""First state of a text, and its value in the journal. A plain pair: a reader of rows must not import the journal's
+module, since Arrow would start a thread in the process that forks."""
 
 
 class TextEntry(Struct, frozen=True, array_like=True):
-    """What one env has of an entry of ``evaluate()`` that is no number; as in `OtherEntry`."""
+    """One env's part of an entry of ``evaluate()`` that is not a number; fields as in `OtherEntry`."""
 
     what: str
     text: str
@@ -155,11 +154,11 @@ class TextEntry(Struct, frozen=True, array_like=True):
 
 
 TextTrack = tuple[tuple[int, TextEntry | None], ...]
-"""States, and what an entry was from each of them on; None where ``evaluate()`` did not return it, or as numbers."""
+"""First state and value of each change; None where ``evaluate()`` did not return the entry, or as numbers."""
 
 
 class TextWriter:
-    """What a journal is told of the texts of one episode, state by state."""
+    """Makes the journal's lines for the texts of one episode."""
 
     def __init__(self) -> None:
         self._last: dict[str, TextEntry] = {}
@@ -168,11 +167,11 @@ class TextWriter:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the state before had no texts."""
+        """Whether the previous state had no texts."""
         return not self._last
 
     def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[Line]:
-        """Lines for what is another than in the state before; `others` as in an `EpisodeRow`."""
+        """Lines for the entries that differ from the previous state; `others` as in an `EpisodeRow`."""
         if not others and not self._last:
             return []
         now = {
@@ -211,7 +210,7 @@ def tracks_of(lines: Sequence[Line]) -> dict[str, TextTrack]:
 
 
 def entry_at(track: TextTrack, state: int) -> TextEntry | None:
-    """What the entry is in this state."""
+    """The entry's value in `state`."""
     found = None
     for begin, entry in track:
         if begin > state:

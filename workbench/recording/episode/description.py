@@ -1,4 +1,4 @@
-"""What is said of an episode that is being written."""
+"""Makes the description of an episode that goes into its files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ THUMBNAIL_WIDTH = 160
 
 
 def describe(episode: Episode) -> Description:
-    """What a recording says of itself wherever it goes; of an episode with a scene."""
+    """The part of the description that is valid in any folder. `episode` must have a scene."""
     info, geometry, flags = episode.info, episode.geometry, episode.flags
     assert geometry is not None
     last = {name: bool(flag[-1]) for name, flag in flags.items()}
@@ -58,7 +58,13 @@ def describe(episode: Episode) -> Description:
 
 
 def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed: bool) -> Description:
-    """`describe`, with what is only worth saying in `folder`, where the recording lies; of which these are the other `files`."""
+    """`describe`, with what belongs into the ``.json`` alone.
+
+    Args:
+        folder: where the recording will lie.
+        files: its other two files.
+        sealed: add this installation's seal.
+    """
     info = episode.info
     source = info.source_file if info.source_file and os.path.isabs(info.source_file) else None
     description = msgspec.structs.replace(
@@ -73,7 +79,7 @@ def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed:
 
 
 def _sample(episode: Episode) -> bytes | None:
-    """Its last picture (JPEG), of a camera for people if there is one."""
+    """Its last picture (JPEG), from a human-render camera if there is one."""
     seen = [camera for camera in episode.cameras if camera.rgb is not None]
     if not seen:
         return None
@@ -82,7 +88,7 @@ def _sample(episode: Episode) -> bytes | None:
 
 
 def thumbnail(picture: bytes | None) -> str | None:
-    """`picture` (JPEG), small, in base64."""
+    """`picture` (JPEG) scaled down, in base64."""
     if picture is None:
         return None
     with Image.open(io.BytesIO(picture)) as image:
@@ -94,7 +100,7 @@ def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnType]:
 
 
 def _relative(path: str, folder: str) -> str:
-    """Where a source file lies as seen from the task's: the folders above it are nobody's business."""
+    """`path` relative to `folder`: a recording must not publish the folders above the task's."""
     if not folder:
         return os.path.basename(path)
     return os.path.relpath(path, folder)

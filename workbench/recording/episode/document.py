@@ -1,9 +1,4 @@
-"""The ``.json`` of a recording: ManiSkill's words for an episode, and ours under the key ``workbench``.
-
-A library of thousands of episodes lists them by this alone, and whoever reads one back learns from `Description` what neither of the
-other two files keeps: the types of the entries of ``evaluate()``, the names and kinds of bodies, the lenses of cameras. The ``.rrd``
-holds it as well. Anybody may have written such a file: it is read up to a size, and each field is of its type or named by its path.
-"""
+"""The ``.json`` of a recording: ManiSkill's fields, ours under the key ``workbench``; checksums, tags and notes."""
 
 from __future__ import annotations
 
@@ -38,21 +33,21 @@ MOST_BYTES = 64 << 20
 """ManiSkill's ``.json`` of 100,000 episodes has 40 MB."""
 _BLOCK = 1 << 20
 MOST_PARTS = 40
-"""Folders in the place of a task that are looked for: the place is what a recording says."""
+"""Parts of a recorded path that are tried: the path comes from an untrusted file."""
 
 T = TypeVar("T")
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Vector = tuple[float, float, float]
 ColumnType = tuple[str, tuple[int, ...]]
-"""numpy's type, and the shape of one row."""
+"""numpy dtype, and shape of one row."""
 
 
 class WrongDocument(ValueError):
-    """No JSON that can be read, or a field is missing or of another type; the message goes on from the file's name."""
+    """Unreadable JSON, or a field that is missing or of another type; the message follows the file's name."""
 
 
 class CameraJson(Struct, frozen=True):
-    """A camera's lens; where its config stands in the source is of no use to another day."""
+    """A camera's parameters, without its position in the task's source."""
 
     name: str
     kind: CameraKind
@@ -87,21 +82,25 @@ class SceneJson(Struct, frozen=True):
 
 
 class Checksum(Struct, frozen=True):
-    """Of a file, as it was written."""
+    """Size and hash of a file as it was written."""
 
     size: int = msgspec.field(name="bytes")
     xxh3_128: str | None = None
 
 
 class SealJson(Struct, frozen=True):
-    """Of the installation that recorded it (`made_here`)."""
+    """Seal of the installation that recorded the episode (`made_here`)."""
 
     content: str
     place: str
 
 
 class Description(Struct, frozen=True, kw_only=True):
-    """What a recording says of itself. What has a default may lack."""
+    """Metadata of a recording, in the ``.json`` and in the ``.rrd``; fields with a default may be missing.
+
+    A library lists thousands of episodes by this alone. It also holds what the ``.rrd`` and ``.h5`` do not: types of
+    the entries of ``evaluate()``, names and kinds of bodies, camera parameters.
+    """
 
     format: int = FORMAT
     # Up to `source_hash` as in `EpisodeInfo`.
@@ -109,7 +108,7 @@ class Description(Struct, frozen=True, kw_only=True):
     task: str
     env_index: Whole
     seed: Whole | None
-    """None where it is not known."""
+    """None if unknown."""
     control_dt: float
     control_mode: str | None
     backend: str
@@ -123,14 +122,14 @@ class Description(Struct, frozen=True, kw_only=True):
     source_file: str | None
     """The name of the task's file."""
     source: dict[str, str] | None
-    """Path as seen from the task's file, to text. None in the ``.rrd``, which holds the texts besides."""
+    """Path relative to the task's folder, to text. None in the ``.rrd``, which holds the texts separately."""
     side_files: dict[str, str] = {}
-    """What else the task reads and is not held here: path as seen from the task's file, to hash."""
+    """Other files that the task reads, not included: path relative to the task's folder, to hash."""
     acted_by: ActedBy = ()
     length: Whole
     total_reward: float = msgspec.field(name="return")
     success: bool | None
-    """Of the last state; None where the task has no such entry. The same of the other three."""
+    """In the last state (`success_once`: in any). None if the task has no such entry."""
     success_once: bool | None
     fail: bool | None
     fail_once: bool | None
@@ -142,22 +141,22 @@ class Description(Struct, frozen=True, kw_only=True):
     batch: dict[str, ColumnType] = {}
     """Numbers that ``evaluate()`` returned without a row for each env."""
     texts: dict[str, TextTrack] = {}
-    """Entries of ``evaluate()`` that are no numbers."""
+    """Entries of ``evaluate()`` that are not numbers."""
     obs: dict[str, ColumnType]
-    # In the .json alone:
+    # Only in the .json:
     files: dict[str, Checksum] | UnsetType = UNSET
-    """By suffix, the other two files."""
+    """Suffix of the other two files to checksum."""
     source_path: str | None | UnsetType = UNSET
-    """Where the task's file lies as seen from the recording's folder."""
+    """Path of the task's file relative to the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
     """Base64 of a JPEG; None without cameras."""
     made_here: SealJson | None | UnsetType = UNSET
-    """None where the installation could make no seal."""
+    """None when no seal could be made."""
     tags: list[str] | UnsetType = UNSET
     note: str | UnsetType = UNSET
 
     def info(self, folder: Path | None = None) -> EpisodeInfo:
-        """Of a recording in `folder`; without it the task's own file is not looked for."""
+        """The episode's info; the task's file is searched for only when the recording's `folder` is given."""
         found = None if folder is None else task_file(self.source_path or None, self.task, folder)
         made = self.made_here or None
         files = as_json(self.files or {})
@@ -174,18 +173,18 @@ SHARED = (
     "id", "task", "env_index", "control_dt", "control_mode", "backend", "versions", "env_kwargs", "reset_options",
     "max_episode_steps", "written_at", "recovered", "source_hash", "side_files", "acted_by",
 )  # fmt: skip
-"""What `EpisodeInfo` and `Description` say alike."""
+"""Fields that `EpisodeInfo` and `Description` share."""
 
 
 class ResetJson(Struct, frozen=True):
-    """How ManiSkill says that an episode was begun."""
+    """Arguments of the reset, as ManiSkill records them."""
 
     seed: Whole | list[Whole] | None = None
     options: dict[str, Any] | None = None
 
 
 class EpisodeJson(Struct, frozen=True):
-    """An episode in ManiSkill's words; an env of several says a list of one where others say a number."""
+    """An episode as ManiSkill records it; batched envs write a list of one instead of a number."""
 
     episode_id: int
     episode_seed: Whole | list[Whole] | None = None
@@ -204,7 +203,7 @@ class EpisodeJson(Struct, frozen=True):
 
 
 class EnvJson(Struct, frozen=True):
-    """How ManiSkill makes the env again."""
+    """Arguments of ``gym.make``, as ManiSkill records them."""
 
     env_id: str | None = None
     env_kwargs: dict[str, Any] | None = None
@@ -213,7 +212,7 @@ class EnvJson(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Document:
-    """A ``.json`` that may be a recording's. Its parts are checked when they are asked for."""
+    """A ``.json`` that may belong to a recording. Its parts are checked on access."""
 
     data: Mapping[str, Any]
 
@@ -226,7 +225,7 @@ class Document:
         return isinstance(self.data.get("episodes"), list)
 
     def description(self) -> Description:
-        """Of a recording of ours. Raises WrongDocument."""
+        """Description of a workbench recording. Raises WrongDocument."""
         return _typed(self.data.get("workbench"), Description, "workbench")
 
     def env(self) -> EnvJson:
@@ -234,12 +233,12 @@ class Document:
         return _typed(self.data.get("env_info") or {}, EnvJson, "env_info")
 
     def episode(self, number: int) -> EpisodeJson:
-        """Of a file of ManiSkill's. Raises WrongDocument."""
+        """Entry `number` of ManiSkill's list of episodes. Raises WrongDocument."""
         return _typed(self.data["episodes"][number], EpisodeJson, f"episodes[{number}]")
 
     @property
     def source_type(self) -> str:
-        """What chose ManiSkill's actions; empty where it is not said."""
+        """ManiSkill's name for the source of the actions; empty if missing."""
         source = self.data.get("source_type")
         return " ".join(source.split())[:80] if isinstance(source, str) else ""
 
@@ -251,17 +250,17 @@ def read_document(path: Path) -> Document:
 
 
 def description_in(text: str, source: Mapping[str, str]) -> Description:
-    """The description in an ``.rrd``, and the texts that lie beside it there. Raises WrongDocument."""
+    """The description in an ``.rrd``, with the `source` texts that are stored separately. Raises WrongDocument."""
     data = parse_json(text)
     return _typed({**data, "source": dict(source)} if isinstance(data, dict) else data, Description, "")
 
 
 def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
-    """What a ``.json`` holds.
+    """The content of a ``.json``.
 
     Raises:
         OSError: it cannot be read.
-        WrongDocument: it is no JSON, no regular file, or much too long.
+        WrongDocument: not JSON, not a regular file, or longer than `most_bytes`.
     """
     try:
         content = read_regular_file(path, most_bytes)
@@ -275,14 +274,14 @@ def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
 def parse_json(content: bytes | str) -> Any:
     """Raises WrongDocument."""
     try:
-        # Not msgspec's own, which refuses the NaN that a sum of rewards may be.
+        # msgspec's parser refuses NaN, which a sum of rewards may be.
         return json.loads(content)
     except (ValueError, RecursionError) as error:
         raise WrongDocument("is not JSON, or was cut short") from error
 
 
 def json_text(value: object, indent: int | None = None) -> str:
-    """`value`, which may hold words, as JSON."""
+    """`value`, which may contain Structs, as JSON."""
     return json.dumps(value, indent=indent, default=_plain)
 
 
@@ -292,7 +291,7 @@ def as_json(value: object) -> Any:
 
 
 def fields_of(words: Struct) -> dict[str, Any]:
-    """Those that are said, by the names that they have in the file."""
+    """The fields that are set, by their names in the file."""
     held = ((field.encode_name, getattr(words, field.name)) for field in msgspec.structs.fields(words))
     return {name: value for name, value in held if value is not UNSET}
 
@@ -315,10 +314,10 @@ def _typed(data: object, kind: type[T], place: str) -> T:
 
 
 def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
-    """The task's own file, where `source_path` leads to from the recording's `folder`; None where it is not found.
+    """The task's file at `source_path` relative to the recording's `folder`; None if it is not found.
 
-    A recording that was copied elsewhere has not taken its task along, and is mostly looked at from where that lies: so the end
-    of the path is looked for below the present folder and those above the recording as well. There the file has to name the task.
+    A copied recording has lost that path and is mostly opened from the task's own folder. So the end of the path is
+    also tried below the current folder and the folders above the recording; such a file must contain the task's name.
     """
     if not source_path:
         return None
@@ -338,20 +337,18 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     return None
 
 
-# --- whether a file of a recording is as it was written ---------------------------------------------
+# --- checksums --------------------------------------------------------------------------------------
 #
-# Neither format notices a changed byte: HDF5 has a checksum for chunks alone, which most columns of an episode are too small
-# to be, and costs whoever reads; rerun takes what a chunk's bytes say. An episode judged again from such a file is wrong without
-# a word. So the `.json` says how long each of the other two is and what it hashes to: both are in the system's memory when they
-# have just been written, where reading and hashing them takes a hundredth of what writing them took, and no program that reads
-# the files alone is concerned.
+# Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode are too small
+# to be chunked; rerun has none. Rescoring such a file would be silently wrong. So the `.json` holds size and hash of the
+# other two. Both are in the page cache when just written: hashing takes a hundredth of the time of writing (measured).
 #
-# It tells damage, not forgery: who changes a file can change the `.json` too. And whoever changed one on purpose
-# (`rerun rrd optimize`) takes its entry out of `workbench.files` in the `.json`, and is believed.
+# This detects damage, not forgery. After an intended change (`rerun rrd optimize`), remove the file's entry from
+# `workbench.files` in the `.json`.
 
 
 def checksum(path: Path) -> Checksum:
-    """Of the file at `path`. Raises OSError."""
+    """Checksum of the file at `path`. Raises OSError."""
     hashed = xxhash.xxh3_128()
     size = 0
     with open_regular_file(path) as file:
@@ -362,26 +359,30 @@ def checksum(path: Path) -> Checksum:
 
 
 def check(path: Path, checksums: Mapping[str, Checksum]) -> None:
-    """Compare the file at `path` with what its ``.json`` says of files of its suffix, if it says anything.
+    """Compare the file at `path` with the checksum of its suffix, if there is one.
 
     Raises:
-        OSError: it is another, and how; or it cannot be read.
+        OSError: it differs, or cannot be read.
     """
     if (why := wrong_size(checksums, path.suffix, path.stat().st_size)) is not None:
         raise OSError(why)
     written = checksums.get(path.suffix)
     if written is not None and written.xxh3_128 is not None and checksum(path) != written:
-        raise OSError("its checksum is not the one that was written down with it")
+        raise OSError("its checksum differs from the recorded one")
 
 
 def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str | None:
-    """What is wrong with a file that is `size` bytes long; None for nothing."""
+    """Problem with a file of `size` bytes; None if it has the recorded size."""
     if suffix not in checksums or checksums[suffix].size == size:
         return None
     return f"it has {size} bytes, and had {checksums[suffix].size}"
 
 
-# --- tags and notes ----------------------------------------------------------------------------
+# --- tags and notes -----------------------------------------------------------------------------------
+#
+# They are the only part of a library that a person typed, and the index is discarded without asking, so they lie with
+# the recordings: in the `.json` of ours; of other programs' files, which they rewrite themselves (ManiSkill's recorder
+# after each episode), in `NAME.notes`, which `mv NAME.*` moves along.
 
 
 MOST_NOTES_BYTES = 16 << 20
@@ -390,8 +391,7 @@ _NOTES = "workbench_notes"
 
 
 def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes``; what is not
-    one holds none."""
+    """Tags and note by trajectory ("" in a file without trajectories) of a ``.notes``; empty if it cannot be read."""
     try:
         return _notes(path)
     except (OSError, ValueError):
@@ -399,11 +399,11 @@ def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note: str) -> None:
-    """Put tags and note of one trajectory into a ``.notes``; without any left, the file goes.
+    """Write tags and note of one trajectory into a ``.notes``; delete the file when none are left.
 
     Raises:
         OSError: the file cannot be read, or the folder not written to.
-        ValueError: there is something else in the file, which is not written over. The message is a sentence's end.
+        ValueError: the file holds something else, which is not overwritten. The message ends a sentence.
     """
     try:
         entries = _notes(path)
@@ -432,17 +432,17 @@ def _notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None:
-    """Put tags and note into the ``.json`` of a recording of ours.
+    """Write tags and note into the ``.json`` of a workbench recording, by replacing the file at once.
 
     Raises:
         OSError: it cannot be read or written.
-        ValueError: it is no recording of ours. The message is the end of a sentence.
+        ValueError: it is not a workbench recording. The message ends a sentence.
     """
     described = read_json(path, MOST_NOTES_BYTES)
     if not isinstance(described, dict) or not Document(described).is_ours:
         raise ValueError("is not a recording of the workbench")
     described["workbench"] |= {"tags": list(tags), "note": note}
-    # Indented as what was read: these files are looked at.
+    # Keep the indentation: people read these files.
     with open_regular_file(path) as file:
         indent = 2 if b"\n" in file.read(4) else None
     replace_file(path, json.dumps(described, indent=indent).encode())

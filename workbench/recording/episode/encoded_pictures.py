@@ -1,18 +1,4 @@
-"""Pictures as they lie in a file: encoded when they are taken, and decoded one at a time when somebody looks.
-
-An episode of ten thousand steps with four cameras is forty thousand pictures, a few hundred megabytes encoded and
-several gigabytes as arrays. So nothing but the picture on screen is ever an array, and the same bytes
-go from the camera through the journal into the recording and out of it again.
-
-Colour is JPEG. Depth is 16-bit PNG in whole millimetres, which is what ManiSkill itself measures in. Segmentation is 16-bit PNG
-of ids; ids that 16 bits do not hold are the four bytes of an RGBA PNG.
-
-A step has two pictures of 16-bit numbers a camera. Libraries try five filters on each line of a PNG and keep the one that looks best,
-one byte at a time: 0.2 to 0.5 ms for 128 x 128, more than all else that the step is recorded with. Here every line is the difference to
-the one above, which is what surfaces want, in one numpy call: a fifth of the time; the files come out smaller besides, and zlib lets
-other threads run meanwhile. The format is that of the PNG specification (third edition): signature, IHDR, one IDAT, IEND, each chunk
-with its length and CRC-32 (section 5); filter type 2, "up", before each line (section 9); numbers with the high byte first (7.1).
-"""
+"""Encodes and decodes camera pictures: JPEG for colour, 16-bit PNG for depth and segmentation."""
 
 from __future__ import annotations
 
@@ -39,23 +25,28 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE = 0
 _UP = 2
 _LEVEL = 3
-"""Of zlib. The fastest level makes files no smaller and takes longer on smooth depth (measured); the usual 6 takes three times as long."""
+"""Of zlib. Level 1 makes no smaller files and takes longer on smooth depth; the default 6 takes three times as long
+(measured)."""
 
 
 @dataclass(frozen=True)
 class EncodedPictures:
-    """What one camera saw in one modality; ``pictures[i]`` decodes picture `i`."""
+    """Pictures of one camera in one modality; ``pictures[i]`` decodes picture `i`.
+
+    Ten thousand steps with four cameras are a few hundred megabytes encoded and several gigabytes as arrays, so
+    pictures stay encoded from the camera through the journal into the recording, and only a shown one is decoded.
+    """
 
     modality: Modality
     blobs: Sequence[bytes]
     decoded: Callable[[int], NDArray] | None = None
-    """Gives the picture of a number where it is decoded elsewhere; raises OSError."""
+    """Returns picture `i` decoded, when another process decodes it; raises OSError."""
 
     def __len__(self) -> int:
         return len(self.blobs)
 
     def blob(self, index: int) -> bytes:
-        """Picture `index` as it is kept: JPEG (rgb), 16-bit PNG in millimetres (depth), PNG of ids (segmentation)."""
+        """Picture `index` encoded: JPEG (rgb), 16-bit PNG in millimetres (depth), PNG of ids (segmentation)."""
         return self.blobs[index]
 
     def __getitem__(self, index: int) -> NDArray:
@@ -63,7 +54,7 @@ class EncodedPictures:
 
         Raises:
             IndexError: there is no such picture.
-            OSError: its bytes are no picture.
+            OSError: it cannot be decoded.
         """
         if self.decoded is not None:
             return self.decoded(range(len(self))[index])
@@ -71,10 +62,10 @@ class EncodedPictures:
 
 
 class LazyPictures(Sequence[bytes]):
-    """Encoded pictures of which each is had when it is asked for; slices are lists."""
+    """Encoded pictures that are read on access; slices are lists."""
 
     def __init__(self, count: int, one: Callable[[int], bytes]) -> None:
-        """`one` gives the picture of a number, which is one of them; it may raise OSError."""
+        """`one` returns picture `i`, 0 <= i < count; it may raise OSError."""
         self._count, self._one = count, one
 
     def __len__(self) -> int:
@@ -86,7 +77,7 @@ class LazyPictures(Sequence[bytes]):
 
 
 def encode(modality: Modality, picture: NDArray) -> bytes:
-    """`picture` as in ``EncodedPictures.__getitem__``; depth may be whole millimetres, none of them below 0."""
+    """Encode `picture`, shaped as in ``EncodedPictures.__getitem__``; depth may be integer millimetres >= 0."""
     if modality == "rgb":
         return encode_jpeg(picture)
     if modality == "depth":
@@ -95,7 +86,7 @@ def encode(modality: Modality, picture: NDArray) -> bytes:
 
 
 def decode(modality: Modality, blob: bytes) -> NDArray:
-    """The inverse of `encode`, as far as JPEG and whole millimetres allow. Raises OSError where `blob` is no picture."""
+    """The inverse of `encode`, up to the loss of JPEG and whole millimetres. Raises OSError when it cannot be decoded."""
     with open_picture(blob) as image:
         if modality == "rgb":
             return np.array(image.convert("RGB"))
@@ -109,7 +100,7 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """A JPEG or PNG of at most `MOST_PIXELS`, not decoded yet. Raises OSError where it is none, also from the block."""
+    """Open a JPEG or PNG of at most `MOST_PIXELS`. Raises OSError when it is invalid, also while the block decodes it."""
     try:
         with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG")) as image:
             if image.width * image.height > MOST_PIXELS:
@@ -122,14 +113,14 @@ def open_picture(blob: bytes) -> Iterator[Image.Image]:
 
 
 def encode_jpeg(image: NDArray[np.uint8]) -> bytes:
-    """(H, W, 3) as JPEG, colour at full resolution (the edges of small pictures blur otherwise)."""
+    """(H, W, 3) as JPEG with colour at full resolution: subsampled colour blurs the edges of small pictures."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     return buffer.getvalue()
 
 
 def small_jpeg(image: Image.Image, longest: int) -> bytes:
-    """`image`, no side of it longer than so many pixels."""
+    """`image` as JPEG, scaled down until no side is longer than `longest` pixels."""
     small = image.convert("RGB")
     small.thumbnail((longest, longest))
     buffer = io.BytesIO()
@@ -140,15 +131,15 @@ def small_jpeg(image: Image.Image, longest: int) -> bytes:
 def encode_depth_png(depth: NDArray[np.float32]) -> bytes:
     """(H, W) metres as 16-bit PNG in millimetres.
 
-    What is not a distance (NaN, infinite, behind the camera) becomes 0, "nothing"; 65.535 m is the
-    farthest that 16 bits hold, and what is farther stays there.
+    NaN, infinite and negative values become 0, "nothing"; distances beyond 65.535 m, the farthest that 16 bits hold,
+    become 65.535 m.
     """
     millimetres = np.nan_to_num(depth * MILLIMETRES_PER_METRE, nan=0.0, posinf=0.0, neginf=0.0)
     return encode_png16(np.rint(np.clip(millimetres, 0, 0xFFFF)).astype(np.uint16))
 
 
 def encode_segmentation_png(ids: NDArray[np.int32]) -> bytes:
-    """(H, W) ids as 16-bit PNG, or as RGBA where one of them is negative or beyond 65535."""
+    """(H, W) ids as 16-bit PNG, or as the four bytes of RGBA when one of them is negative or beyond 65535."""
     if ids.min() >= 0 and ids.max() <= 0xFFFF:
         return encode_png16(ids.astype(np.uint16))
     buffer = io.BytesIO()
@@ -158,7 +149,15 @@ def encode_segmentation_png(ids: NDArray[np.int32]) -> bytes:
 
 
 def encode_png16(pixels: NDArray[np.uint16]) -> bytes:
-    """(H, W), both above 0, as greyscale PNG of 16 bits."""
+    """(H, W), both above 0, as greyscale PNG of 16 bits.
+
+    Libraries try five filters per line, byte by byte: 0.2 to 0.5 ms for 128 x 128, more than everything else that
+    recording a step costs, and a step has two such pictures per camera. Here every line is the difference to the one
+    above, in one numpy call: a fifth of the time, smaller files, and zlib releases the interpreter's lock.
+
+    PNG specification (third edition): signature, IHDR, one IDAT, IEND, each chunk with its length and CRC-32
+    (section 5); filter type 2, "up", before each line (section 9); numbers big-endian (7.1).
+    """
     height, width = pixels.shape
     lines = pixels.astype(">u2").view(np.uint8).reshape(height, 2 * width)
     filtered = np.empty((height, 1 + 2 * width), np.uint8)

@@ -1,10 +1,4 @@
-"""One episode of one env, as columns: what every file of it is written from, and what reading one gives.
-
-Rerun takes columns forty times faster than calls a step (measured), ManiSkill's own format is columns
-too, and a review, a replay and a dataset all ask for whole columns. Only pictures are not plain arrays:
-an hour of four cameras is more than a machine holds, so they stay encoded until one is looked at
-(`EncodedPictures`).
-"""
+"""One episode of one env as columns."""
 
 from __future__ import annotations
 
@@ -29,34 +23,34 @@ def _now() -> str:
 
 
 NO_SEED = -1
-"""An episode's seed where it has none: it began wherever the random generators stood."""
+"""Seed of an episode that was begun without one."""
 
 
 @dataclass(frozen=True)
 class Seal:
-    """What a recording that was read says of who made it; only `made_here` knows whether it is true."""
+    """The seal that a recording claims; `made_here` checks it."""
 
     content: str
     place: str
     main: Any
-    """The name of the task's file as it was described."""
+    """Recorded name of the task's file."""
     files: Any
-    """What the other files hash to."""
+    """Recorded checksums of the other files."""
 
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """What is needed to know an episode again, and to make it again."""
+    """Identity of an episode, and what is needed to make it again."""
 
     task: str
     env_index: int
     seed: int
-    """Episode seed; `NO_SEED` where none was given, or it is not known."""
+    """Episode seed; `NO_SEED` when none was given or it is unknown."""
     source_file: str | None
-    """The task's own file. Of a recording that was read: its path where it is still there, else its name alone."""
+    """The task's file. When read from a recording: its path if the file exists, else its name alone."""
     source_hash: str
     source: dict[str, str]
-    """Path to text of the task's own files; of a recording that was read, paths as seen from `source_file`'s folder."""
+    """Path to text of the task's Python files; when read from a recording, relative to `source_file`'s folder."""
     control_dt: float
     """Seconds of simulated time per step."""
     control_mode: str | None
@@ -64,29 +58,28 @@ class EpisodeInfo:
     versions: dict[str, str] = field(default_factory=dict)
     """Package name to version."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keywords of ``gym.make`` that make this env (``robot_uids``, ``obs_mode``, ``control_mode`` ...), as JSON can say
-    them."""
+    """Keywords of ``gym.make`` for this env (``robot_uids``, ``obs_mode``, ``control_mode`` ...), as JSON values."""
     reset_options: dict[str, Any] = field(default_factory=dict)
     """``options`` of the reset that began the episode."""
     max_episode_steps: int | None = None
     written_at: str = field(default_factory=_now)
     """When it was recorded, ISO 8601 in UTC."""
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
-    """Unique for ever, whatever the files are called."""
+    """Globally unique, independent of file names."""
     recovered: bool = False
-    """Its writer ended in the middle; the episode is cut where that was."""
+    """Its writer was killed; the episode ends there."""
     side_files: dict[str, str] = field(default_factory=dict)
-    """What else the task reads, and the recording does not hold: path as seen from `source_file`'s folder, to hash."""
+    """Other files that the task reads and the recording lacks: path relative to `source_file`'s folder, to hash."""
     acted_by: tuple[tuple[int, str], ...] = ()
-    """What chose the actions: number of an action, and what it was from that one on (``random``, ``policy act.py:act``).
-    Empty where it is not known."""
+    """Source of the actions: index of its first action, and its name (``random``, ``policy act.py:act``). Empty if
+    unknown."""
     seal: Seal | None = field(default=None, compare=False)
-    """Of a recording that was read."""
+    """Set when read from a recording."""
 
 
 @dataclass
 class CameraTrack:
-    """What one camera saw over the episode; P pictures, normally one a state (P = T + 1)."""
+    """P pictures of one camera, normally one per state (P = T + 1)."""
 
     info: CameraInfo
     frame: NDArray[np.int64]
@@ -99,12 +92,12 @@ class CameraTrack:
 
     @property
     def pictures(self) -> dict[Modality, EncodedPictures]:
-        """Those that it has."""
+        """The modalities that it has."""
         return {m: held for m in MODALITIES if (held := getattr(self, m)) is not None}
 
 
 def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
-    """What people know each by: its name, after which ``_human`` follows where a sensor has the same."""
+    """A unique name for each camera: its own, with ``_human`` appended when a sensor has the same name."""
     names = [""] * len(cameras)
     for index in sorted(range(len(cameras)), key=lambda index: cameras[index].kind != "sensor"):
         name = cameras[index].name or "unnamed"
@@ -116,12 +109,12 @@ def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
 
 @dataclass(frozen=True)
 class BrokenFile:
-    """A file of a recording that is broken."""
+    """A broken file of a recording."""
 
     file: str
     """Its name."""
     what: str
-    """How it is broken, and what it would have held: goes on from its name to a sentence."""
+    """What is wrong and what is missing; follows the name in a sentence."""
 
     @property
     def sentence(self) -> str:
@@ -130,11 +123,15 @@ class BrokenFile:
 
 @dataclass
 class Episode:
-    """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1."""
+    """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1.
+
+    Whole columns, since every format and every reader wants them; rerun takes columns forty times faster than one call
+    per step (measured). Only pictures are not plain arrays: an hour of four cameras does not fit into memory.
+    """
 
     info: EpisodeInfo
     geometry: SceneGeometry | None
-    """Of this env alone (one env, index 0) where it was read from a recording; None where a recording holds no scene."""
+    """When read from a recording: of this env alone, as env 0 of 1; None if the recording holds no scene."""
     segmentation: dict[int, str]
     poses: NDArray[np.float32] | None
     """(T + 1, B, 7) position and wxyz of every body; NaN rows for bodies this env lacks. None without a scene."""
@@ -148,19 +145,19 @@ class Episode:
     truncated: NDArray[np.bool_]
     """(T,)"""
     evaluate: dict[str, NDArray]
-    """(T + 1, ...) every entry of ``evaluate()`` with a row for each env; ``success`` and ``fail`` are among them if the task has them, and the
-    terms of the reward under ``reward_terms/`` if it names any. NaN where a state lacks an entry."""
+    """(T + 1, ...) each entry of ``evaluate()`` that has a row per env, with ``success`` and ``fail`` if the task has
+    them, and the terms of the reward under ``reward_terms/``. NaN where a state lacks an entry."""
     cameras: list[CameraTrack]
     env_states: dict[str, NDArray] = field(default_factory=dict)
     """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
     obs: dict[str, NDArray] = field(default_factory=dict)
-    """State observations flattened by ``/``, each (T + 1, ...); no pictures. The key of one that was no dict is ``""``."""
+    """State observations without pictures, (T + 1, ...) each; nested keys joined by ``/``, ``""`` if not a dict."""
     batch: dict[str, NDArray] = field(default_factory=dict)
-    """(T + 1, ...) the numbers that ``evaluate()`` returned of the whole batch."""
+    """(T + 1, ...) numbers that ``evaluate()`` returned for the whole batch."""
     texts: dict[str, TextTrack] = field(default_factory=dict)
-    """Its entries that are no numbers."""
+    """Entries of ``evaluate()`` that are not numbers."""
     broken_files: tuple[BrokenFile, ...] = ()
-    """Of a recording that was read: its files that are broken."""
+    """Set when read from a recording."""
 
     @property
     def length(self) -> int:
@@ -168,19 +165,18 @@ class Episode:
         return len(self.reward)
 
     def flag(self, name: str) -> NDArray[np.bool_] | None:
-        """(T + 1,) of an entry of ``evaluate()`` that is one truth a state, NaN where it lacks it; None where it is another,
-        or not there."""
+        """(T + 1,) of an entry of ``evaluate()`` with one value per state, False where it is NaN; None if there is none."""
         values = self.evaluate.get(name)
         return None if values is None or values.ndim != 1 else np.nan_to_num(values.astype(np.float64)) != 0
 
     @property
     def flags(self) -> dict[str, NDArray[np.bool_]]:
-        """(T + 1,) ``success`` and ``fail``, those that the task has."""
+        """(T + 1,) ``success`` and ``fail``, if the task has them."""
         found = {name: self.flag(name) for name in ("success", "fail")}
         return {name: flag for name, flag in found.items() if flag is not None}
 
     def others_at(self, state: int) -> dict[str, OtherEntry]:
-        """What ``evaluate()`` returned in this state besides `evaluate`."""
+        """Entries of ``evaluate()`` in this state that are not in `evaluate`."""
         found: dict[str, OtherEntry] = {}
         for name, values in self.batch.items():
             value = np.asarray(values[state])
@@ -188,7 +184,7 @@ class Episode:
         for name, track in self.texts.items():
             entry = entry_at(track, state)
             number = found.get(name)
-            # A state in which it was no number is NaN in the column.
+            # The column has NaN in states where the entry was not a number.
             if entry is not None and (number is None or _is_nan(number.numbers)):
                 found[name] = OtherEntry(entry.what, (entry.text,), None, entry.per_env, entry.whole)
         return found
@@ -199,7 +195,12 @@ def _is_nan(value: NDArray | None) -> bool:
 
 
 def box_of_moving(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, NDArray]:
-    """Lowest and highest corner (3,), in metres, of where the bodies (..., B, 7) are that can move; the origin where none can."""
+    """Lowest and highest corner (3,), in metres, of the positions of movable bodies; the origin if there are none.
+
+    Args:
+        poses: (..., B, 7).
+        kinds: (B,)
+    """
     points = poses[..., np.isin(np.array(kinds), ("link", "dynamic")), :3].reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -211,10 +212,10 @@ ActedBy = tuple[tuple[int, str], ...]
 
 
 def parse_acted_by(pairs: Iterable[Iterable[Any]] | None) -> ActedBy:
-    """`EpisodeInfo.acted_by` of what JSON keeps of it. Raises TypeError or ValueError."""
+    """`EpisodeInfo.acted_by` from its JSON value. Raises TypeError or ValueError."""
     return tuple((int(begin), str(what)) for begin, what in pairs or ())
 
 
 def acted_by_text(acted_by: ActedBy) -> str:
-    """``random; from step 41 on: sliders``; empty where it is not known. Action k leads to step k + 1."""
+    """``random; from step 41 on: sliders``; empty if unknown. Action k leads to step k + 1."""
     return "; ".join(what if begin == 0 else f"from step {begin + 1} on: {what}" for begin, what in acted_by)

@@ -1,10 +1,4 @@
-"""The seal of a recording: by it this installation knows what it recorded itself, also after others had it in hand.
-
-A keyed hash (HMAC-SHA256) with a key that is made once, at random, and that only this user can read. It covers what
-decides which code runs when the recording is judged or gone into (task, text, keywords), and what its files hash to
-(`document.checksum`). Tags and notes may change; a moved recording keeps it. Where the task's file lay has a hash of its own: a
-recording that comes back from elsewhere with another file beside it must not pass for the one that was open here.
-"""
+"""The seal by which this installation recognizes its own recordings."""
 
 from __future__ import annotations
 
@@ -31,16 +25,23 @@ _logged: set[str] = set()
 
 
 class MadeHere(Enum):
+    """Who made a recording, by its seal: a keyed hash (HMAC-SHA256) with a random key that only this user can read.
+
+    It covers what decides which code runs when the recording is rescored or entered (task, text, keywords), and the
+    checksums of its files. Tags and notes may change, and a moved recording keeps it. The path of the task's file has a
+    hash of its own: a recording that comes back with a different file next to it must not run that one.
+    """
+
     NO = "no"
-    """It came from elsewhere, or was changed, or the key is gone."""
+    """It came from elsewhere, was changed, or the key is lost."""
     CONTENT = "content"
-    """This installation recorded it; but its task's file lay elsewhere, or is gone."""
+    """This installation recorded it, but the task's file is at another path, or missing."""
     CONTENT_AND_PLACE = "content and place"
-    """And the file that it names now is the one that was open then (with another text, perhaps)."""
+    """And the task's file is the one that was open then, with possibly another text."""
 
 
 def seal(description: Description, source_file: str | None) -> SealJson | None:
-    """For the description `description` of a recording that is being made; None as `seal_text`.
+    """The seal for a new recording with this `description`; None as in `seal_text`.
 
     Args:
         source_file: the absolute path of the task's file.
@@ -54,7 +55,7 @@ def seal(description: Description, source_file: str | None) -> SealJson | None:
 
 
 def made_here(info: EpisodeInfo) -> MadeHere:
-    """Whether this installation made the recording that `info` was read from."""
+    """Check the seal of the recording that `info` was read from."""
     found = info.seal
     if found is None:
         return MadeHere.NO
@@ -72,25 +73,24 @@ def made_here(info: EpisodeInfo) -> MadeHere:
 
 
 def seal_text(text: str, what: str = "text") -> str | None:
-    """A seal of a text that this installation writes and reads back, such as the head of a journal; None, which is told once,
-    where there can be no key.
+    """Seal a text that this installation reads back, such as a journal's header; None, logged once, without a key.
 
     Args:
-        what: it is; a seal of something else does not fit.
+        what: kind of text; the seal is invalid for another kind.
     """
     try:
         return _mac(_key() or _new_key(), what, text)
     except OSError as error:
-        _log_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
+        _log_once(f"Recordings of this session cannot be sealed as made here: {error}")
         return None
 
 
 def is_sealed(text: str, found: object, what: str = "text") -> bool:
-    """Whether `found` is what `seal_text` gave for this here."""
+    """Whether `found` is this installation's `seal_text` of the same arguments."""
     try:
         key = _key()
     except OSError as error:
-        _log_once(f"Recordings that were made here cannot be told from others: {error}")
+        _log_once(f"Recordings cannot be checked for the seal of this installation: {error}")
         return False
     if key is None or not isinstance(found, str):
         return False
@@ -98,7 +98,7 @@ def is_sealed(text: str, found: object, what: str = "text") -> bool:
 
 
 def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequence[Sequence[Any]]) -> str:
-    """One text for what JSON reads back as the same."""
+    """The same text for values that are equal as JSON."""
     return json.dumps(as_json([values, main, files, acted_by]), sort_keys=True)
 
 
@@ -107,7 +107,7 @@ def _mac(key: bytes, what: str, text: str) -> str:
 
 
 def _key() -> bytes | None:
-    """None where there is none, or what is there is none."""
+    """None when there is none, or it is broken."""
     written = read_private(KEY_FILE)
     try:
         key = None if written is None else bytes.fromhex(written.decode("ascii"))
@@ -120,7 +120,7 @@ def _new_key() -> bytes:
     if read_private(KEY_FILE) is not None:
         broken = set_aside(KEY_FILE)
         _log_once(
-            f"The key of this installation's recordings was broken, and is {broken} now: there is a new one."
+            f"The key of this installation's recordings was broken and was moved to {broken}; there is a new one."
         )
     create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # or another process did, a moment ago
     key = _key()

@@ -1,9 +1,4 @@
-"""One line of the library: what is known of a recording without opening it.
-
-Rows are made from files that anybody may have written, edited or cut short, and from an index that another version
-may have written. So every value is checked for its type on its way in, and what is of another type is treated as not
-known. Texts are cut to a length that a table can bear.
-"""
+"""A recording before it is read: its source, and its row in the library."""
 
 from __future__ import annotations
 
@@ -15,29 +10,29 @@ from pathlib import Path
 from typing import Literal
 
 SourceKind = Literal["ours", "maniskill", "lerobot"]
-"""Who made a recording: which of the three ways to read it."""
+"""Which of the three readers opens a recording."""
 
 
 class UnreadableRecording(ValueError):
-    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
+    """A broken recording, or a file that is none; the message is a sentence that says what is wrong."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One recording, not read yet."""
+    """Where a recording is."""
 
     path: Path
     """A file of ours, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
     part: str | None = None
     """Which of several: ``traj_3``, or the number of the dataset's episode."""
     id: str = ""
-    """What the caller knows it by."""
+    """The caller's id."""
     name: str = ""
-    """For people."""
+    """Name to show."""
 
     @property
     def stem(self) -> str:
-        """Of the names of what is made from it."""
+        """Stem for the names of files that are made from it."""
         stem = self.path.name if self.kind == "lerobot" else self.path.stem
         return stem if self.part is None else f"{stem}_{self.part}"
 
@@ -56,14 +51,14 @@ MOST_TAGS = 20
 
 @dataclass(frozen=True)
 class Facts:
-    """What a file says of one recording in it. None is: not known."""
+    """Metadata of a recording, as its file states it. None is: unknown."""
 
     kind: RecordingKind
     task: str = ""
     trajectory: str | None = None
-    """Which one of the file, for a file with several (ManiSkill's), or of a LeRobot dataset."""
+    """Which recording of a file with several (ManiSkill's), or of a LeRobot dataset."""
     uid: str = ""
-    """The recording's own id; empty for files that have none."""
+    """The recording's own id; empty if it has none."""
     written: float | None = None
     """Unix seconds."""
     seed: int | None = None
@@ -72,24 +67,24 @@ class Facts:
     """Actions."""
     total_reward: float | None = None
     success: bool | None = None
-    """Of the last state; None for a task that knows no success."""
+    """In the last state; None for a task without success."""
     success_once: bool | None = None
     fail: bool | None = None
     control_mode: str = ""
     acted_by: str = ""
-    """What chose the actions, in words; empty where it is not known."""
+    """Source of the actions; empty if unknown."""
     source_hash: str = ""
-    """Empty where the task's source is not known."""
+    """Empty if unknown."""
     tags: tuple[str, ...] = ()
     note: str = ""
     recovered: bool = False
-    """It ends where its writer died."""
+    """Its writer was killed; it ends there."""
     problem: str | None = None
-    """One sentence, where something is wrong with the files."""
+    """A sentence, if something is wrong with the files."""
 
 
 LibraryEntry = tuple[Facts, bytes | None]
-"""A recording and its thumbnail (jpeg)."""
+"""A recording and its thumbnail (JPEG)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,20 +92,20 @@ class LibraryRow(Facts):
     """A recording in the table."""
 
     id: str
-    """Letters, digits and ``-``; unique in its library, and the same for as long as the recording stays in it: a
-    recording's own id, or one that is made of the place of a file that has none."""
+    """Letters, digits and ``-``; unique in its library and constant while the recording stays there: its own id, or
+    one made from its path."""
     name: str
-    """Of its files, with the folder below the library's and without suffix; and ``#traj_3`` of a file with several."""
+    """Path below the library's folder without suffix, and ``#traj_3`` for a file with several."""
     place: tuple[str, int]
-    """Key of its files (`library_scan`), and which of the recordings in them it is."""
+    """Key of its files (`scan.Found.key`), and its number among the recordings in them."""
     paths: tuple[Path, ...]
-    """Its files, the one to open it by first. All of them are what *delete* takes."""
+    """Its files, the one to open first. *Delete* takes all of them."""
     size: int
     """Bytes of `paths` together."""
 
     @property
     def source(self) -> Source:
-        """What it is read from."""
+        """Where to read it."""
         path = self.paths[0]
         if self.trajectory is not None:
             path = path.parents[1] if self.kind == "lerobot" else path.with_suffix(".h5")
@@ -124,7 +119,7 @@ class LibraryRow(Facts):
 
 
 def clean_facts(facts: Facts) -> Facts:
-    """`facts` as a table can bear them, of whichever process or version says them."""
+    """`facts` with valid types and bounded lengths: they come from a confined reader or from an older index."""
     texts = ("task", "uid", "control_mode", "acted_by", "source_hash")
     wholes = ("seed", "env_index", "length")
     return replace(
@@ -140,11 +135,11 @@ def clean_facts(facts: Facts) -> Facts:
     )
 
 
-# --- values of any type, as what they should be or not at all ---------------------------------------
+# --- values from untrusted files: converted, or None when of another type ---------------------------
 
 
 def clean_text(value: object, longest: int = 200) -> str:
-    """One line of printable characters; empty for what is no text."""
+    """One line of printable characters, cut to `longest`; empty for other types."""
     if not isinstance(value, str):
         return ""
     if len(value) <= longest and value.isprintable():
@@ -153,7 +148,7 @@ def clean_text(value: object, longest: int = 200) -> str:
 
 
 def integer(value: object) -> int | None:
-    """A whole number that fits 64 bits; lists of one number (a batched env's seed) are that number."""
+    """An integer of 64 bits; a list of one (a batched env's seed) counts as its item."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if isinstance(value, float) and value.is_integer():
@@ -175,9 +170,9 @@ def number(value: object) -> float | None:
 
 
 def total(value: object) -> float | None:
-    """A sum of rewards, NaN and infinite ones too."""
+    """A sum of rewards, which may be NaN or infinite."""
     if isinstance(value, float) and not math.isfinite(value):
-        # One object, or a row would not equal itself when it is read again.
+        # Always the same NaN object: rows are compared, and NaN equals only itself by identity.
         return math.nan if math.isnan(value) else value
     return number(value)
 
@@ -189,7 +184,7 @@ def boolean(value: object) -> bool | None:
 
 
 def unix_seconds(value: object) -> float | None:
-    """Unix seconds of an ISO date; one without a zone is UTC."""
+    """Unix seconds of an ISO date, UTC if without a zone."""
     if not isinstance(value, str):
         return None
     try:
@@ -199,12 +194,12 @@ def unix_seconds(value: object) -> float | None:
         seconds = date.timestamp()
     except (ValueError, OverflowError):
         return None
-    # What a table can show as a date; 9999 with a zone is one that it cannot.
+    # Up to the year 3000: a date in 9999 can overflow in another time zone.
     return seconds if 0 <= seconds < 32503680000 else None
 
 
 def clean_tags(values: object) -> tuple[str, ...]:
-    """At most `MOST_TAGS` words, each once, in their order; a comma parts them where they are typed."""
+    """At most `MOST_TAGS` distinct tags, in order; commas separate tags when typed, so they become spaces."""
     if not isinstance(values, Iterable) or isinstance(values, (str, bytes, Mapping)):
         return ()
     tags = (clean_text(value, LONGEST_TAG).replace(",", " ").strip() for value in values)

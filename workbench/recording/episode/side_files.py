@@ -1,15 +1,4 @@
-"""Files beside the task that are no Python: meshes, textures, tables of numbers that its code reads.
-
-A recording holds the text of the task, so that it can be made again after the file has changed. Meshes are not text,
-may be larger than all recordings together, and which of them a task reads is known to its code alone: much of it is
-opened by native libraries, where nothing can listen. So they are not taken along, but named, each with a hash, and whoever
-wants the recorded text to run again is told what else that takes, and whether it is still as it was.
-
-What is named is what the task's own text names: files and folders below the task's folder whose name stands in one of
-its strings, and what those files name in turn (a URDF its meshes). A name that the code puts together is missed,
-unless its folder is named, and a folder that is named brings files that are not read; so what is amiss with one of
-these is said, and nothing is refused for it.
-"""
+"""Names and hashes of the files besides Python that a task reads: meshes, textures, tables."""
 
 from __future__ import annotations
 
@@ -25,9 +14,9 @@ from workbench.machine.files import NotARegularFile, open_regular_file, read_reg
 
 MOST_FILES = 200
 MOST_LOOKED_AT = 5000
-"""Files below the task's folder that are looked at; who keeps a task in the home folder has more."""
+"""Files below the task's folder that are considered: it may be a home folder."""
 NAMING = (".urdf", ".xml", ".srdf", ".obj", ".mtl", ".gltf", ".dae")
-"""Ends of the names of files that name others."""
+"""Suffixes of files that name other files."""
 NAMING_BYTES = 4_000_000
 _NAMED = re.compile(r"[\w./ -]+\.\w{2,5}")
 _INSTALLED = {"site-packages", "dist-packages"}
@@ -35,10 +24,16 @@ _hashes: dict[tuple[str, int, int], str] = {}
 
 
 def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
-    """Path as seen from the task's folder, to hash.
+    """Path relative to the task's folder, to hash.
+
+    A recording holds the task's text but not its meshes, which may be larger than all recordings together. Which of
+    them the task reads cannot be observed, since native libraries open many. So this lists what the text names: files
+    and folders below the task's folder that appear in one of its strings, and what those files name in turn (a URDF its
+    meshes). A name that the code composes is missed unless its folder is named, and a named folder includes unread
+    files; so a change here is reported and never refused.
 
     Args:
-        task: the task's own file; of an installed package nothing is named, since its version says it.
+        task: the task's file; an installed package gives nothing, since its version identifies its files.
         source: texts of its Python files.
     """
     if task is None or not os.path.isabs(task) or _INSTALLED & set(Path(task).parts):
@@ -54,13 +49,13 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
         try:
             found[name] = hash_of(below[name])
             wanted += sorted(_named(below, _names_in(below[name])) - {name})
-        except OSError:  # gone in this moment, or not ours to read: then the task cannot read it either
+        except OSError:  # removed meanwhile, or not readable for the task either
             continue
     return dict(sorted(found.items()))
 
 
 def hash_of(path: Path) -> str:
-    """Twelve characters. Raises OSError."""
+    """Twelve hex digits of SHA-256. Raises OSError."""
     stat = path.stat()
     key = (os.fspath(path), stat.st_mtime_ns, stat.st_size)
     if key not in _hashes:
@@ -71,11 +66,11 @@ def hash_of(path: Path) -> str:
 
 
 def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
-    """A sentence on what the recorded text needs besides, and how that is now; empty for nothing.
+    """A sentence on the files that the recorded task needs and their present state; empty if there are none.
 
     Args:
-        task: its file, where that is still there.
-        recorded: of `side_files`.
+        task: its file, if it exists.
+        recorded: result of `side_files`.
     """
     if not recorded:
         return ""
@@ -89,7 +84,7 @@ def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
 
 
 def _changed_files(folder: Path | None, recorded: Mapping[str, str]) -> dict[str, str]:
-    """Those of `recorded` that are not as they were, and what is with them."""
+    """Files of `recorded` that differ now, each with the difference."""
     changed = {}
     for name, hashed in recorded.items():
         path = side_file_path(folder, name)
@@ -104,12 +99,12 @@ def _changed_files(folder: Path | None, recorded: Mapping[str, str]) -> dict[str
 
 
 def folder_of(task: str | None) -> Path | None:
-    """The folder of a task's file, where the file is known and there."""
+    """The folder of a task's file; None if the file is unknown or missing."""
     return Path(task).parent if task is not None and os.path.isabs(task) and os.path.isfile(task) else None
 
 
 def side_file_path(folder: Path | None, name: str) -> Path | None:
-    """Where a side file is; None where that is nowhere, or above the folder: a recording is somebody else's file."""
+    """Path of a side file; None for a name that leaves `folder`: names come from untrusted recordings."""
     pure = PurePosixPath(name)
     if folder is None or pure.is_absolute() or ".." in pure.parts or not pure.parts:
         return None
@@ -119,7 +114,7 @@ def side_file_path(folder: Path | None, name: str) -> Path | None:
 def _files_below(folder: Path) -> Iterator[Path]:
     looked_at = 0
     for root, folders, names in os.walk(folder):
-        # A .json or .h5 with a .rrd of its name beside it is a recording.
+        # A .json or .h5 with a .rrd of the same name is a recording.
         folders[:] = sorted(f for f in folders if not f.startswith((".", "__")) and f != "recordings")
         recordings = {name[:-4] for name in names if name.endswith(".rrd")}
         for name in sorted(names):
@@ -132,7 +127,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def _strings(texts: Iterable[str]) -> set[str]:
-    """What stands in the strings of these programs, docstrings left out; of one that does not parse, nothing."""
+    """String constants of these programs without docstrings; none from one that does not parse."""
     found: set[str] = set()
     for text in texts:
         try:
@@ -158,7 +153,7 @@ def _names_in(path: Path) -> set[str]:
 
 
 def _named(below: Mapping[str, Path], strings: Iterable[str]) -> set[str]:
-    """Of the files below, those that one of the strings names: by the end of its path, or by a folder that it is in."""
+    """The files of `below` that one of the strings names, by the end of their path or by a folder above them."""
     names = {string.strip().strip("/").removeprefix("./") for string in strings}
     names = {name for name in names if name and "\n" not in name}
     lasts = {PurePosixPath(name).name for name in names}

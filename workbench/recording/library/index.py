@@ -1,15 +1,4 @@
-"""What was read of a library's files, kept so that thousands of them are there at once the next time.
-
-The index is a cache and nothing else: all that it holds can be read again from the files, so whatever is wrong with it
-(cut short, a page of garbage, no place to write) is answered by throwing it away, never by an error.
-For each name it keeps its files as they were, the rows that they gave, and their thumbnails. It is SQLite, since
-that bears two processes at once and being killed; each write is one short transaction. A process that finds the file
-locked for long goes on without having written.
-
-It lies in the user's cache folder, and where that cannot be written in memory, for this time. Not in the library's folder: one that
-came from elsewhere would bring an index along, and SQLite does what a file says (it may be a link to another program's
-database, which would be given our tables, or have a journal that names files to delete).
-"""
+"""A cache of a library's rows and thumbnails, in SQLite."""
 
 from __future__ import annotations
 
@@ -33,12 +22,12 @@ from workbench.recording.reader.scan import Found
 log = logging.getLogger(__name__)
 
 VERSION = 5
-"""Raised whenever rows are read or kept in another way; each version has a file of its own."""
+"""Increase it when the content or the format of rows changes; each version has its own file."""
 LOCKED_SECONDS = 3.0
 MOST_INDICES = 200
-"""Of folders that were looked into."""
+"""Indices that are kept."""
 _ROWS = msgspec.msgpack.Decoder(tuple[dict[str, int], dict[str, int], list[Facts]])
-"""Sizes and times of the files, and what they gave."""
+"""Sizes and times of the files, and their rows."""
 _JPEGS = msgspec.msgpack.Decoder(list[bytes | None])
 _TABLES = ("read (key BLOB PRIMARY KEY, rows BLOB)", "pictures (key BLOB PRIMARY KEY, jpegs BLOB)")
 T = TypeVar("T")
@@ -46,14 +35,22 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Kept:
-    """What the files of one name gave when they were so."""
+    """The rows of the files of one name, and the sizes and times at which they were read."""
 
     found: Found
     rows: tuple[Facts, ...]
 
 
 class LibraryIndex:
-    """The index of one folder. Safe to use from several threads."""
+    """The index of one folder; thread-safe. Its methods do not fail.
+
+    Everything in it can be read again from the files, so a broken index is deleted, and a process that finds it locked
+    for `LOCKED_SECONDS` goes on without it. SQLite survives two processes at once and being killed.
+
+    It lies in the user's cache folder, or in memory if that is not writable. Not in the library's folder: a folder from
+    elsewhere could bring an index along that is a link to another program's database, or that has a journal naming
+    files to delete.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._lock = threading.Lock()
@@ -62,7 +59,7 @@ class LibraryIndex:
         _remove_oldest(self._path)
 
     def load(self) -> dict[str, Kept]:
-        """All that it holds, by key."""
+        """Everything in it, by key."""
 
         def read(database: sqlite3.Connection) -> dict[str, Kept]:
             kept = {}
@@ -77,7 +74,7 @@ class LibraryIndex:
     def store(
         self, read: Collection[tuple[Found, Sequence[LibraryEntry]]], gone: Collection[str] = ()
     ) -> None:
-        """Keep what was read, and forget the keys that are gone."""
+        """Store what was read, and delete the keys that are `gone`."""
 
         def write(database: sqlite3.Connection) -> None:
             for found, entries in read:
@@ -93,7 +90,7 @@ class LibraryIndex:
         self._do(write, None)
 
     def thumbnails(self, wanted: Collection[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
-        """The jpegs of these rows (key, and number of the row in what its files gave), of those that have one."""
+        """JPEGs of these rows, each a key and the number of the row in its files; rows without one are left out."""
 
         def read(database: sqlite3.Connection) -> dict[tuple[str, int], bytes]:
             found = {}
@@ -112,8 +109,8 @@ class LibraryIndex:
                 self._database = None
 
     def _do(self, work: Callable[[sqlite3.Connection], T], default: T) -> T:
-        """`default` where another process holds the file, and where what is there is of no use: it is thrown away. Another
-        process that has it open goes on with what it has, unharmed."""
+        """Run `work`; `default` when another process holds the file or the file is broken. A broken one is replaced, which
+        does not harm another process that has it open."""
         with self._lock:
             if self._database is None:
                 return default
@@ -121,10 +118,10 @@ class LibraryIndex:
                 with self._database:
                     return work(self._database)
             except (sqlite3.Error, msgspec.MsgspecError, ValueError, TypeError) as error:
-                # What Python's module raises by itself has no code. The low byte is the error, the rest tells its kinds apart.
+                # Python's own errors have no code. The low byte is the error, the rest its variant.
                 code = getattr(error, "sqlite_errorcode", None) or 0
                 if code & 0xFF not in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-                    log.info("The index of the library is made anew: %s", error)
+                    log.info("The index of the library is rebuilt: %s", error)
                     self._database.close()
                     _remove(self._path)
                     self._database = _open(self._path)
@@ -132,13 +129,13 @@ class LibraryIndex:
 
 
 def index_path(folder: Path) -> Path:
-    """Where the index of a folder lies."""
+    """Path of the index of a folder."""
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
     return cache_folder() / "libraries" / f"{name}-{VERSION}.sqlite"
 
 
 def _open(path: Path) -> sqlite3.Connection:
-    """What is there and no index is thrown away; in memory where there is no place for it."""
+    """Open or create the index, replacing a file that is none; in memory if `path` is not writable."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(2):
@@ -157,7 +154,7 @@ def _connect(name: str) -> sqlite3.Connection:
         with database:
             for table in _TABLES:
                 database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
-            # A folder that may be read but not written says so only here.
+            # A read-only folder fails only here.
             database.execute("DELETE FROM read WHERE key = ''")
     except sqlite3.Error:
         database.close()
@@ -166,12 +163,12 @@ def _connect(name: str) -> sqlite3.Connection:
 
 
 def _remove_oldest(path: Path) -> None:
-    """Throw away the indices that were used least lately, where there are very many."""
+    """Delete the least recently used indices beyond `MOST_INDICES`."""
     try:
         os.utime(path)
         indices = sorted(path.parent.glob("*.sqlite"), key=lambda index: index.stat().st_mtime)
     except OSError:
-        return  # there is none, or another process is at it
+        return  # missing, or another process is deleting
     for index in indices[:-MOST_INDICES]:
         _remove(index)
 

@@ -1,14 +1,4 @@
-"""The library: every recording below one folder, as a table that keeps up with the folder.
-
-A folder of recordings is the only truth: people move, copy and delete files, several processes write into it, and
-some of it comes from elsewhere. So the table is made from the files, again whenever they changed, and what can be
-done to recordings here (tags, a note, deleting) is done to the files. Reading thousands of them takes seconds, hence
-an index (`library_index`) from which the rows are there at once; then names, sizes and times are compared, and only
-what differs is read, the newest first and on a thread of its own (`watch`), with the rows so far shown meanwhile.
-
-Recordings are known by ids that this table gives. What a page sends is looked up here, and only what is found has
-paths.
-"""
+"""The library: every recording below one folder, as a table that follows the folder."""
 
 from __future__ import annotations
 
@@ -46,16 +36,16 @@ from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, Scan, key
 log = logging.getLogger(__name__)
 
 LOOK_EVERY = 1.0
-"""Seconds between two looks at the folders' times."""
+"""Seconds between two checks of the folders' times."""
 LONGEST_PAUSE = 5.0
 LOOK_THOROUGHLY_EVERY = 30.0
-"""Seconds between two looks at every file: a file that was written to in place leaves its folder's time alone."""
+"""Seconds between two checks of every file: writing a file in place does not change its folder's time."""
 PUBLISH_EVERY = 0.3
-"""Seconds between two states of the table while it is being read."""
+"""Seconds between two updates of the table while files are being read."""
 
 
 class LibraryError(OSError):
-    """Something could not be done to recordings; the message says what to do about it."""
+    """An operation on recordings failed; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -63,29 +53,35 @@ class LibraryView:
     """The table at one moment."""
 
     serial: int = 0
-    """Grows with each change."""
+    """Increases with each change."""
     rows: tuple[LibraryRow, ...] = ()
     """By name."""
     reading: tuple[int, int] | None = None
-    """Files read so far and to be read, while they are; (0, 0) before the first look has found out how many."""
+    """Files read and files to read, while reading; (0, 0) before they are counted."""
     problem: str | None = None
-    """A sentence, where the folder cannot be looked at."""
+    """A sentence, if the folder cannot be listed."""
     trash: Trash = Trash()
 
 
 class Library:
     """The recordings in a folder and the folders below it.
 
+    The files are the only truth: people and other processes move, copy and delete them. Rows come from an index at
+    once; then names, sizes and times are compared, and files that differ are read on a thread (`watch`), the newest
+    first. Tags, notes and deletion change the files.
+
+    A page sends only ids. They are looked up here, and paths come from the row.
+
     Args:
-        folder: need not be there yet. Nothing is written into it but the index and what is asked for.
+        folder: may not exist yet. Only tags, notes and the trash are written into it.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()
         self._looking = threading.Lock()
-        """Held while the folder is looked through: by one thread at a time."""
+        """Held while the folder is scanned."""
         self._changing = threading.RLock()
-        """Held while `_kept` is changed, but not while all that changed is read."""
+        """Held while `_kept` is changed, but not while files are read."""
         self._changed = threading.Lock()
         self._view = LibraryView(reading=(0, 0))
         self._by_id: dict[str, LibraryRow] = {}
@@ -97,7 +93,7 @@ class Library:
         self._asked = threading.Event()
         self._thread: threading.Thread | None = None
 
-    # --- looking -----------------------------------------------------------------------------------
+    # --- the table ---------------------------------------------------------------------------------
 
     def view(self) -> LibraryView:
         return self._view
@@ -106,11 +102,11 @@ class Library:
         return self._view.rows
 
     def row(self, id: str) -> LibraryRow | None:
-        """None for an id that is not in the table (any more)."""
+        """None if the id is not in the table."""
         return self._by_id.get(id)
 
     def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
-        """Small jpegs of those of these recordings that have one."""
+        """JPEGs by id; recordings without one are left out."""
         by_id, index = self._by_id, self._index
         rows = [by_id[id] for id in ids if id in by_id]
         jpegs = {} if index is None else index.thumbnails([row.place for row in rows])
@@ -119,18 +115,18 @@ class Library:
     # --- keeping up with the folder ------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Keep the table up to date, on a thread of its own, until `close`."""
+        """Keep the table up to date on a thread, until `close`."""
         if self._thread is not None:
             raise RuntimeError("The library is watched already.")
         self._thread = watched_thread("library", self._watch)
         self._thread.start()
 
     def request_scan(self) -> None:
-        """Have the watching thread look at every file now, for whoever knows that something changed."""
+        """Have the watching thread check every file now."""
         self._asked.set()
 
     def close(self) -> None:
-        """Stop to watch; returns when the thread has ended."""
+        """Stop watching; returns when the thread has ended."""
         self._stopping.set()
         self._asked.set()
         if self._thread is not None:
@@ -146,18 +142,18 @@ class Library:
             try:
                 self.refresh(thorough=self._asked.is_set())
             except Exception:
-                # The table is what it was, and a thread that ended would let it be that for ever.
+                # If the thread ended, the table would never change again.
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._asked.clear()
-            # Of a huge folder that is being written to, a tenth of the time goes into looking and not all of it.
+            # Scan at most a tenth of the time: a huge folder that is written to would keep the thread busy.
             self._asked.wait(min(max(LOOK_EVERY, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
 
     def refresh(self, thorough: bool = True) -> None:
-        """Read what has changed since the last look.
+        """Read the files that changed since the last call.
 
         Args:
-            thorough: look at every file, also if no folder says that something came or went.
+            thorough: check every file, even if no folder's time has changed.
         """
         with self._looking:
             late = time.monotonic() - self._thorough_at > LOOK_THOROUGHLY_EVERY
@@ -167,15 +163,15 @@ class Library:
                 if self._index is None and self.folder.is_dir() and not self._stopping.is_set():
                     self._index = LibraryIndex(self.folder)
                 if self._view.serial == 0 and self._kept:
-                    # What the index knows, as if it were all still so, until that is known.
+                    # Rows of the index, shown until the files are checked.
                     self._show(reading=(0, 0))
             self._thorough_at = time.monotonic()
             scan = scan_folder(self.folder)
-            self._scan = replace(scan, found={})  # what was read is kept with what it was read of
+            self._scan = replace(scan, found={})  # `_kept` has the files that were read
             self._read_changed(scan)
 
     def _read_changed(self, scan: Scan, only: Collection[str] | None = None) -> None:
-        """Of all keys, or of those alone with which something was just done here: whoever did it sees it at once."""
+        """Read changed files; with `only`, of these keys alone, to show the result of an operation at once."""
         with self._changing:
             before = self._view.reading
             changed = [
@@ -186,7 +182,7 @@ class Library:
             gone = {key for key in self._kept if key not in scan.found and (only is None or key in only)}
             for key in gone:
                 del self._kept[key]
-            # Where not all could be looked at, what is not seen may be there: the index keeps it.
+            # After an incomplete scan a missing file may exist: the index keeps it.
             forgotten = [] if scan.problem else sorted(gone)
         changed.sort(key=lambda found: found.newest, reverse=True)
         unsaved: list[tuple[Found, list[LibraryEntry]]] = []
@@ -196,7 +192,7 @@ class Library:
                 break
             with self._changing:
                 if not os.path.lexists(found.paths(self.folder)[0]):
-                    continue  # deleted since, on this page perhaps
+                    continue  # deleted meanwhile
                 self._kept[found.key] = Kept(found, tuple(facts for facts, _ in entries))
                 unsaved.append((found, entries))
                 if time.monotonic() - published > PUBLISH_EVERY:
@@ -223,12 +219,12 @@ class Library:
     def _row(self, found: Found, number: int, facts: Facts, taken: Collection[str]) -> LibraryRow:
         id = facts.uid if facts.uid.isalnum() and facts.uid.isascii() else ""
         if not id or id in taken:
-            # No id of its own, or a copy of a recording that is in the table already.
+            # No id of its own, or a copy of another row's recording.
             where = f"{found.key}#{facts.trajectory or ''}"
             id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
         name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
         name += "" if facts.trajectory is None else f"#{facts.trajectory}"
-        # A file's name may hold bytes that are no text, which no page can be sent.
+        # A file's name may hold invalid UTF-8, which cannot be sent to a page.
         name, place = clean_text(name, 400), (found.key, number)
         paths, size = found.paths(self.folder), sum(found.sizes.values())
         return LibraryRow(**vars(facts), id=id, name=name, place=place, paths=paths, size=size)
@@ -241,13 +237,13 @@ class Library:
             if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
                 self._view = replace(view, serial=self._view.serial + 1)
 
-    # --- what is done to recordings --------------------------------------------------------------------
+    # --- operations on recordings ----------------------------------------------------------------------
 
     def set_tags(self, ids: Iterable[str], add: Iterable[str] = (), remove: Iterable[str] = ()) -> None:
-        """Add tags to recordings and take tags away.
+        """Add tags to recordings and remove tags.
 
         Raises:
-            LibraryError: a file cannot be written; the recordings before it have their tags.
+            LibraryError: a file cannot be written; the recordings before it have been changed.
         """
         add, without = clean_tags(tuple(add)), set(clean_tags(tuple(remove)))
         self._annotate(
@@ -255,7 +251,7 @@ class Library:
         )
 
     def set_note(self, ids: Iterable[str], note: str) -> None:
-        """Give recordings a note; an empty one takes it away. Raises as `set_tags`."""
+        """Set the note of recordings; an empty one removes it. Raises as `set_tags`."""
         note = clean_note(note)
         self._annotate(ids, lambda facts: (facts.tags, note))
 
@@ -278,7 +274,7 @@ class Library:
                         why = getattr(error, "strerror", None) or error
                         raise LibraryError(
                             f"Tags and note of {row.name} could not be kept ({why}). "
-                            "They are written beside the recording, so its folder must be writable."
+                            "They are written into the recording's folder, which must be writable."
                         ) from error
             finally:
                 self._read_changed(scan_folder(self.folder), touched)
@@ -287,8 +283,8 @@ class Library:
         """Move all files of these recordings to the trash; returns the name of the deletion, for `undo_delete`.
 
         Raises:
-            LibraryError: nothing was moved because a file holds other recordings too, or something could not be
-                moved; the recordings before it were.
+            LibraryError: a file holds other recordings too, and nothing was moved; or a file could not be moved, and the
+                recordings before it were.
         """
         with self._changing:
             keys = self._keys_to_delete(ids)
@@ -300,11 +296,11 @@ class Library:
             finally:
                 self._read_changed(scan_folder(self.folder), keys)
             if batch is None:
-                raise LibraryError("Those files were gone already.")
+                raise LibraryError("These files no longer exist.")
             return batch
 
     def check_delete(self, ids: Iterable[str]) -> None:
-        """Raise LibraryError where `delete` would refuse them."""
+        """Raises LibraryError if `delete` would refuse these recordings."""
         with self._changing:
             self._keys_to_delete(ids)
 
@@ -326,10 +322,10 @@ class Library:
         return keys
 
     def undo_delete(self) -> None:
-        """Bring back what the last deletion took.
+        """Restore the files of the last deletion.
 
         Raises:
-            LibraryError: there is none, or something could not be brought back.
+            LibraryError: there is none, or a file could not be restored.
         """
         with self._changing:
             batches = read_trash(self.folder).batches
@@ -338,11 +334,11 @@ class Library:
             try:
                 back = restore_from_trash(self.folder, batches[-1])
             except TrashError as error:
-                raise LibraryError(f"Not everything could be brought back. {error}") from error
+                raise LibraryError(f"Not everything could be restored. {error}") from error
             self._read_changed(scan_folder(self.folder), {key_of(path) for path in back})
 
     def empty_trash(self) -> None:
-        """Delete for good what was deleted. Raises LibraryError."""
+        """Delete the content of the trash permanently. Raises LibraryError."""
         with self._changing:
             try:
                 empty_trash(self.folder)

@@ -1,11 +1,4 @@
-"""Deleting recordings, so that it can be taken back: the files go into ``.trash`` in the library's folder.
-
-People delete the wrong one, and an episode cannot be had again. A move within one folder tree costs nothing, leaves
-the files as they are, and is found by anybody who looks. Each deletion is a folder of its own in there, named by its
-time, with the files under the paths that they had; so nothing has to be written down about it, and taking it back is
-moving them to where they were. What makes a recording one, its first file, goes first and comes back last. The room
-is given back only when the trash is emptied.
-"""
+"""Moves deleted recordings into ``.trash`` in the library's folder, and back."""
 
 from __future__ import annotations
 
@@ -22,23 +15,26 @@ TRASH = ".trash"
 
 @dataclass(frozen=True)
 class Trash:
-    """What is in there."""
+    """Content of the trash.
+
+    Each deletion is a folder named by its time, with the files under their old paths below the library's folder, so
+    undoing it needs no list. Of a recording's files the one that makes it listed moves first and comes back last.
+    """
 
     batches: tuple[str, ...] = ()
-    """One a deletion that holds something, the last one last."""
+    """Names of the deletions that hold files, the newest last."""
     files: int = 0
     size: int = 0
     """Bytes."""
 
 
 class TrashError(OSError):
-    """Files could not be moved; the message says which and why. Those of the same recording are where they were, or
-    the message says where."""
+    """Files could not be moved; the message says which and why. The recording's other files are where they were, or the
+    message says where."""
 
 
 def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
-    """Move the files of these recordings, each the one that makes it first; returns the name of the deletion, or None
-    if nothing was there any more.
+    """Move the files of these recordings, in order; returns the name of the deletion, or None if no file exists any more.
 
     Raises:
         TrashError: some could not be moved; those before it were.
@@ -55,11 +51,10 @@ def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | N
 
 
 def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
-    """Move what this deletion took to where it was; returns the paths below `folder`, with ``/``. What stands there now is not
-    written over.
+    """Move the files of a deletion back; returns their paths below `folder`, with ``/``. Existing files stay.
 
     Raises:
-        TrashError: something could not be moved, and is in the trash still.
+        TrashError: a file could not be moved and is still in the trash.
     """
     root = folder / TRASH / batch
     if batch not in read_trash(folder).batches:
@@ -78,7 +73,7 @@ def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
 def read_trash(folder: Path) -> Trash:
     size = 0
     if (folder / TRASH).is_symlink():
-        return Trash()  # another folder, which came with this one
+        return Trash()  # leads to a foreign folder
     try:
         with os.scandir(folder / TRASH) as listed:
             batches = sorted(entry.name for entry in listed if entry.is_dir(follow_symlinks=False))
@@ -92,13 +87,13 @@ def read_trash(folder: Path) -> Trash:
                     size += os.lstat(os.path.join(below, name)).st_size
                     held[batch] = held.get(batch, 0) + 1
                 except OSError:
-                    continue  # taken out meanwhile
-    # A deletion that failed leaves folders, and taking that back would be taken for taking back the one before it.
+                    continue  # restored meanwhile
+    # A failed deletion leaves empty folders; undo must skip it.
     return Trash(tuple(held), sum(held.values()), size)
 
 
 def empty_trash(folder: Path) -> None:
-    """Delete what is in there for good.
+    """Delete its content permanently.
 
     Raises:
         TrashError: something could not be deleted.
@@ -112,7 +107,7 @@ def empty_trash(folder: Path) -> None:
 
 
 def _move_together(pairs: Sequence[tuple[Path, Path]]) -> bool:
-    """Move all or none; whether there was anything to move."""
+    """Move all or none; returns whether there was anything to move."""
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in pairs:
