@@ -14,7 +14,7 @@ import pytest
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_state import read_states, state_distance, state_mismatches
-from workbench.jobs.open_task import OpenedTask, step_checked
+from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.replay import arrive
 
 pytestmark = pytest.mark.thorough
@@ -38,7 +38,7 @@ def recorded(task: OpenedTask) -> Recorded:
 def goes_on_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
     """The same states and rewards under the same actions, to the last bit."""
     for t in range(state, STEPS):
-        step = step_checked(task.env, task.loaded, recorded.steps[t + 1].action)
+        step = task.env.step(recorded.steps[t + 1].action)
         now = read_states(task.env.env)
         for name, rows in now.items():
             assert np.array_equal(rows[env], recorded.states[t + 1][name][env]), (name, t)
@@ -67,7 +67,7 @@ def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, r
         if disturb:
             arrive(task, recorded.run(1), 20, [1])
         for _ in range(steps):
-            step_checked(task.env, task.loaded, rng.uniform(-0.4, 0.4, (N, 8)).astype(np.float32))
+            task.env.step(rng.uniform(-0.4, 0.4, (N, 8)).astype(np.float32))
             states.append(read_states(task.env.env))
         return states
 
@@ -83,7 +83,7 @@ def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recor
     assert replay_result.metres == 0
     for t in range(30, STEPS):
         action = np.broadcast_to(recorded.steps[t + 1].action[2], (N, 8)).astype(np.float32)
-        step_checked(task.env, task.loaded, action)
+        task.env.step(action)
     last = read_states(task.env.env)
     for name, rows in last.items():
         for env in range(N):
@@ -120,7 +120,7 @@ def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
     targets = task.env.env.scene.px.cuda_articulation_target_qpos.torch()[1]
     assert np.allclose(targets[: robot.max_dof], robot.get_qpos()[1], atol=1e-6)
     # It stays where it is, and does not run to where it stood before.
-    step_checked(task.env, task.loaded, None)
+    task.env.step(None)
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
     assert state_distance(now, run.state(25))[1] < 0.05
 

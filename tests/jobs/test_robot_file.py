@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from workbench.core.env import actions
-from workbench.jobs.open_task import step_checked
 from workbench.jobs.task import TaskOptions
 from workbench.session.protocol.messages import Load
 from workbench.session.worker.reload import Running, load_version
@@ -34,7 +33,7 @@ def test_a_robot_stands_in_the_scene_and_is_built_anew_by_a_save(tmp_path: Path)
         assert opened.description.env_kwargs["robot_uids"] == "my_panda"
         rng = np.random.default_rng(0)
         action = actions.random_action(opened.env.parts, 2, rng)
-        last = step_checked(opened.env, opened.loaded, action)
+        last = opened.env.step(action)
         assert (last.elapsed_steps == 1).all()
         file.write_text(ROBOT.replace("1e3", "5e2"))
         again, report = load_version(request, Running(request, opened, last))

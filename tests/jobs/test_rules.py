@@ -17,7 +17,7 @@ from tests.drive.session import wait_until
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.env.actions import hold_action
 from workbench.core.rules import Finding
-from workbench.jobs.open_task import OpenedTask, Opening, open_task, reset_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, Opening, open_task
 from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
@@ -154,7 +154,7 @@ def test_what_the_task_can_live_with_is_a_row_and_the_task_opens(
 ) -> None:
     file, told = write(body, tmp_path), []
     for task in opened(file, found=told):
-        step_checked(task.env, task.loaded, hold_action(task.env.parts, 4))
+        task.env.step(hold_action(task.env.parts, 4))
         rules = task.env.broken_rules
         assert rules is not None
         row = next(row for row in rules.rows if row.rule == rule)
@@ -261,10 +261,10 @@ class Desk:
 
     def step(self) -> None:
         env = self.opened.env
-        step_checked(env, self.opened.loaded, hold_action(env.parts, env.num_envs))
+        env.step(hold_action(env.parts, env.num_envs))
 
     def reset(self, env: int) -> None:
-        reset_checked(self.opened.env, self.opened.loaded, env_idx=[env])
+        self.opened.env.reset(env_idx=[env])
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
-from workbench.jobs.open_task import OpenedTask, open_task, reset_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.task import TaskOptions
 
 States = dict[str, np.ndarray]
@@ -57,14 +57,14 @@ def record(
     """Reset every env by itself with its seed (or all at once with 0, 1 ... if None), and make steps."""
     env, rng = task.env, np.random.default_rng(0)
     if seeds is None:
-        first = reset_checked(env, task.loaded, 0)
+        first = env.reset(0)
     else:
         for i, seed in enumerate(seeds):
-            first = reset_checked(env, task.loaded, [seed], [i])
+            first = env.reset([seed], [i])
     said, states = [first], [read_states(env.env)]
     for t in range(steps):
         action = actions.random_action(env.parts, env.num_envs, rng) if act is None else act(t)
-        said.append(step_checked(env, task.loaded, action))
+        said.append(env.step(action))
         states.append(read_states(env.env))
     return Recorded(said, states, [int(seed) for seed in env.episode_seeds])
 

@@ -47,7 +47,6 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
-from workbench.core.snapshots.snapshot import RestoreReport, Snapshot
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
 
 
@@ -206,7 +205,8 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
         clock.lap("rehearse")
         if task.broken_rules is not None:
             task.broken_rules.begin()
-        first = reset_checked(task, loaded, options.seed)
+        with blamed("reset", loaded, task):
+            first = task.reset(options.seed)
         clock.lap("reset")
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
@@ -221,36 +221,13 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
 
 def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
     """One reset, one step and one partial reset; raises TaskError where the task fails in one."""
-    reset_checked(task, loaded, seed)
-    step_checked(task, loaded, actions.hold_action(task.parts, task.num_envs))
-    if task.num_envs > 1:
-        reset_checked(task, loaded, env_idx=[0])
-
-
-def step_checked(task: TaskEnv, loaded: LoadedTask, action: Any) -> StepResult:
-    """`TaskEnv.step`; what goes wrong is raised as a TaskError with the author's line."""
-    with blamed("step", loaded, task):
-        return task.step(action if task.parts else None)
-
-
-def reset_checked(
-    task: TaskEnv,
-    loaded: LoadedTask,
-    seed: int | Sequence[int] | None = None,
-    env_idx: Sequence[int] | None = None,
-    options: Mapping[str, Any] | None = None,
-) -> StepResult:
-    """`TaskEnv.reset`; what goes wrong is raised as a TaskError with the author's line."""
     with blamed("reset", loaded, task):
-        return task.reset(seed=seed, env_idx=env_idx, options=options)
-
-
-def restore_checked(
-    task: TaskEnv, loaded: LoadedTask, snapshot: Snapshot, env_idx: Sequence[int], source: Sequence[int]
-) -> tuple[StepResult, RestoreReport]:
-    """`TaskEnv.restore`; what goes wrong is raised as a TaskError with the author's line."""
-    with blamed("restore", loaded, task):
-        return task.restore(snapshot, env_idx, source)
+        task.reset(seed)
+    with blamed("step", loaded, task):
+        task.step(actions.hold_action(task.parts, task.num_envs))
+    if task.num_envs > 1:
+        with blamed("reset", loaded, task):
+            task.reset(env_idx=[0])
 
 
 def describe(

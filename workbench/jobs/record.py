@@ -26,7 +26,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SUFFIXES, Acting, RecordActing, read_given
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
-from workbench.jobs.open_task import OpenedTask, blamed, open_task, reset_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, blamed, open_task
 from workbench.jobs.policy import find_policy
 from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
 from workbench.jobs.record_options import RecordArguments
@@ -325,7 +325,8 @@ class _Episodes:
         seed = self._what.options.seed + index
         if given is not None and given.seed >= 0:
             seed = given.seed
-        step = reset_checked(task, self._opened.loaded, seed, [env])
+        with blamed("reset", self._opened.loaded, task):
+            step = task.reset(seed, [env])
         self._running[env], self._steps[env] = index, 0
         if given is not None and given.env_states:
             step = self._put_right_start(env, given, step)
@@ -345,7 +346,8 @@ class _Episodes:
         """A control step of all envs, and the end of the episodes that are over with it."""
         task, loaded = self._opened.env, self._opened.loaded
         action = self._acting.next_action(task, {env: self._steps[env] for env in self._running})
-        step = step_checked(task, loaded, action)
+        with blamed("step", loaded, task):
+            step = task.step(action)
         if self._what.use_env_states:
             states = {
                 env: given.state(self._steps[env] + 1)

@@ -36,7 +36,7 @@ from workbench.core.capture.recorded_state import (
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.snapshot import Snapshot, step_only
-from workbench.jobs.open_task import OpenedTask, blamed, reset_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, blamed
 from workbench.machine.text import length
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
@@ -91,7 +91,8 @@ def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int
             missed[i]["the seed"] = "the recording does not know it: what the task drew at the reset is new"
         seed = [run.seed] if run.seed >= 0 else None
         # One by one: numbers that are drawn for several envs together are others than each would get alone.
-        reset_checked(task, opened.loaded, seed, [i], options)
+        with blamed("reset", opened.loaded, task):
+            task.reset(seed, [i], options)
     now = read_states(env)
     other = {i: not same_state(_of(now, i), run.state(0)) for i, run in runs.items()}
     wrong = {i: run.state(0) for i, run in runs.items() if other[i]}
@@ -152,7 +153,8 @@ def arrive(
             for t in range(state):
                 action: NDArray[np.float32] = run.action[t]
                 rows = dict.fromkeys(chosen, action)
-                step_checked(task, opened.loaded, actions.action_of(task.parts, task.num_envs, rows))
+                with blamed("step", opened.loaded, task):
+                    task.step(actions.action_of(task.parts, task.num_envs, rows))
                 wanted = run.state(t + 1)
                 if wanted and _far(env, chosen, wanted):
                     with blamed("restore", opened.loaded, task):

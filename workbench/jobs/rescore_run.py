@@ -22,7 +22,7 @@ from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.snapshot import step_only
 from workbench.jobs.from_recording import run_of
-from workbench.jobs.open_task import OpenedTask, blamed, step_checked
+from workbench.jobs.open_task import OpenedTask, blamed
 from workbench.jobs.replay import begin_again, put_there, why_not_replayed
 from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, single_numbers
 from workbench.recording.episode.episode import Episode
@@ -186,8 +186,8 @@ def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool)
     rows = {env: seat.run.action[seat.at] for env, seat in seats.items()}
     action = actions.action_of(task.parts, task.num_envs, rows)
     others = step_only(task.env, [*seats], None) if len(seats) < task.num_envs else nullcontext()
-    with others:
-        step = step_checked(task, opened.loaded, action)
+    with others, blamed("step", opened.loaded, task):
+        step = task.step(action)
     now = read_states(task.env)
     if use_env_states:
         step = put_there(opened, {env: seat.run.state(seat.at + 1) for env, seat in seats.items()}, action)

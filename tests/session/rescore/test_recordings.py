@@ -13,7 +13,6 @@ import pytest
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states
-from workbench.jobs.open_task import reset_checked, step_checked
 from workbench.jobs.rescore_run import rescore
 from workbench.jobs.verdict import Verdict
 from workbench.recording.episode.episode import Episode, EpisodeInfo
@@ -187,10 +186,10 @@ class FallingBallEnv(BaseEnv):
 def test_a_task_without_a_robot_is_given_its_rewards(tmp_path: Path, use_env_states: bool) -> None:
     (tmp_path / "ball.py").write_text(BALL)
     task = opened(str(tmp_path / "ball.py"), 2)
-    said = [reset_checked(task.env, task.loaded, 0)]
+    said = [task.env.reset(0)]
     states = [read_states(task.env.env)]
     for _ in range(10):
-        said.append(step_checked(task.env, task.loaded, None))
+        said.append(task.env.step(None))
         states.append(read_states(task.env.env))
     reward = np.array([step.reward[0] for step in said[1:]], np.float32)
     low = np.array([step.evaluate["low"][0] for step in said])

@@ -14,7 +14,7 @@ import pytest
 from workbench.authoring.loading.load import load_task
 from workbench.core.env import actions
 from workbench.core.snapshots.snapshot import Snapshot
-from workbench.jobs.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
 from workbench.session.protocol.messages import Restore, WayBack
 from workbench.session.worker import go_back
@@ -29,7 +29,7 @@ class EnvMoment:
     def __init__(self, opened: OpenedTask) -> None:
         self.opened, self.told = opened, []
         task, rng = opened.env, np.random.default_rng(0)
-        reset_checked(task, opened.loaded, 2)
+        task.reset(2)
         self.snapshots: list[Snapshot] = [task.snapshot()]
         self.actions: list[np.ndarray] = []
         self.packs: list[list[bytes]] = [self.packed()]
@@ -42,7 +42,7 @@ class EnvMoment:
         return list(scene.px.packs())
 
     def step(self, action: np.ndarray) -> None:
-        step_checked(self.opened.env, self.opened.loaded, action)
+        self.opened.env.step(action)
         self.actions.append(action)
         self.packs.append(self.packed())
 
@@ -87,7 +87,7 @@ def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None
     assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N
     for after in range(T, 2 * T):
         assert lived.packed() == lived.packs[after]
-        step_checked(lived.opened.env, lived.opened.loaded, lived.actions[after])
+        lived.opened.env.step(lived.actions[after])
     assert lived.packed() == lived.packs[2 * T]
 
 
@@ -108,7 +108,7 @@ def test_ways_of_several_lengths_end_together(lived: EnvMoment) -> None:
     middle = lived.opened.env.snapshot()
     assert lived.back(T, {1: 0, 2: 0}).replayed == (1, 2)
     for after in range(T, T + 3):
-        step_checked(lived.opened.env, lived.opened.loaded, lived.actions[after])
+        lived.opened.env.step(lived.actions[after])
     wanted, end = lived.packed(), lived.opened.env.snapshot()
     ways = {
         0: WayBack(100, 0, np.stack([a[0] for a in lived.actions[T : T + 3]])),

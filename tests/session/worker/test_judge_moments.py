@@ -14,7 +14,7 @@ from tests.drive.session import TASKS
 from workbench.authoring.loading.load import load_task
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
-from workbench.jobs.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
 from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
 from workbench.session.worker.go_back import rescore_moments
@@ -50,14 +50,14 @@ class Record:
             self.moments.append(MomentToRescore(None, pickle.dumps(task.snapshot()), envs))
             self.steps.append(step)
 
-        jump(reset_checked(task, opened.loaded, 5), tuple(range(N)))
+        jump(task.reset(5), tuple(range(N)))
         for envs in ((1,), (0, 2), (1,), ()):
             for _ in range(4):
                 action = actions.random_action(task.parts, N, rng)
-                self.steps.append(step_checked(task, opened.loaded, action))
+                self.steps.append(task.step(action))
                 self.moments.append(MomentToRescore(action))
             if envs:
-                jump(reset_checked(task, opened.loaded, [90 + i for i in envs], envs), envs)
+                jump(task.reset([90 + i for i in envs], envs), envs)
 
 
 def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_the_last_bit(
@@ -68,7 +68,7 @@ def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_t
     made = [step for moment, step in zip(record.moments, record.steps, strict=True) if not moment.snapshot]
     assert len({step.evaluate["noise"].tobytes() for step in made}) == len(made) == 16
     for _ in range(2):
-        step_checked(draws.env, draws.loaded, np.zeros((N, 8), np.float32))  # it draws on meanwhile
+        draws.env.step(np.zeros((N, 8), np.float32))  # it draws on meanwhile
         rescored = rescore_moments(draws, RescoreMoments(tuple(record.moments)))
         assert rescored.problem is None and rescored.not_carried == {}
         for moment, was, now in zip(record.moments, record.steps, rescored.steps, strict=True):

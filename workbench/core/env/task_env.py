@@ -203,7 +203,11 @@ class TaskEnv:
             return self.env.reset(options=options)
 
     def step(self, action: NDArray[np.float32] | None) -> StepResult:
-        """One control step of all envs with a flat action (N, A), or None to leave the targets alone."""
+        """One control step of all envs with a flat action (N, A), or None to leave the targets alone.
+
+        A task without a controller gets none.
+        """
+        action = action if self.parts else None
         env_action = None if action is None else actions.to_env_action(self.env, self.parts, action)
         self.obs, reward, terminated, _, info = self.env.step(env_action)
         if self._check is not None:

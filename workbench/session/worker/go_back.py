@@ -29,7 +29,7 @@ from workbench.core.snapshots.snapshot import (
     step_only,
 )
 from workbench.jobs.from_recording import changed_since
-from workbench.jobs.open_task import OpenedTask, blamed, restore_checked, step_checked
+from workbench.jobs.open_task import OpenedTask, blamed
 from workbench.jobs.replay import arrive, how
 from workbench.jobs.task import NO_MOMENT, Restored
 from workbench.session.protocol.messages import EnterRecording, Restore
@@ -113,7 +113,8 @@ def _replay_steps(
                 px.freeze_envs({*others, *waiting})
                 at = {i: max(0, done - total + len(way.actions)) for i, way in ways.items()}
                 rows = {i: way.actions[at[i]] for i, way in ways.items()}
-                step_checked(task, opened.loaded, actions.action_of(task.parts, task.num_envs, rows))
+                with blamed("step", opened.loaded, task):
+                    task.step(actions.action_of(task.parts, task.num_envs, rows))
                 on_step(done + 1, total)
                 if time.monotonic() - began > MOST_SECONDS:
                     return []
@@ -150,12 +151,12 @@ def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMome
     for moment in request.moments:
         try:
             if moment.snapshot is None:
-                steps.append(step_checked(opened.env, opened.loaded, moment.action))
+                with blamed("step", opened.loaded, opened.env):
+                    steps.append(opened.env.step(moment.action))
                 continue
             snapshot = pickle.loads(moment.snapshot)
-            step, report = restore_checked(
-                opened.env, opened.loaded, snapshot, moment.env_idx, moment.env_idx
-            )
+            with blamed("restore", opened.loaded, opened.env):
+                step, report = opened.env.restore(snapshot, moment.env_idx, moment.env_idx)
         except TaskError as error:
             return RescoredMoments(tuple(steps), missed, error.problem)
         steps.append(step)

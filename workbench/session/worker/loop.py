@@ -30,9 +30,10 @@ from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.core.capture.inspect_env import inspect_env
 from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import Acting
-from workbench.jobs.open_task import OpenedTask, Opening, reset_checked, step_checked, warm_up
+from workbench.jobs.open_task import OpenedTask, Opening, blamed, warm_up
 from workbench.jobs.pool import Answer, CannotAnswer, Progress
 from workbench.jobs.task import Restored
 from workbench.jobs.verdict import Rescore
@@ -373,7 +374,9 @@ class Worker:
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
             self._cameras.settle()  # the observation is about to draw the same scene
-        step = step_checked(opened.env, opened.loaded, self._acting.next_action(opened.env))
+        action = self._acting.next_action(opened.env)
+        with blamed("step", opened.loaded, opened.env):
+            step = opened.env.step(action)
         self._rate.tick(time.monotonic())
         self._send_step(step, np.zeros(opened.env.num_envs, bool))
         ended = np.flatnonzero(step.terminated | step.truncated)
@@ -388,34 +391,33 @@ class Worker:
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
         self._cameras.finish_picture()  # a reset may build the scene anew
-        step = self._reset_with_seeds(opened, env_idx, seed)
+        with blamed("reset", opened.loaded, opened.env):
+            step = self._reset_with_seeds(opened.env, env_idx, seed)
         self._cameras.put_back()
         self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
         return step
 
     def _reset_with_seeds(
-        self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
+        self, task: TaskEnv, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
         """Reset these envs: those that are recorded each alone, so that its seed gives the same start anywhere.
 
         What envs that are reset together draw from torch's generator hangs on all of them, and on the first one's seed.
         """
-        every = range(opened.env.num_envs) if env_idx is None else env_idx
+        every = range(task.num_envs) if env_idx is None else env_idx
         alone = [env for env in every if env in self._steps.recorded] if len(every) > 1 else []
         if seed is None or not alone:
-            return reset_checked(opened.env, opened.loaded, seed, env_idx)
+            return task.reset(seed, env_idx)
         seeds = dict(
             zip(every, range(seed, seed + len(every)) if isinstance(seed, int) else seed, strict=True)
         )
         step = None
         if env_idx is None:
-            step = reset_checked(
-                opened.env, opened.loaded, seed
-            )  # what only a reset of all does: a new scene
+            step = task.reset(seed)  # what only a reset of all does: a new scene
         elif rest := [env for env in every if env not in alone]:
-            step = reset_checked(opened.env, opened.loaded, [seeds[env] for env in rest], rest)
+            step = task.reset([seeds[env] for env in rest], rest)
         for env in alone:
-            step = reset_checked(opened.env, opened.loaded, [seeds[env]], [env])
+            step = task.reset([seeds[env]], [env])
         assert step is not None
         return step
 

@@ -43,7 +43,6 @@ from workbench.jobs.open_task import (
     build_task,
     import_task,
     notices_of,
-    reset_checked,
     returns_check,
     with_advice,
 )
@@ -307,7 +306,8 @@ def _build(
         first, restored = _restore(opened, snapshot, action)
     except TaskError as error:
         # The new version works, as its rehearsal has shown; only not from this moment on.
-        first = reset_checked(opened.env, opened.loaded, request.options.seed)
+        with blamed("reset", opened.loaded, opened.env):
+            first = opened.env.reset(request.options.seed)
         restored = RestoreReport((), {"the moment": f"the new version fails in it: {error.problem.message}"})
     except BaseException:
         opened.env.close()
