@@ -220,8 +220,8 @@ def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> No
     for reading, why in (
         (lambda: read_episode(tmp_path / "none.rrd"), "none.rrd is not there"),
         (lambda: read_episode(theirs), "theirs.json is not from the workbench"),
-        (lambda: read_maniskill(theirs, "traj_7"), "says nothing of traj_7"),
-        (lambda: trajectories(ours.with_suffix(".json")), "no .h5 that can be read"),
+        (lambda: read_maniskill(theirs, "traj_7"), "has no entry for traj_7"),
+        (lambda: trajectories(ours.with_suffix(".json")), "cannot be read as .h5"),
     ):
         with pytest.raises(UnreadableRecording, match=why):
             reading()

@@ -1,9 +1,4 @@
-"""Recordings that ManiSkill's own RecordEpisode made, as an `Episode`: its demonstrations, and everybody's own.
-
-Such a file has no meshes and no poses of bodies, which are the simulator's to make; but its curves, states, observations and
-cameras are columns like ours. Two things that it does not hold: what ``evaluate()`` said of state 0 (taken for no success and no
-failure), and entries of ``evaluate()`` besides those two.
-"""
+"""Reads recordings of ManiSkill's ``RecordEpisode``, such as its demonstrations, as episodes."""
 
 from __future__ import annotations
 
@@ -33,27 +28,27 @@ from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5,
 
 _PICTURES = ("sensor_data", "sensor_param")
 _UNKNOWN_DT = 0.05
-"""ManiSkill's default control period (20 Hz); the file does not say it."""
+"""ManiSkill's default control period (20 Hz), if the file has none."""
 
 
 def trajectories(path: Path) -> tuple[str, ...]:
     """Names of the episodes in a ManiSkill .h5, in the order of their numbers.
 
     Raises:
-        UnreadableRecording: it is no such file.
+        UnreadableRecording: it cannot be read as HDF5.
     """
     try:
         with open_h5(path) as file:
             return tuple(sorted((name for name in file if name.startswith("traj_")), key=_number))
     except (OSError, RuntimeError, RefusedH5) as error:
-        raise UnreadableRecording(f"{Path(path).name} is no .h5 that can be read: {error}") from error
+        raise UnreadableRecording(f"{Path(path).name} cannot be read as .h5: {error}") from error
 
 
 def read_maniskill(path: Path, trajectory: str) -> Episode:
-    """Episode `trajectory` (``traj_0``) of an .h5 that ManiSkill's RecordEpisode wrote; its .json lies beside it.
+    """Episode `trajectory` (``traj_0``) of an .h5 with its .json, both written by ManiSkill's RecordEpisode.
 
-    It has no geometry and no poses. The control period is `control_freq` of its env's keywords if that is said, else
-    ManiSkill's default of 1/20 s.
+    Such files have no geometry and no poses, and no entries of ``evaluate()`` but ``success`` and ``fail``, which are
+    False for state 0. The control period is the env's `control_freq` if recorded, else ManiSkill's default of 1/20 s.
 
     Raises:
         UnreadableRecording: one of the two files is missing or broken, or has no such episode.
@@ -79,7 +74,7 @@ def read_maniskill(path: Path, trajectory: str) -> Episode:
 def leaves(
     node: H5Group | H5Dataset | None, prefix: str = "", skip: Sequence[str] = ()
 ) -> Iterator[tuple[str, NDArray]]:
-    """Every dataset of numbers below `node` by its path, ``a/b``; ``""`` where `node` is one itself."""
+    """Every dataset of numbers below `node` by its path, ``a/b``; ``""`` if `node` is one itself."""
     if isinstance(node, H5Dataset):
         if node.is_numbers:
             yield prefix, node.read()
@@ -105,8 +100,8 @@ def _read_entry(path: Path, trajectory: str) -> tuple[Document, EpisodeJson]:
     except WrongDocument as error:
         raise UnreadableRecording(f"{path.name} {error}.") from error
     except (KeyError, TypeError) as error:
-        raise UnreadableRecording(f"{path.name} is not what ManiSkill writes beside an .h5.") from error
-    raise UnreadableRecording(f"{path.name} says nothing of {trajectory}.")
+        raise UnreadableRecording(f"{path.name} is not a .json of ManiSkill's RecordEpisode.") from error
+    raise UnreadableRecording(f"{path.name} has no entry for {trajectory}.")
 
 
 def _episode(group: H5Group, document: Document, entry: EpisodeJson, path: Path, trajectory: str) -> Episode:
@@ -160,7 +155,7 @@ def _written(path: Path) -> str:
 
 
 def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """(T, A), of several robots one behind the other, and a name for each of the A."""
+    """(T, A) with the robots' actions concatenated, and a name for each of the A."""
     parts = [(name, array.reshape(len(array), -1)) for name, array in leaves(node)]
     names = [f"{name or 'action'}[{i}]" for name, array in parts for i in range(array.shape[1])]
     return np.concatenate([array for _, array in parts], axis=1).astype(np.float32), tuple(names)
@@ -170,7 +165,7 @@ def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str,
 
 
 def _picture(path: Path, place: str, modality: Modality, number: int) -> bytes:
-    """Of a dataset (P, H, W, C), read and encoded when it is asked for."""
+    """Picture `number` of a dataset (P, H, W, C), encoded."""
     with open_h5(path) as file:
         dataset = file[place]
         if not isinstance(dataset, H5Dataset):
@@ -180,7 +175,7 @@ def _picture(path: Path, place: str, modality: Modality, number: int) -> bytes:
         return encode("rgb", np.ascontiguousarray(picture[..., :3]))
     plain = picture.reshape(picture.shape[:2])
     if modality == "depth":
-        # Whole millimetres if they are integers, metres otherwise (textures of the ray tracers).
+        # Integers are millimetres; floats, from ray-tracing shaders, are metres.
         scale = MILLIMETRES_PER_METRE if plain.dtype.kind in "iu" else 1.0
         return encode("depth", plain.astype(np.float32) / scale)
     return encode("segmentation", plain.astype(np.int32))

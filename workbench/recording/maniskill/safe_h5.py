@@ -1,11 +1,4 @@
-"""Reads HDF5 files that anybody may have made: numbers of this one file, and no more of them than it can hold.
-
-HDF5 by itself follows a file wherever it points. External links, external storage and virtual datasets read other files
-of the machine, filters load plugins, and a dataset of 8 kB may claim terabytes that are allocated before the first byte
-is read. So groups and datasets are reached through this module alone. It follows hard links, and soft links within the
-file; it reads plain numbers; and it compares what a dataset claims with what the file holds of it before anything is
-allocated.
-"""
+"""Reads numbers from untrusted HDF5 files, within limits."""
 
 from __future__ import annotations
 
@@ -15,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-# Filters come from shared libraries that HDF5 looks for when it is loaded; "::" is how it is told not to.
+# HDF5 searches for filter plugins when it is loaded; "::" turns that off.
 os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")
 
 import h5py
@@ -25,17 +18,17 @@ from numpy.typing import NDArray
 from workbench.machine.files import open_regular_file
 
 MOST_BYTES = 1 << 30
-"""Of numbers that are read from one file while it is open."""
+"""Numbers that are read from one open file."""
 MOST_NODES = 200_000
-"""Groups and datasets that are looked up in one file while it is open."""
+"""Groups and datasets that are looked up in one open file."""
 DEEPEST = 32
-"""Groups in groups; hard links can lead round in a circle."""
+"""Nesting of groups; hard links can form a cycle."""
 SMALL = 1 << 20
-"""Bytes that a dataset may claim whatever the file holds of it: one that was made and never written reads as zeros."""
+"""Bytes that every dataset may claim: an unwritten one has no storage and reads as zeros."""
 MOST_PACKED = 1100
-"""Bytes that one byte in the file may become: deflate's limit is 1032."""
+"""Largest compression ratio; deflate's limit is 1032."""
 LARGEST_CHUNK = 16 << 20
-"""Bytes of a chunk that are allocated whatever the file holds of its dataset."""
+"""Bytes that a chunk may have independent of its dataset's storage."""
 
 _FILTERS = {
     h5py.h5z.FILTER_DEFLATE,
@@ -46,30 +39,36 @@ _FILTERS = {
     h5py.h5z.FILTER_SCALEOFFSET,
     h5py.h5z.FILTER_LZF,
 }
-"""That come with h5py."""
+"""Filters that come with h5py."""
 _NUMBERS = "biuf"
 
 
 class RefusedH5(ValueError):
-    """The file asks for something that is not done for it; the message says what, and goes on from the file's name."""
+    """The file is refused; the message follows the file's name.
+
+    HDF5 by itself follows external links, external storage and virtual datasets into other files of the machine, loads
+    filter plugins, and allocates whatever size a dataset claims, terabytes in a file of 8 kB. The classes of this module
+    follow hard links, and soft links within the file, read plain numbers only, and compare a dataset's size with its
+    storage before anything is allocated.
+    """
 
 
 @contextmanager
 def open_h5(path: Path) -> Iterator[H5Group]:
-    """The root group of the file at `path`, for the time of the block.
+    """The root group of the file at `path`, open during the block.
 
     Raises:
-        OSError: it cannot be opened, or is no regular file, or no HDF5.
+        OSError: it cannot be opened, or is not a regular file of HDF5.
     """
     with open_regular_file(path) as file:
         size = os.fstat(file.fileno()).st_size
-    # Without a lock: a recorder that has the file open would be a reason to show nothing.
+    # Without a lock: a recorder may have the file open.
     with h5py.File(path, "r", locking=False) as opened:
         yield H5Group(opened, _Budget(size))
 
 
 class _Budget:
-    """What may still be taken out of an open file."""
+    """Remaining limits of an open file."""
 
     def __init__(self, file_size: int) -> None:
         self.file_size = file_size
@@ -87,7 +86,7 @@ class _Budget:
 
 
 class H5Group:
-    """A group; what is in it is looked up by names, or by a path of names with ``/`` between them."""
+    """A group; its content is looked up by name, or by a path with ``/``."""
 
     def __init__(self, group: h5py.Group, budget: _Budget, depth: int = 0) -> None:
         self._group, self._budget, self._depth = group, budget, depth
@@ -101,23 +100,23 @@ class H5Group:
         return self.get(path) is not None
 
     def __getitem__(self, path: str) -> H5Group | H5Dataset:
-        """Raises KeyError where there is nothing, and RefusedH5."""
+        """Raises KeyError if missing, and RefusedH5."""
         found = self.get(path)
         if found is None:
             raise KeyError(f"{self._where(path)} is missing")
         return found
 
     def get(self, path: str) -> H5Group | H5Dataset | None:
-        """None where there is nothing. Raises RefusedEditH5."""
+        """None if missing. Raises RefusedH5."""
         return self._follow(path, 0)
 
     def group(self, path: str) -> H5Group | None:
-        """None where there is none. Raises RefusedEditH5."""
+        """None if missing or not a group. Raises RefusedH5."""
         found = self.get(path)
         return found if isinstance(found, H5Group) else None
 
     def numbers(self, path: str) -> NDArray:
-        """All of a dataset. Raises KeyError where there is none, and RefusedH5."""
+        """All numbers of a dataset. Raises KeyError if there is none, and RefusedH5."""
         found = self[path]
         if not isinstance(found, H5Dataset):
             raise KeyError(f"{path} is a group, not numbers")
@@ -157,13 +156,13 @@ class H5Group:
 
 
 class H5Dataset:
-    """A dataset of this file. Nothing of it is read until it is asked for."""
+    """A dataset of this file, read on request."""
 
     def __init__(self, dataset: h5py.Dataset, budget: _Budget) -> None:
-        """Raises RefusedEditH5."""
+        """Raises RefusedH5."""
         self.name = str(dataset.name)
         creation = dataset.id.get_create_plist()
-        # Before its shape is asked for: HDF5 opens the files of a virtual dataset to say one.
+        # Before reading the shape: HDF5 opens the files of a virtual dataset for it.
         if creation.get_layout() == h5py.h5d.VIRTUAL:
             raise RefusedH5(
                 f"has {self._short} put together from other files (a virtual dataset), which are not read for it"
@@ -195,13 +194,13 @@ class H5Dataset:
         return self.shape[0] if self.shape else 0
 
     def read(self) -> NDArray:
-        """All of it. Raises RefusedEditH5."""
+        """All of it. Raises RefusedH5."""
         self._check_numbers()
         self._budget.take_bytes(self._short, self._size(self.shape))
         return _native(self._dataset[()])
 
     def row(self, number: int) -> NDArray:
-        """One of its rows. Raises RefusedEditH5, and IndexError where there is none."""
+        """Row `number`. Raises RefusedH5, and IndexError if there is none."""
         self._check_numbers()
         if not self.shape:
             raise RefusedH5(f"has one number where rows are looked for (at {self._short})")
@@ -214,7 +213,7 @@ class H5Dataset:
             raise RefusedH5(f"has {self._short} of type {self.dtype}, which is no plain number")
 
     def _check_size(self) -> None:
-        """Whether the file can hold what its shape claims."""
+        """Compare the size that its shape claims with its storage."""
         storage = self._dataset.id.get_storage_size()
         if storage > self._budget.file_size:
             raise RefusedH5(
@@ -238,6 +237,6 @@ class H5Dataset:
 
 
 def _native(numbers: NDArray) -> NDArray:
-    """With the bytes of each number in this machine's order, which torch asks for."""
+    """In this machine's byte order, which torch requires."""
     array = np.asarray(numbers)
     return array.astype(array.dtype.newbyteorder("="), copy=False)

@@ -1,12 +1,4 @@
-"""Write an episode as ManiSkill's own trajectory: an ``.h5`` with the columns and a ``.json`` that says what they are of.
-
-Whatever reads ManiSkill's demonstrations then reads ours: its replay, its datasets, the training code of half the field.
-Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1), one episode a file, ``traj_0``:
-
-- ``actions`` (T, A) float32, ``rewards`` (T,) float32, ``terminated``, ``truncated``, and ``success`` and ``fail`` if the task has them,
-  (T,) bool, ``env_states/{actors,articulations}/<name>`` (T + 1, D), ``obs/...`` (T + 1, ...).
-- the ``.json``: ``env_info``, ``commit_info``, ``episodes`` and ``source_type`` as there; ``workbench`` besides (see `document`).
-"""
+"""Writes an episode as ManiSkill's trajectory: columns in an ``.h5``, metadata in a ``.json``."""
 
 from __future__ import annotations
 
@@ -27,7 +19,7 @@ TRAJECTORY = "traj_0"
 _WORTH_PACKING = 8 << 10
 _CHUNK_BYTES = 256 << 10
 _LEVEL = 1
-"""Of zlib. Of numbers of a simulation level 4 takes away 1 % more, in a third more time."""
+"""Of zlib. On numbers of a simulation level 4 saves 1 % more, in a third more time."""
 _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
 
@@ -35,21 +27,26 @@ _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
 def write_h5(episode: Episode, path: Path) -> None:
     """Write `episode` to `path`, which must not exist.
 
+    Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1), one episode per file
+    as ``traj_0``, so programs that read ManiSkill's demonstrations read it: ``actions`` (T, A) float32, ``rewards`` (T,)
+    float32, ``terminated``, ``truncated``, and ``success`` and ``fail`` if the task has them, (T,) bool,
+    ``env_states/{actors,articulations}/<name>`` (T + 1, D), ``obs/...`` (T + 1, ...).
+
     Raises:
         OSError: it cannot be written.
-        ValueError: two of its columns want one name.
+        ValueError: HDF5 refuses a column.
     """
-    # In memory: HDF5 does not take a failing disk well, and leaves files half open.
+    # In memory: on a disk error HDF5 leaves files half open.
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         _put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
     with path.open("xb") as file:
         file.write(content.getbuffer())
-    h5py.File(path, "r").close()  # refuses a file that is shorter than it says of itself
+    h5py.File(path, "r").close()  # fails on a truncated file
 
 
 def _put_columns(episode: Episode, trajectory: h5py.Group) -> None:
-    # What is in the file, so that h5py, which is slow to say, need not be asked.
+    # Names in the file: asking h5py is slow.
     groups: dict[tuple[str, ...], h5py.Group] = {(): trajectory}
     taken: set[tuple[str, ...]] = set()
 
@@ -58,7 +55,7 @@ def _put_columns(episode: Episode, trajectory: h5py.Group) -> None:
         inside: tuple[str, ...] = ()
         while folders:
             folder = folders.pop(0)
-            if (*inside, folder) in taken:  # something is called "a", and something "a/b"
+            if (*inside, folder) in taken:  # one column is called "a", another "a/b"
                 leaf = "_".join([folder, *folders, leaf])
                 break
             if (*inside, folder) not in groups:
@@ -82,7 +79,7 @@ def _put_columns(episode: Episode, trajectory: h5py.Group) -> None:
 
 
 def _put(parent: h5py.Group, name: str, values: NDArray) -> None:
-    """By HDF5's own calls: h5py's take longer than the numbers."""
+    """Write a dataset by HDF5's low-level calls: h5py's high-level ones take longer than writing the numbers."""
     kind, space = h5py.h5t.py_create(values.dtype, logical=True), h5py.h5s.create_simple(values.shape)
     packing = _packing(values.shape, values.dtype)
     dataset = h5py.h5d.create(parent.id, name.encode(), kind, space, packing, _MAKES_UTF8)
@@ -91,10 +88,9 @@ def _put(parent: h5py.Group, name: str, values: NDArray) -> None:
 
 
 def _packing(shape: tuple[int, ...], dtype: np.dtype) -> h5py.h5p.PropDCID:
-    """How HDF5 is to keep a dataset: compressed where that saves more than the index of its chunks costs.
+    """Storage of a dataset: compressed if that saves more than the index of its chunks costs.
 
-    ManiSkill compresses pictures alone. Whoever reads it does not notice, as long as a chunk fits HDF5's cache of 1 MB: row by row is how
-    ManiSkill's replay reads.
+    A chunk must fit HDF5's cache of 1 MB: ManiSkill's replay reads row by row.
     """
     packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     packing.set_obj_track_times(False)
@@ -107,10 +103,12 @@ def _packing(shape: tuple[int, ...], dtype: np.dtype) -> h5py.h5p.PropDCID:
 
 
 def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path], sealed: bool) -> None:
-    """Write what is to be said of the episode, and of its other `files`, to `path`; they will lie in `folder`. Raises OSError.
+    """Write ManiSkill's metadata of the episode, and ours under ``workbench``, to `path`. Raises OSError.
 
     Args:
-        sealed: say by a seal that this installation recorded it.
+        folder: where the recording will lie.
+        files: its other two files.
+        sealed: add this installation's seal.
     """
     described = describe_json(episode, folder, files, sealed)
     content = json_text({**_maniskill_json(episode), "workbench": described}, indent=2).encode()

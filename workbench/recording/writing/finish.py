@@ -1,8 +1,4 @@
-"""From a journal to the three files of an episode: the one way in which recordings come to be.
-
-The writer that comes to its end and the process that finds a dead writer's journal do the same, so what is recovered
-is as good as what was never in danger.
-"""
+"""Turns journals into the files of recordings: at the end of an episode, or after its writer died."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ from workbench.recording.episode.document import WrongDocument, read_document
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.maniskill.write import write_h5, write_json
 from workbench.recording.rerun.write import write_rrd
-from workbench.recording.writing.from_journal import Header, episode_in, read_header, recovered
+from workbench.recording.writing.from_journal import Header, episode_in, mark_recovered, read_header
 from workbench.recording.writing.journal import (
     FOLDER,
     SCENE_SUFFIX,
@@ -35,7 +31,7 @@ SUFFIXES = (".rrd", ".h5", ".json")
 
 @dataclass(frozen=True)
 class EpisodeFiles:
-    """The files of one recording; without the .json the other two are not one."""
+    """The files of one recording; without the .json the other two do not count."""
 
     rrd: Path
     h5: Path
@@ -43,11 +39,11 @@ class EpisodeFiles:
 
 
 def make_files(journal: Path, header: Header, folder: Path, states: int | None = None) -> EpisodeFiles:
-    """Write the episode in `journal` to `folder`; the journal stays. `states` is how many it must hold, if that is known.
+    """Write the episode in `journal` to `folder`; the journal stays. `states`, if given, is checked.
 
     Raises:
-        RecordingError: the files cannot be written; none of them is there then.
-        ValueError: the journal holds no state, or what rerun refuses.
+        RecordingError: the files cannot be written; none of them exists then.
+        ValueError: the journal holds no state, or rerun refuses a value.
     """
     temporaries = temporary_files(journal)
     try:
@@ -73,21 +69,21 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
         ) from error
     finally:
         for path in temporaries:
-            # What stays is taken away by `recover`; the files are there, or it is to be told why they are not.
+            # `recover` deletes what stays; an error here must not hide the one above.
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
 
 def temporary_files(journal: Path) -> tuple[Path, ...]:
-    """What the files of an episode are called until they are whole."""
+    """Paths of an episode's files until they are complete."""
     return tuple(journal.with_suffix(suffix) for suffix in SUFFIXES)
 
 
 def episode_stem(info: EpisodeInfo) -> str:
     """``PushCube-v1_seed0003_env03_2026-11-21T08-15-30``: task, seed, env, local time of the recording.
 
-    A seed below 0 says that it is not known, and the name then says ``noseed``. Only letters, digits and ``_ -`` (a dot would end the
-    name for ManiSkill's replay); sorts by task, then seed, then env, then time. Two episodes of one second get the same, which `publish` keeps apart.
+    An unknown seed (below 0) gives ``noseed``. Only letters, digits and ``_ -``: ManiSkill's replay cuts a name at a dot.
+    Two episodes of one second get the same stem; `publish` makes it unique.
     """
     when = datetime.datetime.fromisoformat(info.written_at).astimezone()
     task = re.sub(r"[^A-Za-z0-9_-]+", "-", info.task).strip("-_")[:80] or "task"
@@ -99,18 +95,19 @@ def episode_stem(info: EpisodeInfo) -> str:
 
 
 def recover(folder: Path) -> list[EpisodeFiles]:
-    """Make an episode of every journal in `folder` whose writer is dead; episodes of live writers are left alone.
+    """Make recordings of all journals in `folder` whose writer is dead, which left its journal unlocked.
 
-    A journal without a control step is removed. Where one of several journals cannot be made an episode, the
-    others are, and the error is raised then.
+    A writer may die while recording, while making files, and between two names of one recording; its journal is there
+    in each case. A journal without a control step is deleted. When one journal fails, the error is raised after the
+    others are done.
 
     Raises:
-        RecordingError: files cannot be written, or the folder or a journal not read; the journals stay.
-        MemoryError: for a journal; the others are done.
+        RecordingError: files cannot be written, or the folder or a journal cannot be read; the journals stay.
+        MemoryError: a journal needs too much memory; the others are done.
     """
     folder = Path(folder)
     if (folder / FOLDER).is_symlink():
-        # Strays are removed there: another folder's files would be.
+        # `_remove_strays` would delete files of another folder.
         raise RecordingError(f"Cannot recover what lies in {folder}: {FOLDER} is a link to another folder")
     made: list[EpisodeFiles] = []
     failed: Exception | None = None
@@ -120,7 +117,7 @@ def recover(folder: Path) -> list[EpisodeFiles]:
                 if (files := _recover(journal, folder)) is not None:
                     made.append(files)
             except Exception as error:
-                # Of any kind: nobody knows what lies there, and the others are whole.
+                # Of any type: a broken journal must not keep the others from being recovered.
                 failed = error
         _remove_strays(folder)
         remove_empty_folder(folder)
@@ -143,7 +140,7 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
         with contextlib.closing(JournalReader(journal)) as reader:
             header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
             if header is not None and not _already_made(header.info, journal, folder):
-                header = recovered(header)
+                header = mark_recovered(header)
                 episode = episode_in(reader, header)
                 if episode is not None and episode.length > 0:
                     files = make_files(journal, header, folder)
@@ -154,7 +151,7 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
 
 
 def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> bool:
-    """Whether the writer had come to its end; takes away what it had named of files that are not all there."""
+    """Whether the writer had published its files; deletes files of an incomplete publication."""
     temporaries = dict(zip(SUFFIXES, temporary_files(journal)))
     for stem in _stems(folder, episode_stem(info)):
         if _id_of(folder / f"{stem}.json") == info.id:
@@ -169,7 +166,7 @@ def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> bool:
 
 
 def _stems(folder: Path, stem: str) -> Iterator[str]:
-    """Those of the names that the recording may have got which are taken."""
+    """Stems in use among the candidates for the recording."""
     for candidate in candidates(stem):
         if not any((folder / f"{candidate}{suffix}").exists() for suffix in SUFFIXES):
             return
@@ -184,7 +181,7 @@ def _id_of(path: Path) -> str | None:
 
 
 def _remove_strays(folder: Path) -> None:
-    """Files of a recording whose journal is gone: its writer died while it cleaned up."""
+    """Delete temporary files without a journal: their writer died while it cleaned up."""
     for path in (folder / FOLDER).glob("*"):
         if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not path.with_suffix(".arrow").exists():
             path.unlink(missing_ok=True)

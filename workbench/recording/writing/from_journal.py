@@ -1,10 +1,4 @@
-"""An episode as its journal tells it: its columns whole, its pictures where they lie until one is asked for.
-
-Both formats must be told beforehand what is only known afterwards: how long the episode is, which entries
-``evaluate()`` gave in the end and of which type, which bodies never moved. An hour of an episode is a hundred megabytes of
-numbers, which are put together at once; but its pictures are more than a machine holds, so they are
-read a second time, while the file that they go to is written.
-"""
+"""Reads an episode back from its journal."""
 
 from __future__ import annotations
 
@@ -38,7 +32,7 @@ from workbench.recording.writing.journal import JournalEntry, JournalReader
 
 @dataclass(frozen=True)
 class Header:
-    """What is known of an episode when it begins."""
+    """What is known when an episode begins."""
 
     info: EpisodeInfo
     geometry: SceneGeometry
@@ -46,7 +40,7 @@ class Header:
     action_names: tuple[str, ...]
     cameras: tuple[CameraInfo, ...]
     made_here: bool = True
-    """Its episode was recorded by this installation: not so of a journal that came with a folder from elsewhere."""
+    """Recorded by this installation; False for a journal in a folder from elsewhere."""
 
     @property
     def bodies(self) -> int:
@@ -70,10 +64,10 @@ def header_text(header: Header) -> str:
 
 
 def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
-    """The inverse of `header_text`; the meshes lie beside it. Raises ValueError, KeyError or TypeError."""
+    """The inverse of `header_text`, with the meshes in `visuals`. Raises ValueError, KeyError or TypeError."""
     data = json.loads(text)
     num_envs, names, kinds, hidden = data["bodies"]
-    # A journal of an earlier version holds it as an object, without a seal.
+    # Journals of earlier versions hold an object, without a seal.
     info = data["info"] if isinstance(data["info"], str) else json.dumps(data["info"])
     return Header(
         info=_info_from(json.loads(info)),
@@ -89,29 +83,29 @@ def _info_from(data: Mapping[str, Any]) -> EpisodeInfo:
     return EpisodeInfo(**{**data, "acted_by": parse_acted_by(data.get("acted_by")), "seal": None})
 
 
-def recovered(header: Header) -> Header:
+def mark_recovered(header: Header) -> Header:
     return replace(header, info=replace(header.info, recovered=True))
 
 
 def read_header(journal: JournalReader, visuals: tuple[Visual, ...]) -> Header | None:
-    """None where the journal ends before its header.
+    """None if the journal ends before its header.
 
     Raises:
         OSError: the journal cannot be read.
-        ValueError: it begins with something else: it is of a later version, or none of ours.
+        ValueError: its header is invalid: a later version wrote it, or another program.
     """
     for _, entries in journal:
         try:
             return header_from(entries[0].value.decode(), visuals)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            why = f"{journal.path.name} is no recording that this version can read; a later one may, else remove it"
+            why = f"this version cannot read {journal.path.name}: use a later one, or delete the file"
             raise ValueError(why) from error
     return None
 
 
 @dataclass
-class _Seen:
-    """What the journal has of one camera."""
+class _CameraEntries:
+    """A camera's entries in the journal."""
 
     frames: list[int] = field(default_factory=list)
     poses: list[bytes] = field(default_factory=list)
@@ -127,14 +121,16 @@ class _Seen:
 
 
 def episode_in(journal: JournalReader, header: Header) -> Episode | None:
-    """The episode that began as `header` says, with the scene of its whole batch; None where there is no state yet.
+    """The journal's episode, with the scene of its whole batch; None if it has no state.
 
-    Its pictures can be had for as long as the journal is open. Raises OSError.
+    The numbers of an hour are a hundred megabytes and are read at once, since both file formats need whole columns:
+    length, types and static bodies are known only at the end. Pictures would not fit into memory, so they are read when
+    they are written to a file: keep the journal open until then. Raises OSError.
     """
     layouts: list[np.dtype] = []
     runs: list[tuple[int, list[bytes]]] = []
-    """Layout, and the rows of it that follow each other."""
-    seen = [_Seen() for _ in header.cameras]
+    """Layout, and consecutive rows in it."""
+    seen = [_CameraEntries() for _ in header.cameras]
     acted = list(header.info.acted_by)
     texts: list[tuple[int, bytes]] = []
     for place, (kind, number, value) in _complete_states(journal):
@@ -182,7 +178,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
 
 
 def _complete_states(journal: JournalReader) -> Iterator[tuple[tuple[int, int], JournalEntry]]:
-    """The entries of states that are there with all that belongs to them, their row last, and where they lie."""
+    """Place and entry of all complete states; the row of each comes last."""
     held: list[tuple[tuple[int, int], JournalEntry]] = []
     for begin, entries in journal:
         for row, entry in enumerate(entries):
@@ -196,4 +192,4 @@ def _modality(name: str) -> Modality:
     for modality in MODALITIES:
         if modality == name:
             return modality
-    raise ValueError(f"{name} is no modality of a picture")
+    raise ValueError(f"{name} is not a modality")

@@ -1,28 +1,4 @@
-"""What has happened of an episode so far, on the disk: what is left of it when its writer is killed.
-
-The files of an episode can only be written when it is over (rerun's index comes last, HDF5 cannot be cut, both
-want whole columns), and by then it may be too late: the task's own code runs here, and it hangs, eats the memory, or takes
-native code down. So every row goes into a journal first, ``.writing/<id>.arrow`` in the recordings' folder, and the files are
-made from the journal, by the writer at the end or by the next process that finds it (`recover`).
-
-A journal is an Arrow stream of one table, ``kind``, ``number`` and ``value``, which may end anywhere: what was written whole can be
-read. A state's pictures come before its row, so a state is there with all of its pictures or not at all:
-
-- ``header``: JSON; the scene's meshes lie beside it (`scene_file`);
-- ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: a row of that layout, or several one behind the other;
-- ``acted`` `action`: text of what chooses the actions from this one on, where the header does not say it;
-- ``entry`` `state`: JSON of an entry of ``evaluate()`` that is no number and changes here (`columns.TextWriter`);
-- ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
-
-A row is on the disk within half a second, and its owner does not wait for that: one thread for all journals of the process writes
-what has gathered and makes it last. While a journal is written its file is locked (``flock``), which the system undoes when the
-process dies, however it dies: that is how the dead are told from the living.
-
-An episode that is to survive its writer needs the scene's meshes on the disk from its first row on. They are megabytes
-(ManiSkill's table alone has a texture of 4 MB), and sixty-four envs begin an episode at once. So all
-episodes of one process and one scene share one file: each has a name of its own for it, a hard link, and the file is gone
-when the last name is. Plain arrays and a line of JSON in numpy's own archive, which checks what it reads and runs no code.
-"""
+"""The crash-safe log of a running episode."""
 
 from __future__ import annotations
 
@@ -52,11 +28,11 @@ from workbench.machine.files import open_regular_file
 FOLDER = ".writing"
 SCENE_SUFFIX = ".scene"
 SYNC_SECONDS = 0.4
-"""How long a row may wait before it is written."""
+"""Interval of writing."""
 _BATCH_BYTES = 2 << 20
-"""More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
+"""Beyond this `append` writes by itself: memory stays bounded when the disk is slower than the episode."""
 _MOST_BATCHES = 4
-"""Of a journal that is read: pictures of some states are asked for camera by camera."""
+"""Cached while reading: pictures of the same states are read camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
 
@@ -70,7 +46,24 @@ JournalItem = JournalEntry | Future[list[JournalEntry]]
 
 
 class Journal:
-    """A journal that is being written."""
+    """The journal of a running episode, ``.writing/<id>.arrow`` in the recordings' folder.
+
+    The files of an episode can only be written when it is over (rerun's index comes last, HDF5 cannot be truncated, both
+    need whole columns), and the task's code may hang, use up the memory or crash before that. So every row goes into a
+    journal, from which the writer or the next process makes the files (`finish.recover`).
+
+    It is an Arrow stream of one table, ``kind``, ``number`` and ``value``, that may end anywhere. A state's pictures come
+    before its row, so a state is complete or missing:
+
+    - ``header``: JSON; the scene's meshes are in a file next to it (`write_scene`);
+    - ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: one or several consecutive rows of that layout;
+    - ``acted`` `action`: source of the actions from this one on, if it differs from the header's;
+    - ``entry`` `state`: JSON of an entry of ``evaluate()`` that is not a number and changes here (`columns.TextWriter`);
+    - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
+
+    One thread writes and syncs all journals of the process every `SYNC_SECONDS`. The file is locked (``flock``) while it
+    is written; the system releases the lock of a dead process, which tells dead writers from live ones.
+    """
 
     def __init__(self, path: Path) -> None:
         """Begin the journal `path`, which must not exist; its folder is made. Raises OSError."""
@@ -80,7 +73,7 @@ class Journal:
         self._size = 0
         self._waiting: list[JournalItem] = []
         self._waiting_bytes = 0
-        self._lock = threading.Lock()  # of what waits; never held while the disk works
+        self._lock = threading.Lock()  # of `_waiting`; not held during disk access
         self._writing = threading.Lock()
         self._error: OSError | None = None
         try:
@@ -88,7 +81,7 @@ class Journal:
             with self._writing:
                 self._put(_SCHEMA.serialize())
         except OSError:
-            with contextlib.suppress(OSError):  # what is to be told is why it cannot be begun
+            with contextlib.suppress(OSError):  # report the first error
                 self.remove()
             raise
         _journal_thread.watch(self)
@@ -99,12 +92,12 @@ class Journal:
         return self._size + self._waiting_bytes
 
     def append(self, *items: JournalItem) -> None:
-        """What belongs together, and will be on the disk soon: a state, its row last.
+        """Queue the entries of a state, its row last.
 
-        Entries that somebody is still working at keep their place, and whoever writes waits for them, not the owner.
+        Pending entries keep their place; the writing thread waits for them, not the caller.
 
         Raises:
-            OSError: something that was appended before could not be written, or not be made; this is not kept then.
+            OSError: an earlier entry could not be written or encoded; this state is not queued.
         """
         if self._error is not None:
             raise self._error
@@ -117,10 +110,10 @@ class Journal:
             if not isinstance(item, JournalEntry):
                 item.add_done_callback(self._weigh)
         if full:
-            self.write()  # where that fails the next one is told: this one is kept
+            self.write()  # an error is raised by the next `append`: this state is queued
 
     def write(self) -> None:
-        """Hand what was appended to the system: a process that dies now loses nothing of it."""
+        """Write what was queued: it survives the death of the process."""
         with self._writing:
             if self._error is not None or not self._closer.alive:
                 return
@@ -151,14 +144,14 @@ class Journal:
                 self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
-        """Write what was appended and make it last, also through a power cut. An error is raised by the next `append`."""
+        """Write what was queued and sync it: it survives a power cut. An error is raised by the next `append`."""
         self._flush(os.fsync)
 
     def finish(self) -> None:
-        """Write everything and stop writing; the file stays locked until `close`.
+        """Write everything and stop the periodic writing; the file stays locked until `close`.
 
-        A process that dies loses nothing of it. For a power cut `sync` it, where it is not to be replaced by something better at once.
-        What could not be written before is tried again. Raises OSError where something still cannot.
+        It is not synced: files replace it at once. Entries that could not be written are tried again; raises OSError if
+        they fail again.
         """
         _journal_thread.forget(self)
         self._error = None
@@ -180,20 +173,20 @@ class Journal:
                 self._error = error
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close and unlock the file."""
         _journal_thread.forget(self)
         with self._writing:
             self._closer()
 
     def remove(self) -> None:
-        """Close, and take the file away."""
+        """Close and delete the file."""
         try:
             self.path.unlink(missing_ok=True)
         finally:
             self.close()
 
     def _put(self, content: pa.Buffer) -> None:
-        # Where half a batch was written before, this one holds all of that and goes to its place: behind it nobody would find it.
+        # After a partial write overwrite at the same offset: a reader stops at an incomplete batch.
         view, end = memoryview(content), self._size
         while view:
             written = os.pwrite(self._descriptor, view, end)
@@ -202,7 +195,7 @@ class Journal:
 
 
 def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSError | None]:
-    """Their entries, and how many of them these are. Where one cannot be made, those of the states before it."""
+    """Entries of `items`, and how many items they are; on an error only those of complete states before it."""
     entries: list[JournalEntry] = []
     whole, done = 0, 0
     for number, item in enumerate(items, 1):
@@ -228,13 +221,13 @@ def _create(path: Path) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        except FileNotFoundError:  # another writer was done and took the empty folder away just now
+        except FileNotFoundError:  # another writer removed the empty folder just now
             continue
-    raise FileNotFoundError(errno.ENOENT, "the folder vanishes as soon as it is made")
+    raise FileNotFoundError(errno.ENOENT, "another process keeps removing the folder")
 
 
 class _JournalThread:
-    """The thread that writes what has gathered in all journals of this process, while there are any."""
+    """Writes all journals of this process periodically, on a thread that runs while there are any."""
 
     def __init__(self) -> None:
         self._journals: set[Journal] = set()
@@ -273,7 +266,7 @@ class _JournalThread:
             with self._changed:
                 journals = list(self._journals)
             for journal in journals:
-                journal.write()  # all of them before the first fsync, which may take its time
+                journal.write()  # all of them before the first fsync, which may take long
             for journal in journals:
                 journal.sync()
 
@@ -282,15 +275,15 @@ _journal_thread = _JournalThread()
 
 
 def before_writing(flush: Callable[[], None]) -> None:
-    """Have the bound method `flush` called before journals are written, while its object lives: for who holds rows back.
+    """Call the bound method `flush` before each write, while its object lives: for a caller that batches rows.
 
-    On the thread of the journals, so it must not raise.
+    It runs on the journals' thread and must not raise.
     """
     _journal_thread.before.append(weakref.WeakMethod(flush))
 
 
 class JournalReader:
-    """A journal that is read, as far as it was written whole."""
+    """Reads a journal up to its last complete batch."""
 
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
@@ -299,7 +292,7 @@ class JournalReader:
         self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
 
     def __iter__(self) -> Iterator[tuple[int, list[JournalEntry]]]:
-        """Its entries, a batch at a time, and where that begins. Raises OSError."""
+        """Offset and entries of each batch. Raises OSError."""
         try:
             self._file.seek(0)
             if pa.ipc.read_schema(self._file) != _SCHEMA:
@@ -315,15 +308,15 @@ class JournalReader:
         except (EOFError, pa.ArrowInvalid):
             return
         except OSError as error:
-            if error.errno is not None:  # of the disk, and not Arrow's, whose own has no number
+            if error.errno is not None:  # Arrow's own OSErrors have no errno
                 raise
 
     def value(self, place: tuple[int, int]) -> bytes:
-        """Of the entry of that number in the batch that begins there."""
+        """Value of an entry: `place` is its batch's offset and its number in the batch."""
         return self._batch(place[0])[0].column(2)[place[1]].as_py()
 
     def _read(self, begin: int) -> tuple[pa.RecordBatch, int]:
-        """The batch that begins there, and where it ends. Raises OSError, EOFError or ArrowInvalid where there is none."""
+        """The batch at offset `begin`, and its end. Raises OSError, EOFError or ArrowInvalid if it is incomplete."""
         self._file.seek(begin)
         return pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA), self._file.tell()
 
@@ -333,7 +326,7 @@ class JournalReader:
 
 
 def remove_empty_folder(folder: Path) -> None:
-    """Take the folder of the journals away if nothing is in it."""
+    """Remove the folder of the journals if it is empty."""
     try:
         os.rmdir(folder / FOLDER)
     except OSError:  # not empty, or not there
@@ -341,19 +334,19 @@ def remove_empty_folder(folder: Path) -> None:
 
 
 def claim(path: Path) -> int | None:
-    """Lock the journal `path` of a dead writer; None where its writer lives, or somebody else is at it, or it is gone.
+    """Lock the journal of a dead writer; None if another process holds the lock, or the file is gone.
 
-    The lock lasts until the descriptor that is returned is closed.
+    The lock lasts until the returned descriptor is closed.
     """
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
-            return None  # no writer makes such
+            return None  # not made by a writer
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.fstat(descriptor).st_nlink > 0:  # else whoever held it has just finished with it
+        if os.fstat(descriptor).st_nlink > 0:  # else its holder has just deleted it
             return descriptor
     except BlockingIOError:
         pass
@@ -364,8 +357,7 @@ def claim(path: Path) -> int | None:
     return None
 
 
-# --- The meshes of a scene in a file of their own, while episodes of it are being recorded ----
-
+# --- the scene's meshes ------------------------------------------------------------------------
 
 _MESH = tuple(field.name for field in fields(Mesh))
 _lock = threading.Lock()
@@ -373,21 +365,26 @@ _last: tuple[weakref.ref[SceneGeometry], Path] | None = None
 
 
 def write_scene(geometry: SceneGeometry, path: Path) -> None:
-    """Have `geometry` in the file `path`, which must not exist. Raises OSError."""
+    """Write `geometry` to `path`, which must not exist. Raises OSError.
+
+    Meshes must be on the disk from the first row on. They are megabytes (ManiSkill's table alone has a texture of 4 MB),
+    and sixty-four envs begin an episode at once. So episodes of one scene share one file by hard links. The format is
+    numpy's archive of plain arrays and a line of JSON, which is validated on reading and executes no code.
+    """
     global _last
     with _lock:
         if _last is not None and _last[0]() is geometry and _last[1].parent == path.parent:
             try:
                 os.link(_last[1], path)
                 return
-            except OSError:  # that episode is over and its file gone, or the filesystem has no links
+            except OSError:  # that episode's file is deleted, or the filesystem has no links
                 pass
         _write(geometry, path)
         _last = (weakref.ref(geometry), path)
 
 
 def read_visuals(path: Path) -> tuple[Visual, ...]:
-    """The visuals of what `write_scene` kept; none where the file is missing or broken."""
+    """The visuals in a file of `write_scene`; none if it is missing or broken."""
     try:
         with open_regular_file(path) as file, np.load(file, allow_pickle=False) as archive:
             return tuple(_visuals(archive))

@@ -1,9 +1,4 @@
-"""Where the files of an episode are written to, and how they get their names: whole and together, or not at all.
-
-A recording outlives its session, so it must not lie: not half written after a full disk, not short of a camera, not written
-over yesterday's. The files of an episode are made under temporary names in a folder beside the journal, checked there (the .rrd by its end, the .h5 by opening it), and only
-then linked to their names, the .json last. **What has no .json is not there.**
-"""
+"""Gives the files of a recording their names: all of them complete, or none."""
 
 from __future__ import annotations
 
@@ -20,14 +15,14 @@ from workbench.machine.files import give_name
 
 
 class RecordingError(OSError):
-    """An episode could not be written; the message says what to do. No file was left behind."""
+    """An episode could not be written; the message says what to do. No file was left."""
 
 
 def try_folder(folder: Path) -> None:
-    """Find out whether recordings can be written to `folder`, which may be missing, before minutes are spent on making one.
+    """Check that recordings can be written to `folder`, which may be missing, before minutes are spent on one.
 
     Raises:
-        RecordingError: they cannot.
+        RecordingError: they cannot be written.
     """
     there = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
     try:
@@ -38,7 +33,7 @@ def try_folder(folder: Path) -> None:
 
 
 def sync_files(paths: Sequence[Path]) -> None:
-    """Have the disk take all of `paths`; at the same time, since each alone waits a few milliseconds. Raises OSError."""
+    """Sync all of `paths` at once, since each waits a few milliseconds. Raises OSError."""
     errors: list[OSError] = []
 
     def sync(path: Path) -> None:
@@ -58,12 +53,13 @@ def sync_files(paths: Sequence[Path]) -> None:
 
 
 def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
-    """Give finished files (``<id>.rrd``, ``<id>.h5`` ...) the first stem that is free for all of them, in their order.
+    """Link finished files (``<id>.rrd``, ``<id>.h5`` ...) to the first stem that is free for all of them, in order.
 
-    Two processes that race get two names. The temporaries stay, if the filesystem has links.
+    The .json comes last: **a recording without a .json does not exist.** Racing processes get different names. The
+    temporaries stay if the filesystem has links.
 
     Raises:
-        OSError: none of them has a name then.
+        OSError: none of them has a name.
     """
     for candidate in candidates(stem):
         paths = [folder / f"{candidate}{temporary.suffix}" for temporary in temporaries]
@@ -96,12 +92,12 @@ def candidates(stem: str) -> Iterator[str]:
 
 def _remove(paths: Sequence[Path]) -> None:
     for path in reversed(paths):
-        with contextlib.suppress(OSError):  # what is to be told is why the others have no name
+        with contextlib.suppress(OSError):  # report the first error
             path.unlink(missing_ok=True)
 
 
 def sync_folder(path: Path) -> None:
-    """Make a new name last: without this a power cut may take it, though not the file's content."""
+    """Sync a folder: otherwise a power cut may lose a new name in it, though not the file's content."""
     _sync(path)
 
 
@@ -114,7 +110,7 @@ def _sync(path: Path) -> None:
 
 
 def reason(error: OSError, folder: Path) -> str:
-    """Why `folder` could not be written to, and what to do about it."""
+    """Why `folder` could not be written to, and what to do."""
     there = next((parent for parent in (folder, *folder.parents) if parent.is_dir()), None)
     if error.errno in (errno.ENOSPC, errno.EDQUOT) or (
         there is not None and shutil.disk_usage(there).free < 1 << 20
@@ -129,5 +125,5 @@ def reason(error: OSError, folder: Path) -> str:
     if error.errno == errno.EFBIG:
         return "the file is larger than the system allows. Record shorter episodes, or lift the limit (ulimit -f)."
     if error.errno == errno.ENOENT:
-        return f"{folder} was removed while it was written to. Record again; it is made anew."
+        return f"{folder} was removed while it was written to. Record again: the folder is created again."
     return f"{error.strerror or error}."
