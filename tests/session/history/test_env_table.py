@@ -136,7 +136,7 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(event
         moment = history.add(Stepped(step, mask, restored=restored))
         for name, flag in (("success", SUCCESS), ("fail", FAIL)):
             now = [kind == "step" and e.first.get(name) == e.steps for e in episodes]
-            assert ((moment.happened & flag) > 0).tolist() == now
+            assert ((moment.event_flags & flag) > 0).tolist() == now
         seen.append(deepcopy((episodes, last)))
 
     rows = history.env_rows()
@@ -309,7 +309,7 @@ def test_a_success_that_is_no_bool_counts_and_other_numbers_do_not() -> None:
     )
     rows = history.env_rows()
     assert rows.first_true["success"].tolist() == [-1, 1, -1] and not {"distance", "each"} & {*rows.first}
-    assert (moment.happened & SUCCESS > 0).tolist() == [False, True, False]
+    assert (moment.event_flags & SUCCESS > 0).tolist() == [False, True, False]
     assert rows.outcome.tolist() == [Outcome.RUNNING, Outcome.SUCCESS, Outcome.RUNNING]
 
 

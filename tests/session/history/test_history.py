@@ -167,7 +167,7 @@ def test_what_was_judged_anew_counts_its_bytes_once() -> None:
     history = filled(3)
     before, first = history.used, history.at(2).step
     for reward in (7.0, 8.0):
-        history.renew_last(replace(first, reward=np.full(N, reward, np.float32)))
+        history.replace_last(replace(first, reward=np.full(N, reward, np.float32)))
     grown = history.used - before
     assert 0 < grown < 2500
     history.limit = 1
@@ -177,10 +177,10 @@ def test_what_was_judged_anew_counts_its_bytes_once() -> None:
 
 def test_the_newest_reset_has_no_reward_whatever_a_newer_version_says() -> None:
     history = filled(1)
-    renewed = history.renew_last(replace(history.at(0).step, reward=np.ones(N, np.float32)))
+    renewed = history.replace_last(replace(history.at(0).step, reward=np.ones(N, np.float32)))
     assert np.isnan(renewed.reward).all() and np.isnan(history.rewards(0, 0, 0)).all()
     empty = History(table(), 10**9)
-    assert empty.renew_last(renewed) is renewed and len(empty) == 0
+    assert empty.replace_last(renewed) is renewed and len(empty) == 0
 
 
 def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to() -> None:
@@ -200,7 +200,7 @@ def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to() -> Non
 def test_serials_go_on_from_the_history_before() -> None:
     history = History(table(), 10**9, first_serial=70)
     assert (history.first, history.last, len(history)) == (70, 69, 0)
-    assert history.at(70) is None and history.stretches(0) == []
+    assert history.at(70) is None and history.segments(0) == []
     history.add(stepped(0, jumped=(0, 1, 2), keys=(1,), new={1: b"p"}))
     history.add(stepped(1, success=(2,)))
     assert history.at(69) is None and history.at(72) is None and history.at(71).number == 1
@@ -235,15 +235,15 @@ def test_a_stretch_is_what_an_env_lived_through_without_a_jump() -> None:
     history = filled(4)
     history.add(stepped(0, jumped=(1,)))
     history.add(stepped(1))
-    assert history.stretches(1) == [(0, 3), (4, 5)]
-    assert history.stretches(0) == [(0, 5)]
-    assert history.stretch_at(1, 2) == (0, 3)
-    assert history.stretch_at(1, 5) == (4, 5)
+    assert history.segments(1) == [(0, 3), (4, 5)]
+    assert history.segments(0) == [(0, 5)]
+    assert history.segment_at(1, 2) == (0, 3)
+    assert history.segment_at(1, 5) == (4, 5)
 
 
 def test_a_stretch_whose_start_was_dropped_is_what_is_kept_of_it() -> None:
     history = filled(100, 60_000)
-    assert history.first > 0 and history.stretches(0) == [(history.first, 99)]
+    assert history.first > 0 and history.segments(0) == [(history.first, 99)]
     assert history.episode(0, 99)[0][0].serial == history.first
 
 
@@ -257,7 +257,7 @@ def test_undo_goes_back_through_the_jumps_one_by_one() -> None:
     before = history.last_jump(1)
     assert before is not None and before.serial == 3
     other = history.last_jump(0)
-    assert other is not None and other.serial == 3 and history.moved_last_by(other) == (0, 1, 2)
+    assert other is not None and other.serial == 3 and history.envs_still_at(other) == (0, 1, 2)
     history.add(stepped(0, jumped=(0, 1, 2), restored=Restored((0, 1, 2), (0, 1, 2), 2, 3, {})))
     assert history.last_jump(1) is None, "what it did in the future that was left is none of what it lives"
 
@@ -278,7 +278,7 @@ def test_what_a_newer_version_says_of_a_moment_is_not_its_record() -> None:
     history = filled(3)
     first = history.at(2).step  # type: ignore[union-attr]
     for reward in (7.0, 8.0):
-        history.renew_last(replace(first, reward=np.full(N, reward, np.float32)))
+        history.replace_last(replace(first, reward=np.full(N, reward, np.float32)))
     moment = history.at(2)
     assert moment is not None and moment.as_recorded is first and moment.step.reward[0] == 8.0
     assert history.rewards(0, 2, 2).tolist() == [8.0]
@@ -330,7 +330,7 @@ def test_the_moments_of_an_episode_are_its_steps_through_what_it_was_put_back_to
 def test_the_way_to_a_moment_begins_at_the_last_exact_point() -> None:
     history = filled(6)  # a reset and steps 1 to 5
     assert way(history, 0, 5) == (0, 0, 5)
-    assert history.way_to(0, 0, 100) is None, "the reset itself is put there"
+    assert history.replay_path(0, 0, 100) is None, "the reset itself is put there"
     history.add(stepped(6, jumped=(0,), restored=Restored((0,), (1,), 3, None, {})))
     history.add(stepped(7))
     assert way(history, 0, 7) == (6, 0, 1), "a moment that was put there is an exact point"
@@ -339,15 +339,15 @@ def test_the_way_to_a_moment_begins_at_the_last_exact_point() -> None:
     history.add(stepped(8, jumped=(0,), restored=episode_backwards))
     history.add(stepped(9))
     assert way(history, 0, 9) == (0, 1, 4), "one that was lived up to is none: on from where it began"
-    assert history.way_to(0, 9, 3) is None, "more steps than may be made"
+    assert history.replay_path(0, 9, 3) is None, "more steps than may be made"
     history.add(stepped(10, jumped=(0,), restored=Restored((0,), (0,), NO_MOMENT, None, {}, "a recording")))
     history.add(stepped(11))
-    assert history.way_to(0, 11, 100) is None and way(history, 2, 11) == (0, 2, 8)
+    assert history.replay_path(0, 11, 100) is None and way(history, 2, 11) == (0, 2, 8)
 
 
 def way(history: History, env: int, serial: int) -> tuple[int, int, int]:
     """Its beginning, the env then, and how many steps it has."""
-    found = history.way_to(env, serial, 100)
+    found = history.replay_path(env, serial, 100)
     assert found is not None
     return found.start, found.source, len(found.actions)
 
@@ -378,7 +378,7 @@ def test_there_is_no_way_from_a_point_that_cannot_be_put_there() -> None:
     history = filled(2)
     history.add(stepped(2, jumped=(0, 1, 2), keys=(1, 99)))
     history.add(stepped(3))
-    assert history.way_to(0, 3, 100) is None and way(history, 0, 1) == (0, 0, 1)
+    assert history.replay_path(0, 3, 100) is None and way(history, 0, 1) == (0, 0, 1)
 
 
 def test_what_may_happen_can_happen_at_once() -> None:

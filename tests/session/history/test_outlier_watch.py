@@ -33,7 +33,7 @@ def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np
 
 
 def found(watch: OutlierWatch, poses: np.ndarray) -> dict[Kind, list[int]]:
-    return {sight.kind: np.flatnonzero(sight.envs).tolist() for sight in watch.look(step_of(poses))}
+    return {sight.kind: np.flatnonzero(sight.envs).tolist() for sight in watch.check(step_of(poses))}
 
 
 def lowered(poses: np.ndarray, by: float, envs: list[int]) -> np.ndarray:
@@ -75,12 +75,12 @@ def test_the_worst_body_is_named_with_how_bad_it_is() -> None:
     there = poses.copy()
     there[1, 2, 1] += 1.5
     there[1, 3, 0] -= 2.0
-    [sight] = watch.look(step_of(there))
+    [sight] = watch.check(step_of(there))
     assert (sight.kind, sight.reason(1)) == (Kind.FAST, "cube moved at 40 m/s")
     watch, poses = watched(2)
     high = lowered(poses, -3.0, [0, 1])
     watch.begin(np.ones(2, bool), step_of(high))
-    [sight] = watch.look(step_of(lowered(high, 0.75, [0])))
+    [sight] = watch.check(step_of(lowered(high, 0.75, [0])))
     assert (sight.kind, sight.reason(0)) == (Kind.DROPPED, "cube dropped 0.75 m")
 
 
@@ -93,7 +93,7 @@ def test_under_the_floor_is_so_far_below_the_lowest_that_stands_still() -> None:
         there[1, 2, 2] = z
         watch.begin(np.ones(2, bool), step_of(there))
         assert list(found(watch, there)) == expected
-    assert [s.reason(1) for s in watch.look(step_of(there))] == ["arm/hand is under the floor"]
+    assert [s.reason(1) for s in watch.check(step_of(there))] == ["arm/hand is under the floor"]
 
 
 def test_a_scene_with_other_bodies_than_before_is_not_compared() -> None:
@@ -126,7 +126,7 @@ def test_a_reward_is_odd_outside_the_range_of_its_mode_or_no_number(
     step = step_of(poses)
     rewards = step.reward.copy()
     rewards[1] = reward
-    sights = watch.look(replace(step, reward=rewards))
+    sights = watch.check(replace(step, reward=rewards))
     assert [sight.reason(1) for sight in sights] == ([] if said is None else [said])
     assert all(np.flatnonzero(sight.envs).tolist() == [1] for sight in sights)
 
@@ -138,13 +138,13 @@ def test_numbers_of_evaluate_and_actions_that_are_none_are_named() -> None:
     action = np.zeros((3, 4), np.float32)
     action[0, 3] = np.nan
     flags = {"success": np.zeros(3, bool), "distance": distance, "count": np.zeros(3, np.int64)}
-    sights = watch.look(replace(step_of(poses), action=action, evaluate=flags))
+    sights = watch.check(replace(step_of(poses), action=action, evaluate=flags))
     said = {int(np.flatnonzero(s.envs)[0]): s.reason(int(np.flatnonzero(s.envs)[0])) for s in sights}
     assert said == {0: "the action is NaN", 2: "distance is infinite"}
     none = replace(
         step_of(poses), action=np.zeros((3, 0), np.float32), sound_obs=np.array([True, False, True])
     )
-    [sight] = watch.look(none)
+    [sight] = watch.check(none)
     assert sight.envs.tolist() == [False, True, False]
 
 
@@ -160,10 +160,10 @@ def test_poses_that_are_lost_are_named_and_bodies_that_were_never_there_are_not(
     geometry, poses = table_scene(2)
     poses[0, 2] = np.nan  # env 0 has no hand
     watch = OutlierWatch(geometry, step_of(poses), 0.05, "dense")
-    assert watch.look(step_of(poses)) == []
+    assert watch.check(step_of(poses)) == []
     lost = poses.copy()
     lost[1, 3] = np.nan
-    [sight] = watch.look(step_of(lost))
+    [sight] = watch.check(step_of(lost))
     assert sight.envs.tolist() == [False, True] and sight.reason(1) == "the pose of cube is NaN"
 
 
@@ -173,7 +173,7 @@ def test_a_speed_below_the_limit_is_none() -> None:
         watch = OutlierWatch(geometry, step_of(poses), 0.05, "dense")
         there = poses.copy()
         there[0, 3, 1] += speed * 0.05
-        assert [sight.kind for sight in watch.look(step_of(there))] == expected
+        assert [sight.kind for sight in watch.check(step_of(there))] == expected
 
 
 def test_the_lowest_still_point_is_the_ground_whichever_way_its_mesh_is_turned() -> None:

@@ -150,11 +150,11 @@ def test_a_strip_is_of_one_env_between_two_moments() -> None:
     assert (whole.low, whole.high) == (0, 5)
     assert [serial for serial, _ in whole.events] == [0, 3, 4]
     assert dict(whole.events)[3] == SUCCESS and dict(whole.events)[0] == RESET
-    assert whole.branches == ((4, 1),) and whole.stretches == ((0, 3), (4, 5))
+    assert whole.branches == ((4, 1),) and whole.segments == ((0, 3), (4, 5))
     assert len(whole.reward) == 6
     part = timeline.strip(1, 1, 3)
-    assert (part.low, part.high, part.branches) == (1, 3, ()) and part.stretches == ((1, 3),)
-    assert timeline.strip(0, 0, 5).stretches == ((0, 5),) and timeline.strip(0, 0, 5).branches == ()
+    assert (part.low, part.high, part.branches) == (1, 3, ()) and part.segments == ((1, 3),)
+    assert timeline.strip(0, 0, 5).segments == ((0, 5),) and timeline.strip(0, 0, 5).branches == ()
 
 
 @pytest.mark.parametrize(

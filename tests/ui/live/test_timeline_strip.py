@@ -29,7 +29,7 @@ def strip(**changes: object) -> Strip:
         "events": ((100, RESET), (150, SUCCESS | TRUNCATED), (160, RESET), (180, WENT_BACK)),
         "reward": np.linspace(0, 1, 101, dtype=np.float32),
         "branches": ((180, 120),),
-        "stretches": ((100, 159), (160, 179), (180, 200)),
+        "segments": ((100, 159), (160, 179), (180, 200)),
     }
     return Strip(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -92,7 +92,7 @@ def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
 
 def test_one_moment_alone_can_be_drawn() -> None:
     one = strip(
-        low=100, high=100, events=((100, RESET),), reward=np.zeros(1), branches=(), stretches=((100, 100),)
+        low=100, high=100, events=((100, RESET),), reward=np.zeros(1), branches=(), segments=((100, 100),)
     )
     html = strip_html(one, running(1, timeline=past()))
     assert "nan" not in html and 'width="-' not in html

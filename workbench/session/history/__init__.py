@@ -1,1 +1,1 @@
-"""The past of the batch: moments, curves, one row an env."""
+"""The history of the batch: moments, curves, one table row an env."""

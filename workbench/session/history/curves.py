@@ -1,14 +1,4 @@
-"""The past of the batch as rows of numbers: what the curves are, and what is drawn under the time slider.
-
-Both are drawn several times a second, and going through some thousand moments one by one for it would take longer than a
-step. They are kept of all envs, so that choosing another env shows its past and not an empty plot.
-
-A dense reward is a sum, and its total does not say which part is stuck. ManiSkill has no place for the parts, so the
-workbench names one: ``info["reward_terms"]``, a dict of tensors (N,), put there by ``compute_dense_reward``, which is
-given ``info``. ManiSkill hands ``info`` on as it is, nested dicts included, so the same file runs everywhere. In a
-`StepResult` a term is the entry ``reward_terms/<name>``. A term that is no number for each env is shown among the numbers,
-and has no curve.
-"""
+"""Numbers of all envs over the past steps, as arrays for curves and the time slider."""
 
 from __future__ import annotations
 
@@ -21,16 +11,24 @@ from numpy.typing import ArrayLike, NDArray
 from workbench.core.env.step_result import StepResult
 
 PREFIX = "reward_terms/"
+"""Of the entries of a `StepResult` that are terms of a dense reward.
+
+``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the workbench's own,
+since ManiSkill has no place for them; it passes ``info`` on unchanged, nested dicts included, so such a file runs in stock
+ManiSkill too. A term that is not one number an env is shown among the numbers, without a curve.
+"""
 MOST = 12
-"""Terms that are followed; more cannot be told apart."""
+"""Terms with a curve; more cannot be told apart."""
 _LENGTH = 1000
 """Steps of a curve."""
 _FIRST_ROWS = 1024
 
 
 class Columns:
-    """Columns of numbers by name, each of shape (rows, N). Rows have numbers that count up; the oldest are dropped when
-    there is no room."""
+    """Columns of numbers by name, each (rows, N). Rows are numbered upwards; the oldest are dropped when space runs out.
+
+    Curves are drawn several times a second: reading them from some thousand moments would take longer than a step.
+    """
 
     def __init__(self, num_envs: int, first: int = 0) -> None:
         """
@@ -48,8 +46,8 @@ class Columns:
         """
         Args:
             number: of the newest row, or the one after it.
-            oldest: number of the oldest row that is still wanted.
-            values: (N,) by name of the column; what is not in it is NaN in this row.
+            oldest: number of the oldest row to keep.
+            values: (N,) by name of the column; missing columns become NaN in this row.
         """
         if number - self._base == self._room:
             kept = slice(oldest - self._base, self._room)
@@ -65,9 +63,9 @@ class Columns:
             column[number - self._base] = values.get(name, np.nan)
 
     def between(self, name: str, low: int, high: int) -> NDArray[np.float32]:
-        """(K, N) of the rows from `low` to `high`, both of rows that are wanted; NaN in a column that is not there.
+        """(K, N) of the rows from `low` to `high`, both kept ones and included; NaN if there is no such column.
 
-        What is given changes only where one of these rows is written again.
+        A view, not a copy: it changes if one of these rows is written again.
         """
         rows = slice(low - self._base, max(low, high + 1) - self._base)
         column = self._columns.get(name)
@@ -82,7 +80,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Curves:
-    """The past of the batch, oldest first, bounded in length; kept over env selection."""
+    """The newest steps of all envs, oldest first, bounded in length."""
 
     serial: int
     """Control steps so far: the tick of the newest row."""
@@ -93,13 +91,13 @@ class Curves:
     success: NDArray[np.float32]
     """(T, N) 0 or 1; NaN for a task that has no ``success``."""
     parts: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """(T, N) of each term of the reward by name; NaN where a step did not have it."""
+    """(T, N) of each term of the reward by name; NaN in steps without it."""
     no_curve: tuple[str, ...] = ()
-    """Names of what the last step put there that is no number for each env."""
+    """Names of the last step's terms that are not one number an env."""
 
     @property
     def terms(self) -> dict[str, NDArray[np.float32]]:
-        """Of `parts` those that are drawn: one that is gone for as long as a curve is long has none any more."""
+        """Those of `parts` that have a value in these steps."""
         return {name: values for name, values in self.parts.items() if not np.isnan(values).all()}
 
 
@@ -113,7 +111,7 @@ class RecentSteps:
         """Control steps so far."""
 
     def add(self, step: StepResult) -> None:
-        """The next control step. A reset has no reward, so it is none."""
+        """Add a control step. Resets are left out, since they have no reward."""
         of_each_env = {
             name: values.reshape(self._num_envs, -1)[:, 0]
             for name, values in step.evaluate.items()
@@ -129,12 +127,12 @@ class RecentSteps:
         room = MOST - sum(name.startswith(PREFIX) for name in known)
         for name in new[max(0, room) :]:
             del of_each_env[name]
-        # A reload may drop a term, and the old one's values do not stand for the new steps: they are NaN there.
+        # A term that a reload dropped becomes NaN in the new steps.
         self._columns.write(self.count, max(0, self.count - _LENGTH), {"reward": step.reward, **of_each_env})
         self.count += 1
 
     def curves(self) -> Curves:
-        """Nothing is copied for it: a row is written once."""
+        """Views of the columns, without a copy: a row is written once."""
         first, last, columns = max(0, self.count - _LENGTH), self.count - 1, self._columns
         reward, success = (columns.between(name, first, last) for name in ("reward", "success"))
         parts = {

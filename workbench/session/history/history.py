@@ -1,17 +1,4 @@
-"""Every control step of every env since the task was built, to look at and to go back to.
-
-The history is a log, not a tape: what arrives is put at its end and nothing in it is changed. A reset is a
-moment of its own. Going back to step 43 is one too: the envs *jump*, and what follows are new moments behind the
-jump. So the future that was left stays where it was, can be scrubbed through and returned to, and "undo" is
-nothing but going back to the moment before a jump. What one env lived through without a jump is a *stretch*: it
-starts from a snapshot, and its actions, rewards and entries of ``evaluate`` are all here, so it can be run again. An
-*episode* goes from a reset on through the moments that the env was put back to.
-
-Memory is bounded, and what is oldest goes first. Pictures are by far the largest (a human camera's is 0.8 MB, a
-step of 16 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be drawn again, so they may fill no more
-than half of it. Snapshots are kept as the bytes that came, cut into parts that many steps share (see
-`core.snapshots.packing`): a part is kept as long as a step needs it.
-"""
+"""The history: every control step of every env since the task was built, within a memory limit."""
 
 from __future__ import annotations
 
@@ -35,12 +22,14 @@ from workbench.session.history.env_table import KEPT_REWARDS, LOST_REWARD, EnvRo
 from workbench.session.protocol.messages import PastPictures, Pictures, WayBack
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
-"""What may happen to an env at a moment. Success, failure and a reward that is none: the first in an episode."""
+"""Event flags of an env at a moment. Success, fail and a NaN or infinite reward: only the first in an episode."""
 _OVERHEAD = 2500
 """Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
 _PICTURES_SHARE = 0.5
+"""Of the memory, for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16 PickCube envs without
+pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
 _RECENT = 200
-"""Moments among which one is looked for that pictures belong to: they come some steps late."""
+"""Newest moments that are searched for the one of a picture: pictures come some steps late."""
 
 
 @dataclass
@@ -49,15 +38,16 @@ class PartSet:
 
     keys: tuple[int, ...]
     content: tuple[bytes, ...] | None
-    """None where some of them went to another history: then a snapshot cannot be put back, and is none."""
+    """None if some parts went to another history: then the moment has no snapshot."""
     moments: int = 0
+    """Number of moments with these parts."""
 
 
 class SharedParts:
-    """The parts of snapshots, kept once however many moments have them, and as long as one has.
+    """Reference-counted store of snapshot parts.
 
-    A snapshot comes as a body and the keys of its parts (`core.snapshots.packing`), most of which are those of the moment
-    before. So moments point to a set of parts, sets count their moments, and parts count their sets.
+    A snapshot comes as a body and the keys of its parts (`core.snapshots.packing`), most of which the moment before has
+    too. So moments refer to a set of parts, sets count their moments, and parts count their sets.
     """
 
     def __init__(self) -> None:
@@ -68,7 +58,7 @@ class SharedParts:
         """Bytes."""
 
     def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> PartSet:
-        """Those of the next moment; `keys` is None where they are those of the moment before."""
+        """Parts of the next moment; `keys` is None if they are those of the moment before."""
         self._parts.update(new_parts)
         if keys is not None and keys != self._last.keys:
             known = self._parts.keys() >= {*keys}
@@ -83,7 +73,7 @@ class SharedParts:
         return parts
 
     def release(self, parts: PartSet) -> None:
-        """A moment that had them is gone."""
+        """A moment with these parts was dropped."""
         parts.moments -= 1
         if parts.moments == 0 and parts.content is not None:
             for key in parts.keys:
@@ -91,13 +81,13 @@ class SharedParts:
                 if self._references[key] == 0:
                     self.used -= len(self._parts[key])
                     del self._references[key]
-                    # The worker will not send it again while the newest moment has it; that one is kept.
+                    # The worker sends a part again unless the newest moment has it, which is never dropped.
                     del self._parts[key]
 
 
 @dataclass
 class Moment:
-    """The batch after one reset, control step or jump."""
+    """The batch after one reset, control step or jump back."""
 
     serial: int
     """Counts up over the session."""
@@ -107,47 +97,47 @@ class Moment:
     """(N,) as `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
     tick: int
-    """Where this is on the curves."""
-    happened: NDArray[np.uint8]
-    """(N,) of `RESET` ... `TRUNCATED`, added up."""
+    """`Curves.tick` of this moment."""
+    event_flags: NDArray[np.uint8]
+    """(N,) event flags (`RESET` ...), added up."""
     restored: Restored | None
     number: int
     """`Stepped.number`."""
     snapshot: WholeSnapshot | None
-    """Of the whole batch; it shares its bytes with other moments. None where there is none."""
+    """Of the whole batch, or None; shares its bytes with other moments."""
     parts: PartSet
     size: int
     """Bytes, without parts and pictures."""
     rows: EnvRows
-    """What the table of envs said then."""
+    """The table of envs at that moment."""
     acted_by: str
     """As `Stepped.acted_by`."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
     """By env, kind and name of the camera."""
     outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
-    """Which of the pictures are of a camera that was moved since."""
-    first_said: StepResult | None = None
-    """`step` as it was when this happened, if a newer version has said otherwise since."""
+    """Keys of pictures whose camera was moved since."""
+    original_step: StepResult | None = None
+    """`step` before a newer version replaced it; None if none did."""
 
     @property
     def as_recorded(self) -> StepResult:
-        """What was said when it happened, whichever version said it."""
-        return self.step if self.first_said is None else self.first_said
+        """The result of the version that made this moment."""
+        return self.step if self.original_step is None else self.original_step
 
 
 EnvMoment = tuple[Moment, int]
-"""A moment of an episode, with the number that the env had then: another than now where it was given another env's."""
+"""A moment of an episode and the env's number in it: another one where the env continued from another env's moment."""
 
 
 @dataclass(frozen=True)
 class ShownMoment:
-    """What the page shows."""
+    """The moment that the page shows."""
 
     env: int
     """The selected one."""
     num_envs: int
     poses: NDArray[np.float32] | None
-    """(N, B, 7) of a moment of the past; None for now."""
+    """(N, B, 7) of a past moment; None while live."""
 
     def of(self, env: int) -> NDArray[np.float32] | None:
         """(B, 7) of one env."""
@@ -155,25 +145,33 @@ class ShownMoment:
 
 
 class Shown(Protocol):
-    """Says which moments the page shows."""
+    """Gives the moments that the page shows."""
 
     def shown_moment(self) -> ShownMoment:
-        """That of the selected env."""
+        """The shown one."""
         ...
 
     def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
-        """Of the selected env's episode round the one that is shown, at the most so many."""
+        """At most so many moments of the selected env's episode that contains the shown moment."""
         ...
 
 
 class History:
-    """The moments of one built task, oldest first. Not thread-safe: its owner locks."""
+    """The moments of one built task, oldest first, append-only. Not thread-safe: its owner locks.
+
+    A reset is a moment of its own, and so is going back: the envs *jump*, and new moments follow behind the jump. The
+    future that they left stays and can be returned to; undo is going back to the moment before a jump. A *segment* is
+    what an env went through without a jump: it starts from a snapshot and has all actions, so it can be replayed. An
+    *episode* goes from a reset on through the moments that the env was put back to.
+
+    Memory is bounded; the oldest moments are dropped first.
+    """
 
     def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
         """
         Args:
-            table: of the envs, which has been told of nothing yet.
-            limit: bytes that it may take; the newest moment is kept whatever it takes.
+            table: of the envs, without events so far.
+            limit: bytes; the newest moment is always kept.
             first_serial: the number of the first moment.
         """
         self._table, num_envs = table, table.rows().num_envs
@@ -189,13 +187,13 @@ class History:
         self._columns = Columns(num_envs, first_serial)
         self.steps = RecentSteps(num_envs)
 
-    # --- what comes --------------------------------------------------------------------------------
+    # --- events ------------------------------------------------------------------------------------
 
     def add(self, stepped: Stepped) -> Moment:
-        """The next moment.
+        """Add a moment.
 
-        A reward is for an action: where there was none (a reset, a going back) the worker says zero, and what is
-        kept is NaN, or what was said of the moment that was gone back to, or in the other envs what stood before.
+        Without an action (a reset or a jump back) the worker sends reward zero. The stored one is NaN after a reset, that
+        of the origin after a jump back, and in all other envs that of the moment before.
         """
         restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
         origin = None if restored is None else self.at(restored.origin)
@@ -219,7 +217,7 @@ class History:
             jumped=stepped.reset_mask,
             seeds=stepped.seeds,
             tick=self.steps.count,
-            happened=self._events(stepped, rows),
+            event_flags=self._events(stepped, rows),
             restored=restored,
             number=stepped.number,
             snapshot=snapshot,
@@ -237,17 +235,17 @@ class History:
         self._shrink()
         return moment
 
-    def renew_last(self, step: StepResult) -> StepResult:
-        """The newest moment was judged anew, by a version that was put on the env that is there.
+    def replace_last(self, step: StepResult) -> StepResult:
+        """Replace the newest moment's result by that of a version that was patched in.
 
         Returns:
-            what it says from now on: no other reward where there was no action.
+            The new result; a moment without an action keeps its reward.
         """
         if not self._moments:
             return step
         moment = self._moments[-1]
-        if moment.first_said is None:
-            moment.first_said = moment.step
+        if moment.original_step is None:
+            moment.original_step = moment.step
             moment.size += step.nbytes
             self._used += step.nbytes
         moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
@@ -255,7 +253,7 @@ class History:
         return moment.step
 
     def add_pictures(self, event: Pictures | PastPictures) -> None:
-        """Pictures are kept with the moment that they show, if it still is."""
+        """Store pictures with their moment, if it is still kept."""
         if isinstance(event, PastPictures):
             moment = self.at(event.origin)
         else:
@@ -276,13 +274,13 @@ class History:
         self._shrink()
 
     def camera_moved(self, kind: CameraKind, name: str) -> None:
-        """Pictures that are kept of this camera do not show what it sees now."""
+        """Mark the stored pictures of this camera as outdated."""
         for serial in self._pictured:
             moment = self.at(serial)
             if moment is not None:
                 moment.outdated.update(key for key in moment.pictures if key[1:] == (kind, name))
 
-    # --- what is there -----------------------------------------------------------------------------
+    # --- reading -----------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self._moments)
@@ -303,11 +301,11 @@ class History:
         return self._next_serial - 1
 
     def at(self, serial: int) -> Moment | None:
-        """The moment of this number, if it is kept."""
+        """The moment of this serial, if it is kept."""
         return self._moments[serial - self.first] if self.first <= serial <= self.last else None
 
     def snapshot_at(self, serial: int) -> bytes | None:
-        """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch at that moment; None where there is none."""
+        """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch at that moment, or None."""
         moment = self.at(serial)
         return None if moment is None or moment.snapshot is None else pickle.dumps(moment.snapshot)
 
@@ -321,42 +319,42 @@ class History:
         return self._table.rows()
 
     def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
-        """What happened to this env between two moments, both included: serials and `RESET` ... added up."""
+        """Events of this env between two moments, both included: serials and flags (`RESET` ... added up)."""
         low = max(low, self.first)
-        happened = self._columns.between("happened", low, min(high, self.last))[:, env]
-        return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
+        event_flags = self._columns.between("event_flags", low, min(high, self.last))[:, env]
+        return [(low + int(k), int(event_flags[k])) for k in np.flatnonzero(event_flags)]
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
-        """(K,) of this env at the moments between two, both included; NaN where it was reset."""
+        """(K,) of this env between two moments, both included; NaN where it was reset."""
         return self._columns.between("reward", max(low, self.first), min(high, self.last))[:, env]
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
-        """Serials of the kept moments at which this env went back, and of those that it went back to."""
+        """Serials of the moments at which this env went back, each with the serial that it went back to."""
         return [
             (moment.serial, moment.restored.origin)
             for moment in self._jumps
             if moment.restored is not None and moment.restored.origin != NO_MOMENT and moment.jumped[env]
         ]
 
-    def stretches(self, env: int) -> list[tuple[int, int]]:
-        """First and last serials of what this env lived through without a jump, as far as they are kept; oldest first.
-        Where others jumped, not all moments between are its steps."""
+    def segments(self, env: int) -> list[tuple[int, int]]:
+        """First and last serials of this env's segments, as far as they are kept; oldest first. A segment also contains
+        moments at which only other envs jumped."""
         if not self._moments:
             return []
         jumps = [moment.serial for moment in self._jumps if moment.jumped[env] and moment.serial > self.first]
         return list(zip([self.first, *jumps], [*(jump - 1 for jump in jumps), self.last], strict=True))
 
-    def stretch_at(self, env: int, serial: int) -> tuple[int, int]:
-        """The one of these that this moment is in."""
-        return next(stretch for stretch in reversed(self.stretches(env)) if stretch[0] <= serial)
+    def segment_at(self, env: int, serial: int) -> tuple[int, int]:
+        """The segment of this env that contains this moment."""
+        return next(segment for segment in reversed(self.segments(env)) if segment[0] <= serial)
 
     def episode(self, env: int, serial: int, most: int | None = None) -> tuple[EnvMoment, ...]:
-        """The episode that this env is in at a moment, as far as it went; oldest first, see `episode_backwards`.
+        """The episode of this env that contains a moment, to its end; oldest first, see `episode_backwards`.
 
         Args:
-            most: so many moments at most, evenly spread, the first and the last among them; None for all.
+            most: at most so many moments, evenly spread, including the first and the last; None for all.
         """
-        episode_backwards = [*self.episode_backwards(env, self.stretch_at(env, serial)[1])][::-1]
+        episode_backwards = [*self.episode_backwards(env, self.segment_at(env, serial)[1])][::-1]
         count = len(episode_backwards) if most is None else min(most, len(episode_backwards))
         chosen = np.unique(np.linspace(0, len(episode_backwards) - 1, count).round().astype(int))
         return tuple(episode_backwards[k] for k in chosen)
@@ -364,22 +362,22 @@ class History:
     def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
         """The episode of this env up to a moment, newest first, through the moments that it was put back to.
 
-        Each control step and, at the end, the reset that it began with, as far as they are kept.
+        Yields each control step and at the end the first reset, as far as they are kept.
         """
-        for moment, at in self._back(env, serial):
+        for moment, at in self._moments_back(env, serial):
             jumped = moment.jumped.any()
             if not jumped or moment.restored is None:
                 yield moment, at
             if jumped and moment.restored is None:
                 return
 
-    def way_to(self, env: int, serial: int, most: int) -> WayBack | None:
-        """How this env came to a moment from the last exact point, by at most so many steps; None if it is not known.
+    def replay_path(self, env: int, serial: int, most: int) -> WayBack | None:
+        """How to replay this env to a moment from the last exact point; None if unknown or longer than `most` steps.
 
-        Exact points are resets and moments that were put there: from them on the same actions give the same bits.
+        Exact points are resets and restored moments: from them on the same actions give the same bits.
         """
         rows: list[NDArray[np.float32]] = []
-        for moment, at in self._back(env, serial):
+        for moment, at in self._moments_back(env, serial):
             jump = moment.restored
             if not moment.jumped.any():
                 if moment.step.action is None or len(rows) == most:
@@ -391,9 +389,9 @@ class History:
                 return WayBack(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
         return None
 
-    def _back(self, env: int, serial: int) -> Iterator[EnvMoment]:
-        """The moments that led this env to one, newest first: its control steps and its own jumps, whose origin is
-        gone on from; as far as they are kept."""
+    def _moments_back(self, env: int, serial: int) -> Iterator[EnvMoment]:
+        """The moments that led this env to one, newest first: its control steps and its own jumps, each followed by the
+        moments before the jump's origin; as far as they are kept."""
         while (moment := self.at(serial)) is not None:
             jump, serial = moment.restored, moment.serial - 1
             if not moment.jumped.any():
@@ -404,10 +402,10 @@ class History:
                     serial, env = jump.origin, jump.source[jump.env_idx.index(env)]
 
     def last_jump(self, env: int) -> Moment | None:
-        """The jump that brought this env where it is, if it can be taken back.
+        """The jump that led this env to its present state, if it can be undone.
 
-        Where one was taken back the env stands as it stood before it, so the next is the last one before that:
-        what it did in the future that was left thereby is none of this one's.
+        After an undo the env is as before the undone jump, so the search continues before that one; moments of the
+        future that the undo left do not count.
         """
         until = self.last
         for moment in reversed(self._jumps):
@@ -420,12 +418,12 @@ class History:
             return moment if before is not None and before.snapshot is not None else None
         return None
 
-    def moved_last_by(self, jump: Moment) -> tuple[int, ...]:
-        """The envs that this jump brought where they are; others that it moved have jumped on since."""
+    def envs_still_at(self, jump: Moment) -> tuple[int, ...]:
+        """The envs of this jump that have not jumped since."""
         moved = (int(env) for env in np.flatnonzero(jump.jumped))
         return tuple(env for env in moved if self.last_jump(env) is jump)
 
-    # --- the inside --------------------------------------------------------------------------------
+    # --- private -----------------------------------------------------------------------------------
 
     def _shrink(self) -> None:
         while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:
@@ -447,11 +445,11 @@ class History:
         self._used -= size
 
     def _write(self, moment: Moment) -> None:
-        values = {"happened": moment.happened, "reward": moment.step.reward}
+        values = {"event_flags": moment.event_flags, "reward": moment.step.reward}
         self._columns.write(moment.serial, self.first, values)
 
     def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
-        """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""
+        """(K,) the newest rewards of this env's episode up to a moment, at most so many, oldest first."""
         episode_backwards = () if moment is None else self.episode_backwards(env, moment.serial)
         rewards = (one.step.reward[of] for one, of in episode_backwards if not one.jumped.any())
         return np.array(list(islice(rewards, most))[::-1], np.float32)
@@ -472,10 +470,10 @@ class History:
     def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask
         if jumped.any():
-            # What is so at a moment that was gone back to is no event: it came about where that moment is.
+            # Success or fail in a restored state is no event of this moment: it happened at the origin.
             return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
-        happened = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
+        event_flags = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
         for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (NOT_A_NUMBER, LOST_REWARD)):
             if what in rows.first:
-                happened[rows.first[what] == step.elapsed_steps] |= flag
-        return happened
+                event_flags[rows.first[what] == step.elapsed_steps] |= flag
+        return event_flags

@@ -115,7 +115,7 @@ class LiveState:
             same = restored and before is not None and before.source_hash == task.source_hash
             self._new_scene(task, event.first, its_past_stays=same)
         elif self.timeline is not None:
-            self.set(step=self.timeline.history.renew_last(event.first))
+            self.set(step=self.timeline.history.replace_last(event.first))
         if report is None or report.level not in ("same", "patched"):
             self.set(cameras_serial=self.now.cameras_serial + 1)
             self.new_pictures(**{} if kept else {"pictures": {}})

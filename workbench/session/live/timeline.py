@@ -73,7 +73,7 @@ class Strip:
     """(high - low + 1,)"""
     branches: tuple[tuple[int, int], ...]
     """Serials at which the env went back, and of the moments that it went back to."""
-    stretches: tuple[tuple[int, int], ...]
+    segments: tuple[tuple[int, int], ...]
     """First and last serial of what it lived through without a jump."""
 
 
@@ -168,7 +168,7 @@ class Timeline:
             limit=history.limit,
             moments=len(history),
             can_go_on=moment is not None and moment.snapshot is not None,
-            undo=None if jump is None else _in_words(jump, history.moved_last_by(jump), self._num_envs),
+            undo=None if jump is None else _in_words(jump, history.envs_still_at(jump), self._num_envs),
             not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
             arrived=how,
             entered=self._entered,
@@ -187,7 +187,7 @@ class Timeline:
             tuple(pair for pair in history.jumps_back(env) if low <= pair[0] <= high),
             tuple(
                 (max(first, low), min(last, high))
-                for first, last in history.stretches(env)
+                for first, last in history.segments(env)
                 if last >= low and first <= high
             ),
         )
@@ -213,7 +213,7 @@ class Timeline:
         snapshot = self.history.snapshot_at(jump.serial - 1)
         if snapshot is None:
             return None
-        envs = self.history.moved_last_by(jump)
+        envs = self.history.envs_still_at(jump)
         self._shown = None
         return self._restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
 
@@ -226,7 +226,7 @@ class Timeline:
         undoes: int | None = None,
     ) -> Restore:
         history = self.history
-        found = {i: history.way_to(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
+        found = {i: history.replay_path(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
         ways = {i: way for i, way in found.items() if way is not None}
         beginnings = {way.start for way in ways.values()}
         starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
@@ -331,13 +331,13 @@ class TimeTravel:
             s = self._state
             return None if s.timeline is None else s.timeline.strip(self._env, low, high)
 
-    def stretch(self) -> tuple[int, int] | None:
+    def segment(self) -> tuple[int, int] | None:
         """First and last moment of what the selected env lived through round the shown moment, without a jump."""
         with self._lock:
             timeline = self._state.timeline
             if timeline is None or not len(timeline.history):
                 return None
-            return timeline.history.stretch_at(self._env, timeline.at)
+            return timeline.history.segment_at(self._env, timeline.at)
 
     def shown_moment(self) -> ShownMoment:
         """Which env is looked at, and where its bodies are if that is not live."""

@@ -194,7 +194,7 @@ class InspectPanel(PagePart[SessionView]):
         it steps: until then its list is empty or outdated."""
         if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
             return True
-        lived = self._session.past.stretch() if view.timeline.shown is None else None
+        lived = self._session.past.segment() if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
     def _ask(self, view: SessionView, choice: str) -> None:

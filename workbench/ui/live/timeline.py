@@ -204,8 +204,8 @@ class TimelinePanel(TimeBar[SessionView]):
         moved = past.shown is not None and not self._range[0] <= past.shown <= self._range[1]
         if now - self._range_at >= RANGE_EVERY or moved:
             self._range_at = now
-            stretch = self._session.past.stretch() if self._episode_only else None
-            self._range = (past.first, past.last) if stretch is None else stretch
+            segment = self._session.past.segment() if self._episode_only else None
+            self._range = (past.first, past.last) if segment is None else segment
             self._newest = past.last
             self._set_ends(*(serial - self._newest for serial in self._range))
         self._slider.show(0 if past.shown is None else past.shown - self._newest)
