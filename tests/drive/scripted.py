@@ -48,7 +48,7 @@ class ScriptedWorker:
     """Takes what `Supervisor` takes, after what its scene is."""
 
     pid = None
-    load_waits = False
+    load_pending = False
     vitals = Vitals()
     goes_back = True
     """Whether it comes to the recorded states that it is asked for; they look as it does where it stands."""

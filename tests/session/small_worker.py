@@ -20,8 +20,7 @@ from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
 from workbench.jobs.pool import Answer
 from workbench.machine.processes.wire import Call, Unpacker, pack_message
-from workbench.session.process.heartbeat import PulseWriter
-from workbench.session.process.interrupts import INTERRUPT_SIGNAL, Interrupts
+from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import ListenForDebugger, Load, Loaded, Loading, Quit, Request
 from workbench.session.protocol.questions import QUESTIONS, RunCameras
 from workbench.session.worker.start import main
@@ -30,8 +29,8 @@ from workbench.session.worker.start import main
 class SmallWorker:
     """Answers `Load` with a `Loading` of its name, and does what a `RunCameras` names as the task."""
 
-    def __init__(self, line: multiprocessing.connection.Connection, pulse: PulseWriter) -> None:
-        self.line, self.pulse = line, pulse
+    def __init__(self, line: multiprocessing.connection.Connection, heartbeat: HeartbeatWriter) -> None:
+        self.line, self.heartbeat = line, heartbeat
         self.unpacker = Unpacker(get_args(Request), QUESTIONS)
         self.interrupts = Interrupts()
         self.interrupts.install()
@@ -39,7 +38,7 @@ class SmallWorker:
 
     def run(self) -> None:
         while True:
-            self.pulse.begin("idle")
+            self.heartbeat.begin("idle")
             request = self.unpacker.message(self.line.recv_bytes())
             if isinstance(request, Quit):
                 return
@@ -56,7 +55,7 @@ class SmallWorker:
             elif isinstance(request, Call):
                 self.line.send_bytes(pack_message(Answer(request.number)))
             if isinstance(request, Load):
-                self.pulse.begin("loading")
+                self.heartbeat.begin("loading")
                 self.line.send_bytes(pack_message(Loading(str(request.task))))
 
     def do(self, what: str, _: str, argument: str) -> None:
@@ -71,7 +70,7 @@ class SmallWorker:
 
     def work(self, seconds: str) -> None:
         """Python that lasts so long, and that an interrupt leaves."""
-        self.pulse.begin("stepping")
+        self.heartbeat.begin("stepping")
         self._pass_time(float(seconds))
 
     def work_on(self, seconds: str) -> None:
@@ -80,13 +79,13 @@ class SmallWorker:
         self.work(seconds)
 
     def held_by_a_debugger(self, seconds: str) -> None:
-        self.pulse.begin("stepping")
-        self.pulse.hold(True)
+        self.heartbeat.begin("stepping")
+        self.heartbeat.hold(True)
         self._pass_time(float(seconds))
-        self.pulse.hold(False)
+        self.heartbeat.hold(False)
 
     def draw(self, seconds: str) -> None:
-        self.pulse.begin("drawing")
+        self.heartbeat.begin("drawing")
         self._pass_time(float(seconds))
 
     def last_steps(self, count: str) -> None:
@@ -96,7 +95,7 @@ class SmallWorker:
         os.kill(os.getpid(), signal.SIGKILL)
 
     def leave(self, code: str) -> None:
-        self.pulse.begin("stepping")
+        self.heartbeat.begin("stepping")
         os._exit(int(code))
 
     def fill_memory(self, megabytes: str) -> None:
@@ -125,6 +124,8 @@ class SmallWorker:
 
 if __name__ == "__main__":
     instead: Any = types.ModuleType("workbench.session.worker.loop")
-    instead.work = lambda fd, pulse: SmallWorker(multiprocessing.connection.Connection(fd), pulse).run()
+    instead.work = lambda fd, heartbeat: SmallWorker(
+        multiprocessing.connection.Connection(fd), heartbeat
+    ).run()
     sys.modules["workbench.session.worker.loop"] = instead
     main()

@@ -184,14 +184,14 @@ def test_the_memory_of_a_family_counts_what_is_shared_once(
     together = proportional_memory(everyone)
     assert 64 * 2**20 < together < 2 * 64 * 2**20
     memory = FamilyMemory(keeper.pid)
-    assert 64 * 2**20 < memory.look(limit=2 * 64 * 2**20) < 2 * 64 * 2**20
+    assert 64 * 2**20 < memory.measure(limit=2 * 64 * 2**20) < 2 * 64 * 2**20
     end_family(keeper)
-    assert memory.look() == 0
+    assert memory.measure() == 0
 
 
 def test_the_memory_of_what_detached_itself_is_counted(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     keeper = begin("hold")
-    alone = FamilyMemory(keeper.pid).look()
+    alone = FamilyMemory(keeper.pid).measure()
     assert alone == resident_memory(children(keeper.pid)[0]) > 64 * 2**20
     end_family(keeper)
 

@@ -160,7 +160,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
     file, job = write_task(tmp_path), a_job()
     load = Load(str(file), TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"}))
     told = list[str]()
-    job.tell = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
+    job.report = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
     with background.turn(job):
         assert background.ensure(job, load) == 2
         assert told == ["starting a process in the background", "building envs in the background"]
@@ -218,7 +218,7 @@ def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_a
     one, other = a_job(), a_job()
     job, waiting = (other, one) if aside else (one, other)
     told = list[str]()
-    job.tell = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
+    job.report = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
     with ThreadPoolExecutor(2) as threads:
         # It would go on for ever if it did not give way.
         side = threads.submit(background.in_turns, job, lambda: side_work(job), aside)
@@ -283,7 +283,7 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
         assert has_it.wait(90)
         queue: list[Future[Any]] = [threads.submit(waiting, job) for job in before]
         queue.append(
-            threads.submit(background.in_turns, aside, lambda: background.ensure(aside, load), aside=True)
+            threads.submit(background.in_turns, aside, lambda: background.ensure(aside, load), low_priority=True)
         )
         given_up = threads.submit(waiting, stopped)
         stopped.stopped = True
@@ -310,7 +310,7 @@ def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
     first = background.pid
     assert first is not None, "it is kept for the next job"
     with background.turn(job):
-        assert background.has(load) and background.pid == first
+        assert background.has_loaded(load) and background.pid == first
     until(lambda: background.pid is None, "its end")
     assert not psutil.pid_exists(first)
     with background.turn(job):

@@ -71,5 +71,5 @@ def test_lines_are_those_of_the_version_that_ran(child_process: None, tmp_path: 
 
 
 def test_a_stack_that_could_not_be_had_leaves_what_is_known() -> None:
-    busy = busy_at(3.0, "loading", "", ["/a/task.py"], deaf=False)
+    busy = busy_at(3.0, "loading", "", ["/a/task.py"], ignores_interrupt=False)
     assert (busy.doing, busy.file, busy.traceback) == ("loading", None, "")

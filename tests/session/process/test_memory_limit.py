@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from workbench.machine.processes.family import allocated_memory, resident_memory
-from workbench.session.process.memory_limit import in_words, parse_memory, total_memory
+from workbench.session.process.memory_limit import format_size, parse_memory, total_memory
 
 
 @pytest.mark.parametrize(
@@ -53,5 +53,5 @@ def test_what_a_process_allocates_is_told_from_the_files_that_it_maps(tmp_path: 
     assert allocated_memory(2**22 + 1) == 0
 
 
-def test_in_words() -> None:
-    assert (in_words(8 * 2**30), in_words(310 * 2**20)) == ("8.0 GB", "310 MB")
+def test_format_size() -> None:
+    assert (format_size(8 * 2**30), format_size(310 * 2**20)) == ("8.0 GB", "310 MB")

@@ -110,7 +110,7 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(worker_process, "python_command", command)
     # What takes seconds for the sake of slow machines takes tenths here.
-    for name, seconds in (("_BUSY", 0.8), ("_STACK_EVERY", 0.3), ("_DEAF", 0.3), ("_HEADLESS", 0.8)):
+    for name, seconds in (("_BUSY", 0.8), ("_STACK_EVERY", 0.3), ("_IGNORED_AFTER", 0.3), ("_HEADLESS", 0.8)):
         monkeypatch.setattr(supervisor, name, seconds)
     for name, seconds in (("_LOAD_WAITS", 0.3), ("_LONGEST_SILENCE", 1.2), ("_AFTER_A_FAILURE", 0.05)):
         monkeypatch.setattr(supervisor, name, seconds)
@@ -177,7 +177,7 @@ def test_a_task_that_was_loaded_forgives_earlier_deaths() -> None:
     with minded() as one:
         for times in (1, 2, 3, 4):
             one.until_greeted(times)
-            one.worker.ran()
+            one.worker.reset_deaths()
             one.worker.send(do("leave 1"))
             assert one.until_dead(times).gives_up is False
 
@@ -189,7 +189,7 @@ def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
         told = [busy for busy in one.busy if busy is not None]
         assert len(told) >= 2, "once in the time between two looks"
         assert told[0].seconds >= supervisor._BUSY and told[-1].seconds > told[0].seconds
-        assert told[-1].file == str(SMALL_WORKER) and not told[-1].deaf and not told[-1].held
+        assert told[-1].file == str(SMALL_WORKER) and not told[-1].ignores_interrupt and not told[-1].held
         assert one.deaths == []
         one.worker.send(do("work 0.05"))
         one.worker.send(do("say over"))
@@ -224,21 +224,21 @@ def test_who_does_not_listen_to_an_interrupt_is_told_deaf() -> None:
     with minded() as one:
         one.worker.send(do("work_on 3"))
         one.until(lambda: one.busy and one.busy[-1] is not None, "that it is busy")
-        assert one.busy[-1] is not None and not one.busy[-1].deaf
+        assert one.busy[-1] is not None and not one.busy[-1].ignores_interrupt
         one.worker.interrupt()
-        one.until(lambda: one.busy[-1] is not None and one.busy[-1].deaf, "that it is deaf")
+        one.until(lambda: one.busy[-1] is not None and one.busy[-1].ignores_interrupt, "that it is deaf")
 
 
 def test_a_load_waits_for_short_work_only() -> None:
     with minded() as one:
         one.worker.send(do("work 60"))
         one.until(lambda: one.busy, "that it is busy")
-        assert not one.worker.load_waits
+        assert not one.worker.load_pending
         one.worker.send(load("mended"))
-        assert one.worker.load_waits
+        assert one.worker.load_pending
         one.until(lambda: "mended" in one.said, "the load")
         assert "interrupted" in one.said and one.deaths == []
-        one.until(lambda: not one.worker.load_waits, "that it was taken up")
+        one.until(lambda: not one.worker.load_pending, "that it was taken up")
 
 
 def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
@@ -445,7 +445,7 @@ def test_a_spare_that_dies_of_its_warming_up_is_tried_once_more_and_no_more(
     spare = SpareWorker(WarmUp(OPTIONS))
 
     def attended() -> worker_process.WorkerProcess | None:
-        spare.attend()
+        spare.poll()
         return spare._process
 
     try:

@@ -25,7 +25,7 @@ from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.process import supervisor
-from workbench.session.process.interrupts import INTERRUPT_SIGNAL
+from workbench.session.process.heartbeat import INTERRUPT_SIGNAL
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.process.worker_process import signal_main_thread
 
@@ -38,7 +38,7 @@ LIMIT = 2 * 2**30
 def soon() -> Iterator[None]:
     """What takes seconds for the sake of slow machines takes about one here."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, seconds in (("_BUSY", 1.0), ("_STACK_EVERY", 0.3), ("_DEAF", 0.5)):
+        for name, seconds in (("_BUSY", 1.0), ("_STACK_EVERY", 0.3), ("_IGNORED_AFTER", 0.5)):
             patch.setattr(supervisor, name, seconds)
         for name, seconds in (("_LOAD_WAITS", 0.7), ("_LONGEST_SILENCE", 2.0)):
             patch.setattr(supervisor, name, seconds)
@@ -91,7 +91,7 @@ def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
     provoke(risky_file, place, "loop")
     session.step()
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
-    assert busy.doing == f"in {place}" and busy.seconds >= supervisor._BUSY and not busy.deaf
+    assert busy.doing == f"in {place}" and busy.seconds >= supervisor._BUSY and not busy.ignores_interrupt
     assert busy.file == str(risky_file) and busy.code in ("while True:", "pass")
     session.step()
     session.step()
@@ -149,7 +149,9 @@ def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back
     session.step()
     wait_until(session, lambda v: v.busy is not None, "busy")
     session.interrupt()
-    busy = wait_until(session, lambda v: v.busy is not None and v.busy.deaf, "that it is deaf").busy
+    busy = wait_until(
+        session, lambda v: v.busy is not None and v.busy.ignores_interrupt, "that it is deaf"
+    ).busy
     assert (
         busy.doing == "in evaluate"
         and busy.file == str(risky_file)

@@ -20,8 +20,7 @@ from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.pool import CannotAnswer
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import MessageSocket
-from workbench.session.process.heartbeat import PulseReader, PulseWriter
-from workbench.session.process.interrupts import Interrupts
+from workbench.session.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     CameraRequest,
     DrawPast,
@@ -63,12 +62,12 @@ class Desk:
     def __init__(self, opened: OpenedTask, clock: Clock) -> None:
         ours, theirs = socket.socketpair()
         self.clock, self.server = clock, MessageSocket(ours, get_args(Event))
-        pulse = os.memfd_create("pulse")
-        os.ftruncate(pulse, mmap.PAGESIZE)
-        self.pulse, interrupts = PulseReader(pulse), Interrupts()
+        heartbeat = os.memfd_create("pulse")
+        os.ftruncate(heartbeat, mmap.PAGESIZE)
+        self.heartbeat, interrupts = HeartbeatReader(heartbeat), Interrupts()
         line = ServerLine(theirs.detach(), interrupts)
-        self.held = GuardedTask(line, interrupts, PulseWriter(pulse), StepEvents(), lambda: None)
-        os.close(pulse)
+        self.held = GuardedTask(line, interrupts, HeartbeatWriter(heartbeat), StepEvents(), lambda: None)
+        os.close(heartbeat)
         self.held.opened = opened
         self.first: list[bool] = []
         self.cameras = WorkerCameras(self.held, self.first.append)
@@ -131,7 +130,7 @@ def test_sensors_come_first_and_each_kind_as_soon_as_it_is_there(desk: Desk) -> 
     (human,) = desk.makes()
     assert [picture.env for picture in human.pictures] == [1] and shown([human]) == [PEOPLE]
     assert desk.wait() is None and desk.makes() == [], "they are of the moment that is"
-    assert desk.first == [False, True] and desk.pulse.read().doing == "drawing"
+    assert desk.first == [False, True] and desk.heartbeat.read().doing == "drawing"
 
 
 def test_after_a_round_there_is_a_pause_in_proportion(desk: Desk) -> None:
@@ -256,7 +255,7 @@ def test_a_question_is_answered_as_the_cameras_were_asked_to_stand_or_why_not(de
     assert np.allclose(picture.pose[:3], there.position, atol=1e-5)
     with pytest.raises(CannotAnswer, match="env 9"):
         desk.cameras.answer(opened, DrawCamera(BASE, None, 9), lambda done, total: None)
-    assert desk.pulse.read().doing == "idle"
+    assert desk.heartbeat.read().doing == "idle"
 
 
 def test_a_moment_is_captured_with_pictures_of_the_envs_that_are_named(desk: Desk) -> None:

@@ -45,7 +45,7 @@ def test_what_cannot_be_interrupted_offers_no_interrupt_and_shows_where_it_is(
     panels: Panels,
 ) -> None:
     banner, _ = a_banner(panels)
-    banner.draw(running(2, busy=replace(LOOP, deaf=True)))
+    banner.draw(running(2, busy=replace(LOOP, ignores_interrupt=True)))
     assert not panels.shows("Interrupt") and panels.shows("Restart")
     assert "Traceback ..." in panels.html()
 
@@ -62,7 +62,7 @@ def test_stands_instead_of_the_banner_of_a_problem(panels: Panels) -> None:
 def test_a_worker_that_gets_ready_is_not_the_author_s_and_leaves_the_reason_in_sight(
     panels: Panels,
 ) -> None:
-    ready = busy_at(21.0, "warming up", "", (), deaf=False)
+    ready = busy_at(21.0, "warming up", "", (), ignores_interrupt=False)
     view = running(2, busy=ready, problem=problem(), problem_serial=1, state="starting", playing=False)
     busy, _ = a_banner(panels)
     died = Banner(panels.server, lambda: None, lambda: None)
@@ -71,7 +71,7 @@ def test_a_worker_that_gets_ready_is_not_the_author_s_and_leaves_the_reason_in_s
     assert not panels.part("Busy").seen and panels.part("Problem").seen
     text = render("status_line", **status_values(view))
     assert "a new worker is getting ready" in text and "busy" not in text
-    assert not busy_at(21.0, "stepping", "", (), deaf=False).getting_ready
+    assert not busy_at(21.0, "stepping", "", (), ignores_interrupt=False).getting_ready
 
 
 def test_an_interrupt_is_not_called_a_failure() -> None:

@@ -167,7 +167,7 @@ class CameraReports:
         """
         moments: list[MeasuredMoment] = []
         for env, poses, moment in cases:
-            job.tell(len(reports), total)
+            job.report(len(reports), total)
             reports.append(asker.ask(job.check, replace(question, env=env, poses=poses)))
             moments += [] if moment is None else [moment]
             if len(reports) % every == 0 or len(reports) == total:
@@ -203,11 +203,11 @@ class CameraReports:
                 num_envs = self._background.ensure(job, _for_measuring(load))
                 self._background.ask(job.check, Reset(None, FIRST_SEED))
                 envs = tuple(range(min(max(1, seeds), num_envs)))
-                job.tell(0, 0, what)
+                job.report(0, 0, what)
                 return self._background.ask(
                     job.check,
                     SuggestCameras(space, envs),
-                    lambda done, total, part: job.tell(done, total, what),
+                    lambda done, total, part: job.report(done, total, what),
                 )
 
             self._know(suggestions=(), suggestions_of=key)
@@ -250,7 +250,7 @@ class CameraReports:
         def work(job: Job) -> None:
             self._know(sheet=())
             for done, env in enumerate(order):
-                job.tell(done, len(order))
+                job.report(done, len(order))
                 picture = self._draw(job, moment, DrawCamera(key, None, env))
                 self._know(sheet=(*self.looked.sheet, picture))
 

@@ -347,7 +347,7 @@ class Session:
         self._note()
 
     def _handle(self, event: Event) -> None:
-        if isinstance(event, LoadFailed) and self._worker.load_waits and event.problem.interrupted:
+        if isinstance(event, LoadFailed) and self._worker.load_pending and event.problem.interrupted:
             return  # left for the sake of a newer version, which waits: nobody need hear of it
         if isinstance(event, Loaded):
             self._on_loaded(event)
@@ -368,7 +368,7 @@ class Session:
         self._on_event(event)
 
     def _on_loaded(self, event: Loaded) -> None:
-        self._worker.ran()
+        self._worker.reset_deaths()
         recording, one_each = self._recorder.recording, self._recorder.one_each
         if not scene_kept(event) or (event.reload is not None and event.reload.level != "same"):
             # Episodes of the version before end here: their steps and the new ones do not belong together.

@@ -1,14 +1,4 @@
-"""Whoever asks a worker: the one that plays, between its steps, or one in the background.
-
-The worker that plays has the envs that are on the screen, at their present moment. Judging the past, drawing it again
-and looking at cameras over many seeds take seconds or minutes, and put the envs wherever they like. So that is asked of
-a process of its own with a lower priority, which costs some seconds to start and some 0.75 GB. All jobs of an open task
-share one, in turns; it is ended when there was none in a while. What was begun last is what somebody waits for: all else
-gives way to it in the middle, and goes on afterwards.
-
-A worker answers in order. A job that is stopped, or gives way, leaves one answer owed, which is taken at the end of its
-turn, or the process is ended. One that dies ends the job that asked it, and the next starts another.
-"""
+"""Asks questions of the worker that plays, and of a second process in the background."""
 
 from __future__ import annotations
 
@@ -29,18 +19,18 @@ from workbench.session.process.worker_process import WorkerProcess
 from workbench.session.protocol.messages import Cancel, Load, PlaceCamera, Request
 
 _LOOK = 0.05
-"""Seconds between two looks at whether the job is to stop."""
+"""Seconds between two checks whether the job is stopped."""
 _NICENESS = 10
-"""After the one that plays, where there are fewer cores than work."""
+"""The worker that plays comes first where there are fewer cores than work."""
 WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
-"""How long the process is kept without a job."""
+"""How long an idle process is kept."""
 _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
-"""Seconds in which a process must answer what nobody waits for any more, or is ended."""
+"""Seconds in which a process must answer a cancelled question, or is ended."""
 Value = TypeVar("Value")
 OnProgress = Callable[[int, int, Any], None]
-"""Gets how much is done, of how much, and the part of the answer that is new."""
+"""Gets done, total, and the new part of the answer."""
 
 
 def _ignore(done: int, total: int, part: Any) -> None:
@@ -48,28 +38,28 @@ def _ignore(done: int, total: int, part: Any) -> None:
 
 
 class Asker:
-    """Asks the worker that plays: any number of questions at a time, from any threads, each with its own answer."""
+    """Asks the worker that plays. Thread-safe; several questions may be under way."""
 
     def __init__(self, send: Callable[[Request], None]) -> None:
         self._send = send
         self._numbers = count(1)
         self._condition = threading.Condition()
-        self._heard: dict[int, deque[Answer | Progress]] = {}
-        """What came for each question that is under way, and was not taken."""
+        self._received: dict[int, deque[Answer | Progress]] = {}
+        """Received and not yet handled, for each question under way."""
 
     def ask(
         self, check: Callable[[], None], question: Question[Value], on_progress: OnProgress = _ignore
     ) -> Value:
         """
         Args:
-            check: called often meanwhile; what it raises ends the question, whose answer is then dropped.
+            check: called often while waiting; an exception from it ends the question, and the answer is dropped.
 
         Raises:
-            JobFailed: it cannot be answered.
+            JobFailed: there is no answer.
         """
         with self._condition:
             number = next(self._numbers)
-            self._heard[number] = deque()
+            self._received[number] = deque()
         try:
             self._send(Call(number, question))
             while True:
@@ -82,55 +72,61 @@ class Asker:
                     return _value(event, question)
         finally:
             with self._condition:
-                del self._heard[number]
+                del self._received[number]
 
     def take(self, event: Answer | Progress) -> None:
-        """What the worker said."""
+        """Handle an event of the worker."""
         with self._condition:
-            if event.number in self._heard:
-                self._heard[event.number].append(event)
+            if event.number in self._received:
+                self._received[event.number].append(event)
                 self._condition.notify_all()
 
     def _next(self, number: int) -> Answer | Progress | None:
         with self._condition:
-            heard = self._heard[number]
-            self._condition.wait_for(lambda: heard, _LOOK)
-            return heard.popleft() if heard else None
+            received = self._received[number]
+            self._condition.wait_for(lambda: received, _LOOK)
+            return received.popleft() if received else None
 
 
 class GaveWay(Exception):
-    """A job that comes first wants the process: what was asked is to be asked again, in another turn."""
+    """A job of higher priority needs the process: ask again in another turn."""
 
 
 _Rank = tuple[bool, int]
-"""Whether somebody waits for a job, and its number: the highest comes first."""
+"""Whether a person waits for the job, and its number: the highest comes first."""
 
 
 class Background(Asker):
-    """Asks a process in the background, one thing at a time; within a turn, where several jobs share it.
+    """Asks a process in the background, one question at a time. Jobs share it in turns.
 
-    The process ends with the thread that started it, which is that of the lane that came first.
+    Rescoring the past, drawing it and searching cameras take seconds to minutes and move the envs, so they cannot run
+    in the worker that plays. This process has a lower priority; it costs some seconds to start and 0.75 GB. It ends
+    after `IDLE_SECONDS` without a job, and with the thread that started it, that of the first lane.
+
+    The job that was begun last comes first, since a person waits for it: the others give way and continue later. A
+    worker answers in order, so a job that stops or gives way leaves one unread answer, which is taken at the end of its
+    turn, or the process is ended. A process that dies fails its job; the next job starts another.
     """
 
     def __init__(self, niceness: int = _NICENESS) -> None:
         """
         Args:
-            niceness: by how much other processes come first.
+            niceness: as for ``nice``.
         """
         super().__init__(self._send_call)
         self._niceness = niceness
         self._turns = threading.Condition()
-        self._has_it: _Rank | None = None
+        self._current: _Rank | None = None
         self._waiting: list[_Rank] = []
         self._idle: threading.Timer | None = None
-        """Ends the process if nobody wants it meanwhile."""
+        """Ends the process if it stays idle."""
         self._process: WorkerProcess | None = None
-        self._owed: Call | None = None
+        self._unanswered: Call | None = None
         self._loaded: Load | None = None
-        """What was loaded last; None after a failure."""
+        """The last load; None after a failure."""
         self._placed: dict[CameraKey, PlaceCamera] = {}
         self.num_envs = 0
-        """Of the version that the process has open; 0 for none."""
+        """Of the version that is open in the process; 0 for none."""
 
     @property
     def pid(self) -> int | None:
@@ -139,78 +135,78 @@ class Background(Asker):
         return None if process is None else process.pid
 
     @contextmanager
-    def turn(self, job: Job, aside: bool = False) -> Iterator[None]:
-        """What a job asks is asked within this. It begins when nobody has the process and none that comes first wants it;
-        where one does in the middle, `ask` raises GaveWay.
+    def turn(self, job: Job, low_priority: bool = False) -> Iterator[None]:
+        """Hold the process for a job. Waits while another job has it, or one of higher priority waits; where such a job
+        comes during the turn, `ask` raises GaveWay.
 
         Args:
-            aside: nobody waits for this job: all others come first, and not only those that are begun later.
+            aside: lowest priority, since no person waits for this job.
 
         Raises:
-            Stopped: the job is to stop.
+            Stopped: the job was stopped.
         """
-        self._take(job, (not aside, job.number))
+        self._begin_turn(job, (not low_priority, job.number))
         try:
             yield
         finally:
             self._settle(job)
             with self._turns:
-                self._has_it = None
-                self._rest_later()
+                self._current = None
+                self._end_when_idle()
                 self._turns.notify_all()
 
-    def in_turns(self, job: Job, work: Callable[[], Value], aside: bool = False) -> Value:
-        """Do `work`, as often as it had to give way once more; the envs are not where it left them then."""
+    def in_turns(self, job: Job, work: Callable[[], Value], low_priority: bool = False) -> Value:
+        """Run `work` in a turn, again after each time it gave way; the envs are elsewhere then."""
         while True:
             try:
-                with self.turn(job, aside):
+                with self.turn(job, low_priority):
                     return work()
             except GaveWay:
-                job.tell(0, 0, WAITING)
+                job.report(0, 0, WAITING)
 
-    def has(self, load: Load) -> bool:
-        """Whether it would not have to be loaded."""
+    def has_loaded(self, load: Load) -> bool:
+        """Whether this version is loaded."""
         return load.level == "auto" and self._loaded == load
 
-    def _rest_later(self) -> None:
+    def _end_when_idle(self) -> None:
         if self._idle is not None:
             self._idle.cancel()
-        self._idle = threading.Timer(IDLE_SECONDS, self._rest)
+        self._idle = threading.Timer(IDLE_SECONDS, self._end_if_idle)
         self._idle.daemon = True
         self._idle.start()
 
-    def _rest(self) -> None:
+    def _end_if_idle(self) -> None:
         with self._turns:
-            # There was a turn since, or there is one, which will say when it ends.
-            if threading.current_thread() is self._idle and self._has_it is None and not self._waiting:
+            # A turn since then has set another timer.
+            if threading.current_thread() is self._idle and self._current is None and not self._waiting:
                 self.end()
 
-    def _take(self, job: Job, rank: _Rank) -> None:
+    def _begin_turn(self, job: Job, rank: _Rank) -> None:
         with self._turns:
             self._waiting.append(rank)
             try:
-                while self._has_it is not None or max(self._waiting) > rank:
+                while self._current is not None or max(self._waiting) > rank:
                     job.check()
                     self._turns.wait(_LOOK)
-                self._has_it = rank
+                self._current = rank
             finally:
                 self._waiting.remove(rank)
 
-    def _is_wanted(self) -> bool:
-        """Whether a job waits that comes before the one that has it."""
+    def _must_give_way(self) -> bool:
+        """Whether a job of higher priority waits."""
         with self._turns:
-            return self._has_it is not None and max(self._waiting, default=self._has_it) > self._has_it
+            return self._current is not None and max(self._waiting, default=self._current) > self._current
 
     def start(self) -> None:
-        """Have a process.
+        """Start the process if there is none.
 
         Raises:
-            JobFailed: none could be started.
+            JobFailed: it cannot be started.
         """
         if self._process is not None:
             return
         try:
-            # What the author's code prints in it is heard of the worker that plays, and not said twice.
+            # The worker that plays shows the author's output; here it would appear twice.
             self._process = WorkerProcess(lambda stream, piece: False, self._niceness)
         except OSError as error:
             raise JobFailed(f"no process could be started in the background: {error}") from error
@@ -218,26 +214,26 @@ class Background(Asker):
     def ensure(
         self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
     ) -> int:
-        """Have a process with that version, and cameras where they are placed; started, loaded and placed if need be.
+        """Start the process, load this version and place the cameras, as far as that is not done.
 
         Args:
-            load: a level that is named is always loaded.
-            or_else: what is loaded where `load` fails.
+            load: with a level other than ``auto`` it is always loaded.
+            or_else: loaded if `load` fails.
 
         Returns:
-            how many envs it has.
+            the number of envs.
 
         Raises:
-            Stopped: the job is to stop.
-            JobFailed: it cannot be had; with the problem, if the author's code raised.
+            Stopped: the job was stopped.
+            JobFailed: one of the steps failed; with the problem, if the author's code raised.
         """
         if self._process is None:
-            job.tell(0, 0, "starting a process in the background")
-            job.check()  # or a job that was stopped meanwhile would start a process for nobody
+            job.report(0, 0, "starting a process in the background")
+            job.check()  # a stopped job must not start a process
             self.start()
-        if not self.has(load):
+        if not self.has_loaded(load):
             self._loaded = None
-            job.tell(0, 0, "building envs in the background")
+            job.report(0, 0, "building envs in the background")
             try:
                 loaded = self.ask(job.check, load)
             except JobFailed as failure:
@@ -251,7 +247,7 @@ class Background(Asker):
             if loaded.reload is None or loaded.reload.level not in ("same", "patched"):
                 self._placed = {}
         wanted = {request.key: request for request in placed}
-        # Those that are placed no more go back to where the file says.
+        # A camera that is no longer placed goes back to the file's pose.
         for key in [key for key in self._placed if key not in wanted]:
             self.ask(job.check, PlaceCamera(key, None))
             del self._placed[key]
@@ -267,16 +263,16 @@ class Background(Asker):
         """As `Asker.ask`.
 
         Raises:
-            JobFailed: it cannot be answered, or the process died.
-            GaveWay: the process is wanted. A load is not left: who waits most likely needs it too.
+            JobFailed: there is no answer, or the process died.
+            GaveWay: a job of higher priority waits. A load is finished first: that job most likely needs it too.
         """
 
         def check_turn() -> None:
             check()
-            if not isinstance(question, Load) and self._is_wanted():
+            if not isinstance(question, Load) and self._must_give_way():
                 raise GaveWay
 
-        check_turn()  # or who waits would wait for this too
+        check_turn()  # before the question: the waiting job would wait for it too
         try:
             return super().ask(check_turn, question, on_progress)
         except EOFError as error:
@@ -286,31 +282,37 @@ class Background(Asker):
             raise JobFailed(f"the process in the background {why}") from None
 
     def end(self) -> None:
-        """End it, if there is one. `pid` is its own until it has ended."""
+        """End the process, if there is one. `pid` stays its own until it has ended."""
         with self._turns:
             if self._process is not None:
                 self._process.stop(grace=0.0)
-            self._process, self._owed, self._loaded, self._placed, self.num_envs = None, None, None, {}, 0
+            self._process, self._unanswered, self._loaded, self._placed, self.num_envs = (
+                None,
+                None,
+                None,
+                {},
+                0,
+            )
 
     def _settle(self, job: Job) -> None:
-        """Take the answer that is still owed, or end the process that does not give it in time."""
-        if self._process is None or self._owed is None:
+        """Read the answer that is still due; end the process if it does not come in time."""
+        if self._process is None or self._unanswered is None:
             return
         self._process.send(Cancel())
-        patience = _LOAD_PATIENCE if isinstance(self._owed.request, Load) else _PATIENCE
+        patience = _LOAD_PATIENCE if isinstance(self._unanswered.request, Load) else _PATIENCE
         deadline = time.monotonic() + patience
         try:
-            while self._owed is not None and not job.closing:
+            while self._unanswered is not None and not job.closing:
                 if time.monotonic() > deadline:
                     self.end()
                     return
-                self._next(self._owed.number)
+                self._next(self._unanswered.number)
         except EOFError:
-            self.end()  # of what it was asked for last; the next job starts another
+            self.end()  # it died of the last question; the next job starts another
 
     def _send_call(self, request: Request) -> None:
         assert self._process is not None and isinstance(request, Call)
-        self._owed = request
+        self._unanswered = request
         self._process.send(request)
 
     def _next(self, number: int) -> Answer | Progress | None:
@@ -319,7 +321,7 @@ class Background(Asker):
         if not isinstance(event, Answer | Progress) or event.number != number:
             return None
         if isinstance(event, Answer):
-            self._owed = None
+            self._unanswered = None
         return event
 
     def _why_gone(self, error: EOFError) -> str:

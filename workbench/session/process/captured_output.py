@@ -1,12 +1,4 @@
-"""What the author's code printed: the last lines, whatever it prints.
-
-A print in a loop is a gigabyte in a minute. Each line that is split, decoded, kept and sent to a terminal costs
-microseconds of the server, which is the page's: a flood of millions would freeze it. So the bytes are taken as
-they come, in large pieces; so many lines a second are looked at, of the others only the number is known.
-
-What it printed may be anything: controls are shown, colours are kept apart from the text (`terminal_text`), and of a
-line that is written over, as by a progress bar, there is the last version, also while it goes on.
-"""
+"""Keeps the last lines that the worker printed, with their colours."""
 
 from __future__ import annotations
 
@@ -29,15 +21,15 @@ SWITCHES = ("bold", "dim", "italic", "underline", "reverse", "strike")
 _LONGEST_LINE = 2000
 _LINES_KEPT = 1000
 _LINES_PER_SECOND = 400
-"""More are counted and dropped. Faster than anybody reads, and 1 % of a core."""
-_BAR_TOLD_EVERY = 0.1
+"""More are counted and dropped. Costs 1 % of a core."""
+_BAR_PERIOD = 0.1
 """Seconds."""
 _KEPT_OF_PIECE = 16_384
-"""Bytes at the end of a piece that are looked at when the piece is one of a flood."""
+"""Bytes at the end of a piece that are split into lines during a flood."""
 
 
 class Run(NamedTuple):
-    """Characters of one style, none of them a control."""
+    """Characters of one style, without control characters."""
 
     text: str
     style: Style
@@ -48,18 +40,18 @@ class PrintedLine:
     stream: str
     """``stdout`` or ``stderr``."""
     text: str
-    """Without colours, every control shown escaped."""
+    """Without colours, control characters escaped."""
     runs: tuple[Run, ...] = ()
-    """The same text with its colours; empty where it has none."""
+    """The same text in coloured runs; empty if it has no colour."""
 
 
 @dataclass(frozen=True)
 class Printed:
-    """The log as it was at one moment."""
+    """A copy of the log."""
 
     serial: int
     lines: tuple[PrintedLine, ...]
-    """Oldest first; last what stands without an end of line, where it was written over: a progress bar."""
+    """Oldest first; an unfinished line that overwrites itself (a progress bar) is last."""
     dropped: int
     """Lines that came too fast to be kept."""
 
@@ -72,13 +64,18 @@ NOTHING_PRINTED = Printed(0, (), 0)
 
 
 class PrintedLog:
-    """Fed by the threads that read the worker's output; read by the page. All methods are thread-safe."""
+    """The last lines of a worker's output. Thread-safe: reader threads feed it, the page reads it.
+
+    A print in a loop gives a gigabyte in a minute. Splitting and decoding each line costs microseconds of the server's
+    process, so a flood of millions would freeze the page: at most `_LINES_PER_SECOND` lines are split, and of the others
+    only the number is kept. Of a line that overwrites itself, as a progress bar does, the last version is kept.
+    """
 
     def __init__(self, on_lines: Callable[[list[PrintedLine], int], None]) -> None:
         """
         Args:
-            on_lines: called with new lines and how many were dropped before them, on the threads that feed; with
-                none where a line that is not ended was written over.
+            on_lines: called on the feeding threads with the new lines and the number dropped before them; with no
+                lines where an unfinished line was overwritten.
         """
         self._on_lines = on_lines
         self._lock = threading.Lock()
@@ -87,24 +84,24 @@ class PrintedLog:
         self._serial = 0
         self._rest: dict[str, bytes] = {}
         self._styles: dict[str, Style] = {}
-        """What each stream's next line begins with."""
+        """The style in which each stream's next line begins."""
         self._budget = float(_LINES_PER_SECOND)
         self._refilled = time.monotonic()
-        self._told_of_bar = 0.0
+        self._bar_reported = 0.0
         self._view = NOTHING_PRINTED
 
     def feed(self, stream: str, piece: bytes) -> bool:
-        """The next bytes of a stream, in any pieces; none at its end. True while they come too fast."""
+        """Add the next bytes of a stream, in any pieces; empty at its end. Returns True during a flood."""
         ended = not piece
         with self._lock:
             if ended:
-                # What stands without an end of line is the last line.
+                # Text without an end of line is the last line.
                 piece = b"\n" if self._rest.get(stream) else b""
             now = time.monotonic()
             earned = (now - self._refilled) * _LINES_PER_SECOND
             self._budget, self._refilled = min(self._budget + earned, float(_LINES_PER_SECOND)), now
             found, dropped = self._split(stream, piece)
-            # The last lines of a flood say more than its first ones, and the very last the most.
+            # Of a flood the last lines are kept.
             over = len(found) - max(1, int(self._budget))
             if over > 0:
                 found, dropped = found[over:], dropped + over
@@ -117,10 +114,10 @@ class PrintedLog:
             bar = b"\r" in self._rest[stream]
             if lines or dropped or bar:
                 self._serial += 1
-            told = bool(lines or dropped) or (bar and now - self._told_of_bar > _BAR_TOLD_EVERY)
-            if told and bar:
-                self._told_of_bar = now
-        if told:
+            report = bool(lines or dropped) or (bar and now - self._bar_reported > _BAR_PERIOD)
+            if report and bar:
+                self._bar_reported = now
+        if report:
             self._on_lines(lines, dropped)
         return dropped > 0
 
@@ -137,11 +134,11 @@ class PrintedLog:
             return self._view
 
     def tail(self, count: int) -> str:
-        """The last `count` lines, as one text."""
+        """The last `count` lines as one text."""
         return "\n".join(self.view().texts[-count:])
 
     def _split(self, stream: str, piece: bytes) -> tuple[list[bytes], int]:
-        """The lines that end in `piece`, and how many of it were not even looked at."""
+        """The lines that end in `piece`, and the number of those that were dropped."""
         dropped = 0
         if len(piece) > _KEPT_OF_PIECE and self._budget < _LINES_PER_SECOND / 2:
             cut = piece.rfind(b"\n", 0, len(piece) - _KEPT_OF_PIECE) + 1
@@ -149,10 +146,10 @@ class PrintedLog:
             if cut:
                 piece, self._rest[stream] = piece[cut:], b""
         *whole, rest = (self._rest.get(stream, b"") + piece).split(b"\n")
-        # Of a bar that is drawn for minutes only the last version is needed, and the one that is being written.
+        # Of a progress bar only the last version and the one being written are needed.
         if rest.count(b"\r") > 1:
             rest = b"\r".join(rest.rsplit(b"\r", 2)[1:])
-        # Without an end of line in sight: cut there, or a gigabyte without one would fill us up.
+        # Cut a line without an end, or a gigabyte of it would fill this process.
         if len(rest) > _LONGEST_LINE:
             whole.append(rest)
             rest = b""
@@ -173,8 +170,8 @@ class PrintedLog:
 
 
 def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
-    """A line, and the style that the one after it begins with."""
-    # What went back to the line's beginning wrote over what stood there.
+    """A line, and the style in which the next one begins."""
+    # Text after a carriage return overwrites the line.
     seen = raw.rstrip(b"\r").rpartition(b"\r")[2]
     cut = seen if len(seen) <= _LONGEST_LINE else seen[:_LONGEST_LINE] + "…".encode()
     runs, after = coloured_runs(cut.decode(errors="replace"), style)
@@ -183,10 +180,10 @@ def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
 
 
 def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[Run], Style]:
-    """One line as runs, and the style that the next line begins with.
+    """One line as runs, and the style in which the next line begins.
 
     Args:
-        style: the one that the line before ended with.
+        style: at the end of the previous line.
     """
     runs: list[Run] = []
     end = 0
@@ -199,7 +196,7 @@ def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[Run], Style]:
 
 
 def for_terminal(runs: Iterable[Run]) -> str:
-    """These runs for a terminal that has colours; it is plain again after them."""
+    """Escape codes for these runs; the terminal's style is plain after them."""
     return "".join(run.style.render(run.text) for run in runs)
 
 
@@ -214,7 +211,7 @@ def _add(runs: list[Run], text: str, style: Style) -> None:
 
 @lru_cache(4096)
 def _changed(style: Style, numbers: str) -> Style:
-    """After the numbers of an ``ESC [ numbers m``."""
+    """The style after ``ESC [ numbers m``."""
     decoder = AnsiDecoder()
     decoder.style = style
     for first, *more in colour_codes(numbers):
@@ -223,7 +220,7 @@ def _changed(style: Style, numbers: str) -> Style:
         elif first in HARMLESS:
             decoder.decode_line(f"\x1b[{24 if (first, more) == (4, [0]) else first}m")
     found = decoder.style
-    # What was switched off looks as what never was on.
+    # Switched off and never on compare equal.
     colour, background = (None if c is None or c.is_default else c for c in (found.color, found.bgcolor))
     on = Style.parse(" ".join(name for name in SWITCHES if getattr(found, name)))
     return Style(color=colour, bgcolor=background) + on

@@ -1,8 +1,4 @@
-"""The worker's debugger: debugpy listens on this machine only, and what it holds is noted for the server.
-
-A worker at a breakpoint answers nothing, as one that hangs does. So whoever watches over it must know: debugpy has no word
-for "the main thread stands still", and the one method that it stands still in is wrapped here.
-"""
+"""Lets a debugger attach to the worker through debugpy, and reports when it holds the main thread."""
 
 from __future__ import annotations
 
@@ -17,33 +13,33 @@ from collections.abc import Callable
 from typing import Any
 
 USUAL_PORT = 5678
-"""Which editors propose to attach to."""
+"""The default of editors."""
 HOST = "127.0.0.1"
-"""Nothing else: whoever attaches runs what they like."""
+"""This machine only: a client that attaches can run any code."""
 
 
 class CannotDebug(ValueError):
-    """No debugger can be listened for; the text says why."""
+    """debugpy cannot listen; the text says why."""
 
 
 def listen_for_debugger(port: int, hold: Callable[[bool], None]) -> None:
-    """From now on a debugger can attach, and ``breakpoint()`` stops for one. Called once, on the main thread.
+    """Listen for a debugger, and let ``breakpoint()`` stop in it. Call once, on the main thread.
 
     Args:
-        hold: called on the main thread with True when a debugger makes it stand still, with False when it goes on.
+        hold: called on the main thread with True when a debugger suspends it, and with False when it continues.
 
     Raises:
-        CannotDebug: the port is taken, or debugpy is not there or another than is known.
+        CannotDebug: the port is taken, or debugpy is missing or of an unknown version.
     """
-    # Python's own modules are not what is debugged; without this it warns of them in four lines on each start.
+    # Without this debugpy prints four lines of warning about Python's frozen modules at each start.
     os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
     try:
         import debugpy.server
         import pydevd  # pyright: ignore[reportMissingImports]  debugpy.server puts it on sys.path
     except ImportError as error:
         raise CannotDebug(f"debugpy cannot be imported: {error}") from error
-    _tell_when_held(pydevd.PyDB, hold)
-    # The processes that a task starts are not the worker, and would each wait for a debugger of their own.
+    _report_suspension(pydevd.PyDB, hold)
+    # Processes that a task starts would each wait for a debugger of their own.
     debugpy.configure(subProcess=False)
     try:
         debugpy.listen((HOST, port))
@@ -53,7 +49,7 @@ def listen_for_debugger(port: int, hold: Callable[[bool], None]) -> None:
 
 
 def wait_for_debugger(hold: Callable[[bool], None]) -> None:
-    """Return when one has attached and set its breakpoints."""
+    """Wait until a debugger has attached and set its breakpoints."""
     import debugpy
 
     hold(True)
@@ -63,34 +59,38 @@ def wait_for_debugger(hold: Callable[[bool], None]) -> None:
         hold(False)
 
 
-def debug_here(say: Callable[[str], None]) -> None:
-    """Wait for a debugger in a process that nobody watches over.
+def debug_here(on_message: Callable[[str], None]) -> None:
+    """Wait for a debugger in a process without a supervisor.
 
     Raises:
-        ValueError: no debugger can be listened for.
+        ValueError: debugpy cannot listen.
     """
     port = port_for_debugger(None)
     listen_for_debugger(port, lambda held: None)
-    say(f"waiting for a debugger at {HOST}:{port}")
+    on_message(f"waiting for a debugger at {HOST}:{port}")
     wait_for_debugger(lambda held: None)
 
 
-def _tell_when_held(debugger: Any, hold: Callable[[bool], None]) -> None:
-    stand_still = getattr(debugger, "do_wait_suspend", None)
-    if stand_still is None:
+def _report_suspension(debugger: Any, hold: Callable[[bool], None]) -> None:
+    """Call `hold` around debugpy's one method in which a thread is suspended; debugpy has no event for it.
+
+    Without this the supervisor would take a worker at a breakpoint for one that hangs.
+    """
+    wait_suspended = getattr(debugger, "do_wait_suspend", None)
+    if wait_suspended is None:
         version = importlib.metadata.version("debugpy")
         raise CannotDebug(f"debugpy {version} is not known to the workbench; install debugpy==1.8.22")
 
-    def told(self: Any, thread: threading.Thread, *arguments: Any, **keywords: Any) -> Any:
+    def reported(self: Any, thread: threading.Thread, *arguments: Any, **keywords: Any) -> Any:
         if thread is not threading.main_thread():
-            return stand_still(self, thread, *arguments, **keywords)
+            return wait_suspended(self, thread, *arguments, **keywords)
         hold(True)
         try:
-            return stand_still(self, thread, *arguments, **keywords)
+            return wait_suspended(self, thread, *arguments, **keywords)
         finally:
             hold(False)
 
-    debugger.do_wait_suspend = told
+    debugger.do_wait_suspend = reported
 
 
 def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., None], port: int) -> None:
@@ -104,8 +104,8 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
         place = caller.f_code.co_filename, caller.f_lineno
         if place not in passed:
             passed.add(place)
-            said = f"{place[0]}:{place[1]}: a breakpoint was passed, since no debugger is attached to {HOST}:{port}"
-            print(said, file=sys.stderr)
+            message = f"{place[0]}:{place[1]}: a breakpoint was passed, since no debugger is attached to {HOST}:{port}"
+            print(message, file=sys.stderr)
 
     if os.environ.get("PYTHONBREAKPOINT") != "0":
         sys.breakpointhook = stop
@@ -113,10 +113,10 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
 
 
 def port_for_debugger(wanted: int | None) -> int:
-    """A port of this machine that is free now: the one that is wanted, or the usual one, or another.
+    """A free port of this machine: `wanted`, or where that is None `USUAL_PORT` or any other.
 
     Raises:
-        ValueError: debugpy is not installed, or the wanted port is taken or none.
+        ValueError: debugpy is not installed, or `wanted` is taken or no port.
     """
     if importlib.util.find_spec("debugpy") is None:
         raise ValueError("--debug needs debugpy, which is not installed: pip install debugpy")
@@ -134,8 +134,8 @@ def port_for_debugger(wanted: int | None) -> int:
     raise ValueError(f"--debug-port {wanted} cannot be listened on: {reason.strerror}")
 
 
-def listening_for_a_debugger(port: int, waits: bool) -> str:
-    """In the log."""
+def listening_text(port: int, waits: bool) -> str:
+    """The log's line."""
     at = f"{HOST}:{port}"
     if waits:
         return f"the worker waits for a debugger at {at}; the task is loaded when one has attached"

@@ -1,33 +1,24 @@
-"""Where a worker hangs, or died, in the author's words: read from faulthandler's dumps.
-
-A process that loops in native code, or that a segmentation fault ends, cannot be asked anything any more. But
-Python's ``faulthandler`` writes the stack from within a signal handler, without the interpreter's help, into
-a file that both processes hold. The server reads it here: the frames, which of them is the author's, and in
-which hook of the task it all happened. (Format: ``_Py_DumpTraceback`` in CPython's ``Python/traceback.c``;
-innermost frame first, no source lines, characters beyond ASCII as backslash escapes.)
-
-A worker that loops for ever sends nothing, and one that is paused sends nothing either. To tell them apart
-without asking (the one that hangs would not answer), the worker notes in shared memory when it begins and
-ends a piece of work: two small writes a control step, no message. The clock is CLOCK_MONOTONIC, which is the
-same in every process of the machine.
-"""
+"""What a worker is doing, where it hangs or died, and how its work is interrupted."""
 
 from __future__ import annotations
 
 import mmap
 import os
 import re
+import signal
 import struct
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
 from traceback import FrameSummary, StackSummary
+from types import FrameType
 from typing import Literal, get_args
 
 from workbench.authoring.loading.modules import read_source
-from workbench.authoring.problem import HOOK_STAGES, Problem
+from workbench.authoring.problem import HOOK_STAGES, Interrupted, Problem
 
 _FRAME = re.compile(r'^  File "(?P<file>.*)", line (?P<line>\d+|\?\?\?) in (?P<function>.*)$', re.MULTILINE)
 _FATAL = re.compile(r"^Fatal Python error: (?P<what>.+)$", re.MULTILINE)
@@ -38,30 +29,35 @@ _OURS = ("/workbench/session/", "/workbench/core/", "/workbench/authoring/", "<f
 
 @dataclass(frozen=True)
 class Busy:
-    """A piece of work that has lasted long, and where it was when the worker was last looked at."""
+    """A piece of work that takes long, and where it was at the last look."""
 
     seconds: float
     doing: str
-    """For people: ``in evaluate``, ``loading``."""
+    """For the page: ``in evaluate``, ``loading``."""
     file: str | None = None
-    """The author's file, if one of their lines is being executed."""
+    """The author's file, if one of its lines is being executed."""
     line: int | None = None
     code: str | None = None
     traceback: str = ""
     drawing: bool = False
-    """The renderer is at work, which may take long the first time."""
+    """The renderer works, which may take long the first time."""
     getting_ready: bool = False
-    """A new worker imports and compiles; no line of the author's is at work."""
-    deaf: bool = False
-    """It was interrupted and went on all the same."""
+    """A new worker imports and compiles; none of the author's lines runs."""
+    ignores_interrupt: bool = False
+    """It was interrupted and continued all the same."""
     held: bool = False
-    """A debugger makes it stand still, or is waited for: it does not hang, and goes on when that says so."""
+    """A debugger has suspended it, or is waited for: it does not hang."""
     awaited: bool = False
-    """Nothing is done until a debugger attaches."""
+    """It waits until a debugger attaches."""
 
 
 def parse_stack(dump: str) -> list[FrameSummary]:
-    """The frames of the dump's last stack, innermost first; empty when there is none."""
+    """The frames of the last stack in a dump of ``faulthandler``, innermost first; empty if there is none.
+
+    faulthandler writes from a signal handler without the interpreter's help, so it works in a process that loops in
+    native code or dies of a segmentation fault. Format: ``_Py_DumpTraceback`` in CPython's ``Python/traceback.c``;
+    innermost frame first, no source lines, characters beyond ASCII as backslash escapes.
+    """
     last = dump.rfind("(most recent call first):")
     return [
         FrameSummary(
@@ -72,7 +68,7 @@ def parse_stack(dump: str) -> list[FrameSummary]:
 
 
 def fatal_error(dump: str) -> str | None:
-    """What the dump says of the end: ``Segmentation fault``, ``called os._exit(3)``; None if nothing."""
+    """How the process ended according to the dump: ``Segmentation fault``, ``called os._exit(3)``; None if not there."""
     fatal, left = _FATAL.search(dump), _EXIT.search(dump)
     if fatal is not None:
         return fatal["what"]
@@ -82,10 +78,10 @@ def fatal_error(dump: str) -> str | None:
 def author_place(
     frames: Sequence[FrameSummary], own_files: Iterable[str], texts: Mapping[str, str] | None = None
 ) -> tuple[str | None, int | None, str | None]:
-    """File, line and code of the innermost frame in one of `own_files` (the author's paths); None where there is none.
+    """File, line and code of the innermost frame in one of `own_files` (the author's paths); None if there is none.
 
     Args:
-        texts: as of `as_traceback`.
+        texts: as for `as_traceback`.
     """
     named = {path.encode("ascii", "backslashreplace").decode(): path for path in own_files}
     for frame in frames:
@@ -101,27 +97,27 @@ def hook_of(frames: Sequence[FrameSummary]) -> str | None:
 
 
 def as_traceback(frames: Sequence[FrameSummary], texts: Mapping[str, str] | None = None) -> str:
-    """As Python prints a traceback: outermost first, with the lines; less the workbench's own at its start.
+    """As Python prints a traceback, without the workbench's own frames at its start.
 
     Args:
-        texts: source by path, of files whose running version is not what is on disk.
+        texts: source by path, for files that run in another version than on disk.
     """
     theirs = dropwhile(lambda frame: any(part in frame.filename for part in _OURS), reversed(frames))
     with_code = [_frame(f.filename, f.lineno or 0, f.name, texts) for f in theirs]
-    said = "".join(StackSummary.from_list(with_code).format()).rstrip()
-    return f"Traceback (most recent call last):\n{said}" if said else ""
+    text = "".join(StackSummary.from_list(with_code).format()).rstrip()
+    return f"Traceback (most recent call last):\n{text}" if text else ""
 
 
 def _frame(file: str, line: int, function: str, texts: Mapping[str, str] | None) -> FrameSummary:
-    # Never without a text, or Python would read the file: it may be a device or a pipe by now.
+    # Without a text Python would read the file, which may be a device or a pipe by now.
     return FrameSummary(file, line, function, line=code_of(file, line, texts) or "")
 
 
 def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str | None:
-    """Text of a line, stripped; None where it cannot be had."""
+    """Text of a line, stripped; None if it cannot be read."""
     text = None if texts is None else texts.get(file)
     try:
-        # Not linecache: the file may be a device or a pipe by now, and this is the page's process.
+        # Not linecache: the file may be a device or a pipe by now, which would block the page.
         lines = (read_source(file) if text is None else text).splitlines()
     except (OSError, SyntaxError):
         return None
@@ -129,9 +125,14 @@ def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str
 
 
 def busy_at(
-    seconds: float, doing: Doing, dump: str, own_files: Iterable[str], deaf: bool, held: bool = False
+    seconds: float,
+    doing: Doing,
+    dump: str,
+    own_files: Iterable[str],
+    ignores_interrupt: bool,
+    held: bool = False,
 ) -> Busy:
-    """What a look at a worker at work showed; `dump` may be empty. Other arguments are as of `Busy`."""
+    """`Busy` from the worker's stack; `dump` may be empty."""
     frames = parse_stack(dump)
     hook, (file, line, code) = hook_of(frames), author_place(frames, own_files)
     return Busy(
@@ -143,7 +144,7 @@ def busy_at(
         traceback=as_traceback(frames),
         drawing=doing == "drawing" and hook is None,
         getting_ready=doing in ("starting", "warming up") and hook is None,
-        deaf=deaf,
+        ignores_interrupt=ignores_interrupt,
         held=held,
         awaited=held and doing == "waiting for a debugger",
     )
@@ -152,13 +153,13 @@ def busy_at(
 def death_problem(
     why: str, doing: str | None, dump: str, own_files: Sequence[str], printed: str, texts: Mapping[str, str]
 ) -> Problem:
-    """Why there is no worker any more, at the author's line if its last words name one.
+    """How a worker died, at the author's line if the last stack names one.
 
     Args:
         why: for example ``was killed by SIGSEGV``.
-        doing: what it was at: ``stepping``; None when it was at nothing.
+        doing: for example ``stepping``; None for an idle worker.
         dump: its last stack, or empty.
-        printed: the last lines that it printed.
+        printed: its last lines of output.
         texts: source by path of the version that ran.
     """
     frames = parse_stack(dump)
@@ -185,12 +186,15 @@ def death_problem(
 
 
 def own_files_of(source_files: Iterable[str], own_file: Path | None) -> list[str]:
-    """The author's files, the task's own first, also before it was ever loaded."""
+    """The author's files, the task's own first, which is known before anything is loaded."""
     own = [] if own_file is None else [str(own_file)]
     return own + [path for path in source_files if path not in own]
 
 
-# --- What the worker is doing now, readable while it hangs: a page of memory that both processes see ---
+# --- what the worker does now, in memory that both processes map -------------------------------------
+# A hanging worker and a paused one both send nothing, and asking would not tell them apart. So the worker writes when
+# it begins and ends a piece of work: two small writes a control step, no message. The clock is CLOCK_MONOTONIC, which
+# is the same in all processes of the machine.
 
 
 Doing = Literal[
@@ -208,37 +212,37 @@ _DOINGS: tuple[Doing, ...] = get_args(Doing)
 _LAYOUT = struct.Struct("=QdB")
 """Number of the piece of work, its beginning in seconds, index into `_DOINGS`."""
 _PID, _PID_AT = struct.Struct("=I"), 64
-"""Of the worker; 0 until it has begun."""
+"""Of the worker; 0 until it has started."""
 _HELD_AT = 128
-"""A byte: 1 while a debugger holds it."""
+"""A byte: 1 while a debugger holds the worker."""
 
 
 @dataclass(frozen=True)
 class Beat:
-    """What a worker was doing when it was looked at."""
+    """What a worker was doing at one moment."""
 
     number: int
-    """Counts pieces of work: the same number a while later is the same piece. 0 until the first."""
+    """Counts pieces of work; 0 until the first."""
     doing: Doing
     since: float
     """``time.monotonic()`` of its beginning."""
     held: bool = False
-    """A debugger makes it stand still, or is waited for."""
+    """A debugger has suspended it, or is waited for."""
 
     @property
     def seconds(self) -> float:
-        """How long it has been at it; 0 for a worker that waits to be asked."""
+        """How long this piece of work has taken; 0 for an idle worker."""
         return 0.0 if self.doing == "idle" or self.number == 0 else max(0.0, time.monotonic() - self.since)
 
 
-def make_pulse() -> int:
-    """The memory, as a file descriptor that can be passed on; the caller closes it."""
+def make_heartbeat() -> int:
+    """Shared memory as a file descriptor for the child; the caller closes it."""
     fd = os.memfd_create("workbench-pulse")
     os.ftruncate(fd, mmap.PAGESIZE)
     return fd
 
 
-class PulseWriter:
+class HeartbeatWriter:
     """The worker's side."""
 
     def __init__(self, fd: int) -> None:
@@ -251,11 +255,11 @@ class PulseWriter:
         _LAYOUT.pack_into(self._memory, 0, self._number, time.monotonic(), _DOINGS.index(doing))
 
     def hold(self, held: bool) -> None:
-        """A debugger makes the worker stand still, or lets it go on."""
+        """A debugger has suspended the worker, or has let it continue."""
         self._memory[_HELD_AT] = held
 
 
-class PulseReader:
+class HeartbeatReader:
     """The server's side."""
 
     def __init__(self, fd: int) -> None:
@@ -263,14 +267,75 @@ class PulseReader:
 
     @property
     def pid(self) -> int:
-        """Process id of the worker; 0 until it has begun."""
+        """Process id of the worker; 0 until it has started."""
         return _PID.unpack_from(self._memory, _PID_AT)[0]
 
     def read(self) -> Beat:
-        # Written by another process without a lock: a torn reading is one that changes when read again.
+        # There is no lock between the processes: a torn read differs from the next one.
         for _ in range(100):
             first = self._memory[: _LAYOUT.size]
             if first == self._memory[: _LAYOUT.size]:
                 break
         number, since, doing = _LAYOUT.unpack(first)
         return Beat(number, _DOINGS[min(doing, len(_DOINGS) - 1)], since, self._memory[_HELD_AT] == 1)
+
+
+# --- interrupting the author's code ------------------------------------------------------------------
+
+INTERRUPT_SIGNAL = signal.SIGUSR1
+"""Not SIGINT, for which libraries and authors install handlers of their own."""
+STACK_SIGNAL = signal.SIGUSR2
+"""Makes faulthandler write the worker's stack into its file."""
+
+
+class Interrupts:
+    """Lets the server stop the author's code in the worker's main thread, and never the workbench's own.
+
+    A signal's handler runs in the main thread between two bytecodes and may raise there, so a Python loop that never ends
+    is left with a traceback that names the author's line. Elsewhere it must not raise: half a message in the pipe would
+    end the session. So a signal counts only within `run`, and not within `shielded`. Native code that does not return,
+    and a loop that catches everything, cannot be left this way; the supervisor reports that.
+    """
+
+    def __init__(self) -> None:
+        self._allowed = False
+        self._waiting = False
+        self._began = 0.0
+
+    def install(self) -> None:
+        """Install the handler; without it the signal would end the process."""
+        signal.signal(INTERRUPT_SIGNAL, self._on_signal)
+
+    def run(self, work: Callable[[], object]) -> None:
+        """Run `work`, which a signal may interrupt.
+
+        Raises:
+            Interrupted: a signal came.
+        """
+        self._began, self._waiting = time.monotonic(), False
+        try:
+            self._allowed = True
+            work()
+        finally:
+            self._allowed = False
+
+    @contextmanager
+    def shielded(self) -> Iterator[None]:
+        """Finish what is done within this; a signal that came meanwhile is raised afterwards."""
+        before, self._allowed = self._allowed, False
+        try:
+            yield
+        finally:
+            self._allowed = before
+        if before and self._waiting:
+            self._raise()
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._allowed:
+            self._raise()
+        # Between two pieces of work there is nothing to stop; within `shielded` it is raised at its end.
+        self._waiting = True
+
+    def _raise(self) -> None:
+        self._waiting = False
+        raise Interrupted(f"stopped by hand after {time.monotonic() - self._began:.1f} s")

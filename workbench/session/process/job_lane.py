@@ -1,8 +1,4 @@
-"""Jobs one at a time on a thread of their own: a new one takes the place of the one before, and any can be stopped.
-
-A job is a function that asks often whether it is to go on (`Job.check`); so it ends within what it does between two
-questions, and nobody ends a thread.
-"""
+"""Runs jobs on a thread, one at a time: a new job replaces the one before."""
 
 from __future__ import annotations
 
@@ -17,7 +13,7 @@ from workbench.machine.processes.watched_thread import report_failure, watched_t
 
 @dataclass(frozen=True)
 class JobProgress:
-    """Of work in the background."""
+    """How far a background job is."""
 
     what: str
     done: int
@@ -25,11 +21,11 @@ class JobProgress:
 
 
 class Stopped(Exception):
-    """The job is to go no further."""
+    """The job was stopped."""
 
 
 class JobFailed(Exception):
-    """The job cannot go on; its text is for the reader, and `problem` is what the author's code raised, if it did."""
+    """The job failed. The text is for the page; `problem` is what the author's code raised, if it did."""
 
     def __init__(self, why: str, problem: Problem | None = None) -> None:
         super().__init__(why)
@@ -37,43 +33,43 @@ class JobFailed(Exception):
 
 
 class Job:
-    """One piece of work."""
+    """One piece of work. It calls `check` often, which raises once the job is stopped: a thread cannot be ended."""
 
     _numbers = count(1)
 
     def __init__(self, lane: JobLane, what: str, work: Callable[[Job], None]) -> None:
         self._job_lane, self._what, self.work = lane, what, work
         self.number = next(self._numbers)
-        """One that is begun later has a higher one, whatever lane it is on."""
+        """Higher for a job that begins later, across all lanes."""
         self.stopped = False
         self.progress = JobProgress(what, 0, 0)
 
     @property
     def closing(self) -> bool:
-        """There is to be no job after it."""
+        """Whether the lane is closing."""
         return self._job_lane.closing
 
     def check(self) -> None:
-        """Raises Stopped where it is to stop."""
+        """Raise Stopped if the job was stopped."""
         if self.stopped:
             raise Stopped
 
-    def tell(self, done: int, total: int, what: str = "") -> None:
-        """How far it is."""
+    def report(self, done: int, total: int, what: str = "") -> None:
+        """Report progress."""
         self.progress = JobProgress(what or self._what, done, total)
         self._job_lane.changed()
 
 
 class JobLane:
-    """See the module's text."""
+    """A thread that runs one job at a time. Thread-safe."""
 
     def __init__(
         self, name: str, on_change: Callable[[], None], on_failure: Callable[[Job, JobFailed], None]
     ) -> None:
         """
         Args:
-            on_change: called when `progress` is new.
-            on_failure: called with a job that failed, whether that was foreseen (JobFailed) or not; it may be stopped.
+            on_change: called when `progress` has changed.
+            on_failure: called with a job that failed, by JobFailed or any other exception; it may be a stopped one.
         """
         self._name, self.changed, self._on_failure = name, on_change, on_failure
         self._wake = threading.Condition()
@@ -84,13 +80,13 @@ class JobLane:
 
     @property
     def progress(self) -> JobProgress | None:
-        """Of the job that is done, or waits to be; None for neither."""
+        """Of the job that runs or waits; None for neither."""
         with self._wake:
             job = self._waiting or self._job
             return None if job is None or job.stopped else job.progress
 
     def start(self, what: str, work: Callable[[Job], None]) -> None:
-        """Do this in place of whatever was done before."""
+        """Run this job; the previous one is stopped."""
         with self._wake:
             if self.closing:
                 return
@@ -103,12 +99,12 @@ class JobLane:
         self.changed()
 
     def stop(self) -> None:
-        """Go no further with what is under way. Calls nobody."""
+        """Stop the job, without a callback."""
         with self._wake:
             self._stop()
 
     def close(self) -> None:
-        """Stop, and wait for the thread's end."""
+        """Stop, and join the thread."""
         with self._wake:
             self.closing = True
             self._stop()
@@ -131,7 +127,7 @@ class JobLane:
             except JobFailed as failure:
                 self._on_failure(job, failure)
             except Exception as error:
-                # Of the workbench's own. Whoever shows the job must hear that it is over.
+                # A fault of the workbench. The page must see that the job is over.
                 report_failure(f"The job '{job.progress.what}' failed", error)
                 why = f"it failed within the workbench ({type(error).__name__}: {shorten(str(error))})"
                 self._on_failure(job, JobFailed(why))

@@ -1,10 +1,4 @@
-"""How much memory a worker may have, and how much it has.
-
-A limit on address space (``RLIMIT_AS``) is of no use here: torch and the renderer reserve far more than they use,
-and fail in ways that name nothing. What counts is the memory that the worker and all that it started have together,
-so the server looks at it ten times a second and ends a worker that has more than it may, with a message, before the kernel must choose a
-victim. Should the kernel be quicker all the same, the worker has told it to be chosen first (``oom_score_adj``).
-"""
+"""Measures a worker's memory, and reads ``--memory-limit``."""
 
 from __future__ import annotations
 
@@ -20,7 +14,7 @@ from workbench.machine.processes.family import family, proportional_memory, resi
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 _SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kmgt]?)i?b?", re.IGNORECASE)
 _SHARE = 0.8
-"""Of the memory that this machine, or the container, has."""
+"""Of the memory of the machine or the container."""
 _LEAST = 2**30
 """Bytes; a worker that has only imported uses about half of this."""
 _CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -31,7 +25,7 @@ def parse_memory(text: str) -> int | None:
     """Bytes of ``8GB``, ``800 MiB`` (both count by 1024), ``auto``; None for ``none``.
 
     Raises:
-        ValueError: it is none of these, or too little for any worker.
+        ValueError: it is none of these, or too small for any worker.
     """
     word = text.strip().lower()
     if word == "none":
@@ -49,13 +43,13 @@ def parse_memory(text: str) -> int | None:
 
 
 def size_in_bytes(text: str) -> float | None:
-    """Of ``8GB``, ``1.5 GiB``, ``800m`` (all count by 1024) or a plain number; None for what is no size."""
+    """Bytes of ``8GB``, ``1.5 GiB``, ``800m`` (all by 1024) or a plain number; None for other text."""
     found = _SIZE.fullmatch(text.strip())
     return None if found is None else float(found["number"]) * _UNITS[found["unit"].lower()]
 
 
 def total_memory() -> int:
-    """Bytes that there are for all: of the machine, or of the container if that has less."""
+    """Bytes of memory of the machine, or of the container if that has less."""
     total = psutil.virtual_memory().total
     for path in _CONTAINER_LIMITS:
         try:
@@ -66,25 +60,27 @@ def total_memory() -> int:
 
 
 class FamilyMemory:
-    """What a process's descendants have in memory together, looked at ten times a second.
+    """Memory of all descendants of a process, measured ten times a second.
 
-    What a forked child shares with its parent counts once: the sum of resident memory (RSS) counts a worker of 1 GB with
-    seven children as 8 GB, and would end it for nothing. The kernel divides shared pages among those who have them
-    (PSS), but takes milliseconds to count them, so that is asked every two seconds, and at once where the memory seems
-    too much. In between, what is new counts as not shared.
+    The server ends a worker above its limit before the kernel must choose a victim. ``RLIMIT_AS`` does not work: torch and
+    the renderer reserve far more address space than they use, and fail without naming the cause.
+
+    Pages that a forked child shares with its parent count once: summed resident memory (RSS) would count a worker of
+    1 GB with seven children as 8 GB. The kernel's share of shared pages (PSS) takes milliseconds, so it is read every
+    two seconds, and at once where the memory seems above the limit. In between, new memory counts as not shared.
     """
 
     def __init__(self, pid: int) -> None:
         """
         Args:
-            pid: is not counted itself.
+            pid: not counted itself.
         """
         self._pid = pid
         self._shared = 0
         self._counted = 0.0
 
-    def look(self, limit: int | None = None) -> int:
-        """Bytes, never more than there are where that is above `limit`."""
+    def measure(self, limit: int | None = None) -> int:
+        """Bytes; exact where the quick estimate is above `limit`."""
         members = family(self._pid)[1:]
         resident = sum(map(resident_memory, members))
         if len(members) < 2:
@@ -97,6 +93,6 @@ class FamilyMemory:
         return resident - self._shared
 
 
-def in_words(size: int) -> str:
+def format_size(size: int) -> str:
     """``8.0 GB``, ``310 MB``; by 1024."""
     return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{size / 2**20:.0f} MB"

@@ -1,14 +1,4 @@
-"""The worker as a child process: start it, talk to it, hear what it prints, look at it, know when it dies.
-
-A plain subprocess with one end of a socket pair: no standard input (a task that reads it gets end of
-file, not a hang), its own process group (Ctrl-C in the terminal is for the server, which then ends the
-worker in good order), and its output read as it comes so that an author's prints reach the page.
-
-The author's code may keep it from reading, from writing, and from ending. So nothing here waits for it: what
-is sent goes through a queue and a thread of its own (a socket that nobody reads is full after some hundred
-messages, and a page's control would wait there); what it is doing stands in shared memory (`pulse`); and where
-it is, it says from a signal handler into a file in memory, whatever its interpreter is doing (`last_words`).
-"""
+"""The worker as a child process: messages, output, stack, memory and exit code."""
 
 from __future__ import annotations
 
@@ -29,8 +19,13 @@ from workbench.machine.processes.child_python import child_environment, python_c
 from workbench.machine.processes.family import end_family, main_thread_ended
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import MessageSocket
-from workbench.session.process.heartbeat import Beat, PulseReader, make_pulse
-from workbench.session.process.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
+from workbench.session.process.heartbeat import (
+    INTERRUPT_SIGNAL,
+    STACK_SIGNAL,
+    Beat,
+    HeartbeatReader,
+    make_heartbeat,
+)
 from workbench.session.process.memory_limit import FamilyMemory
 from workbench.session.protocol.messages import (
     Event,
@@ -42,42 +37,48 @@ from workbench.session.protocol.messages import (
     without_steps,
 )
 
-_WHOLE = (Load, Settings)
-"""Of two of one kind that wait one behind the other only the second matters."""
+_ONLY_LAST = (Load, Settings)
+"""Of two such requests in a row in the queue only the second matters."""
 _MOST_WAITING = 1000
-"""Requests for a worker that reads none; more are dropped (a key held down on Step)."""
+"""Length of the queue; more are dropped (a key held down on Step while the worker reads nothing)."""
 _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
 _BEGINS = 10.0
-"""Seconds in which a worker has begun, also on a machine that is at work."""
+"""Seconds in which a worker starts, also on a busy machine."""
 
 Output = Callable[[str, bytes], bool]
-"""Gets ``stdout`` or ``stderr`` and the bytes that came (none at its end); True asks for a little rest."""
+"""Gets ``stdout`` or ``stderr`` and new bytes (none at its end); True asks for a pause."""
 
 
 class WorkerProcess:
-    """One worker. Events are taken by `receive`, on one thread; all else may be called from any.
+    """One worker. `receive` is called on one thread, all else on any.
 
-    It must be started on a thread that lives as long as the worker may: the kernel ends a worker with the
-    thread that started it, so that none is left behind when the server is killed.
+    Start it on a thread that outlives the worker: the kernel ends a worker with the thread that started it, so that none
+    is left behind when the server is killed.
+
+    It has no standard input, so that a task that reads it gets end of file and does not hang, and its own process group,
+    so that Ctrl-C in the terminal reaches the server alone. The author's code may keep it from reading, writing and
+    ending, so nothing here waits for it: requests go through a queue and a thread (an unread socket is full after some
+    hundred messages, and the page would block), what it does is in shared memory (`heartbeat`), and faulthandler writes
+    its stack from a signal handler into a memory file.
     """
 
     def __init__(self, output: Output, niceness: int = 0) -> None:
         """
         Args:
-            output: called with what it prints, on threads of this object; see `hear`.
-            niceness: by how much other processes come first.
+            output: called with its output on threads of this object; see `redirect_output`.
+            niceness: as for ``nice``.
         """
         ours, theirs = socket.socketpair()
-        pulse = make_pulse()
+        heartbeat = make_heartbeat()
         self._stacks = os.memfd_create("workbench-stacks")
-        # Appended to by the worker, read and emptied by us: the position is shared with it.
+        # The worker appends, we read and truncate: the file position is shared.
         fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
-        fds = [theirs.fileno(), pulse, self._stacks]
+        fds = [theirs.fileno(), heartbeat, self._stacks]
         try:
-            # What is started is the worker's keeper, and the worker its child; it ends as the worker does.
+            # This starts the worker's keeper, which starts the worker and ends with its exit code.
             self._process = subprocess.Popen(
                 python_command(
                     "-m", "workbench.session.worker.start", *map(str, [*fds, os.getpid(), niceness])
@@ -90,14 +91,14 @@ class WorkerProcess:
                 start_new_session=True,
                 env=child_environment(PYTHONUNBUFFERED="1"),
             )
-            self._pulse = PulseReader(pulse)
+            self._heartbeat = HeartbeatReader(heartbeat)
         except BaseException:
             ours.close()
             os.close(self._stacks)
             raise
         finally:
             theirs.close()
-            os.close(pulse)
+            os.close(heartbeat)
         self._line = MessageSocket(ours, get_args(Event))
         self._memory = FamilyMemory(self._process.pid)
         self._output = output
@@ -117,18 +118,18 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process that runs the task. Waits for it to begin, some 50 ms after it was started."""
+        """Of the process that runs the task. Waits until it has started, some 50 ms."""
         deadline = time.monotonic() + _BEGINS
-        while self._pulse.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
+        while self._heartbeat.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
-        return self._pulse.pid or self._process.pid
+        return self._heartbeat.pid or self._process.pid
 
     # --- messages ----------------------------------------------------------------------------------
 
     def send(self, request: Request) -> None:
-        """Never waits. What is sent to a worker that is gone is lost; `receive` says so."""
+        """Queue a request. Never blocks. Lost if the worker is gone; `receive` reports that."""
         with self._wake:
-            if self._waiting and _takes_the_place_of(request, self._waiting[-1]):
+            if self._waiting and _replaces(request, self._waiting[-1]):
                 self._waiting.pop()
             if len(self._waiting) < _MOST_WAITING:
                 self._waiting.append(request)
@@ -138,40 +139,40 @@ class WorkerProcess:
         """The next event; None after `timeout` seconds without one.
 
         Raises:
-            Unreadable: what it sent is no event, so it counts as gone; `kill` it.
-            EOFError: the worker is gone (see `exit_code`), and all that it sent was received.
+            Unreadable: it sent no event; `kill` it.
+            EOFError: the worker is gone (see `exit_code`), and all its events were received.
         """
         message = self._line.receive(timeout)
-        # A process that the author's code forked may hold the socket open after its parent's death.
+        # A process that the author's code forked may hold the socket open after the worker's death.
         if message is None and self._process.poll() is not None:
             message = self._line.receive(0)
             if message is None:
                 raise EOFError
         return message
 
-    def hear(self, output: Output) -> None:
-        """From now on what it prints goes there."""
+    def redirect_output(self, output: Output) -> None:
+        """Redirect its output from now on."""
         self._output = output
 
     # --- looking at it -------------------------------------------------------------------------------
 
     def beat(self) -> Beat:
         """What it is doing, and since when."""
-        return self._pulse.read()
+        return self._heartbeat.read()
 
     def memory(self, limit: int | None = None) -> int:
-        """Bytes that it has in memory together with all that it started; see `FamilyMemory.look`."""
-        return self._memory.look(limit)
+        """Bytes of memory, with all processes that it started; see `FamilyMemory.measure`."""
+        return self._memory.measure(limit)
 
     def main_thread_ended(self) -> bool:
-        """Whether the thread that takes requests is gone while another keeps the process alive."""
-        pid = self._pulse.pid
+        """Whether the main thread has ended while another keeps the process alive."""
+        pid = self._heartbeat.pid
         return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
 
     def stack(self, patience: float = 0.3) -> str:
-        """Where it is now, as faulthandler writes it; empty when it does not say so within `patience` seconds."""
+        """Its current stack, as faulthandler writes it; empty if it does not come within `patience` seconds."""
         if self.beat().number == 0 or self._process.poll() is not None:
-            return ""  # before its handlers are there the signal would end it
+            return ""  # before its handlers are installed the signal would end it
         with self._look_lock:
             start = size = os.fstat(self._stacks).st_size
             os.kill(self.pid, STACK_SIGNAL)
@@ -187,12 +188,12 @@ class WorkerProcess:
                 os.ftruncate(self._stacks, 0)
         return dump
 
-    def last_words(self) -> str:
-        """What it wrote on its way out: the stack of a crash, or of ``os._exit``. Empty after a plain kill."""
+    def crash_report(self) -> str:
+        """The stack of a crash or of ``os._exit``. Empty after a plain kill."""
         return os.pread(self._stacks, 100_000, 0).decode(errors="replace")
 
     def interrupt(self) -> None:
-        """Leave the author's code if Python runs it (see `interrupts`); control steps that wait are not taken."""
+        """Raise Interrupted in the author's code if Python runs it (see `Interrupts`), and drop queued control steps."""
         with self._wake:
             self._waiting = deque(without_steps(self._waiting))
         if self.beat().number > 0 and self._process.poll() is None:
@@ -201,18 +202,18 @@ class WorkerProcess:
     # --- its end -----------------------------------------------------------------------------------
 
     def exit_code(self) -> int | None:
-        """As ``subprocess`` gives it: negative is the signal that ended it. Waits a little for it."""
+        """As of ``subprocess``: negative is the signal that ended it. Waits up to 2 s; None if it still runs."""
         try:
             return self._process.wait(timeout=2.0)
         except subprocess.TimeoutExpired:
             return None
 
     def kill(self) -> None:
-        """End it now with all that it started; `receive` then raises EOFError."""
+        """End it now with all processes that it started; `receive` then raises EOFError."""
         self._process.terminate()
 
     def stop(self, grace: float = 1.0) -> None:
-        """Ask it to end, and after `grace` seconds end it with all that it started."""
+        """Ask it to quit, and after `grace` seconds end it with all processes that it started."""
         if grace > 0 and self._process.poll() is None:
             self.send(Quit())
             try:
@@ -223,11 +224,11 @@ class WorkerProcess:
         with self._wake:
             self._ending = True
             self._wake.notify()
-        # Else the writer may wait for ever where a process that left the group still holds the other end.
+        # Or the writer would block for ever if a process that left the group holds the other end.
         self._line.end.shutdown(socket.SHUT_RDWR)
         self._writer.join()
         for reader in self._readers:
-            # A process that left the group may hold the pipe; its thread then stays with it.
+            # A process that left the group may hold the pipe: its reader thread is left behind.
             reader.join(timeout=1.0)
         self._line.end.close()
         os.close(self._stacks)
@@ -244,7 +245,7 @@ class WorkerProcess:
             try:
                 self._line.send(request)
             except OSError:
-                return  # it is gone, and `receive` says so
+                return  # it is gone; `receive` reports it
             except Exception as error:
                 report_failure(f"A {type(request).__name__} could not be sent to the worker", error)
 
@@ -254,14 +255,14 @@ class WorkerProcess:
             try:
                 fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE)
             except OSError:
-                pass  # the system's limit for pipes is reached: smaller pieces then
+                pass  # the user's limit for pipe memory is reached: smaller pieces then
             failed = False
             while True:
                 piece = os.read(fd, _PIECE)
                 try:
                     too_fast = self._output(name, piece)
                 except Exception as error:
-                    # Such as a terminal that is closed. It is read on: a worker whose pipe is full stands still.
+                    # For example a closed terminal. Keep reading: a worker whose pipe is full blocks.
                     too_fast = False
                     if not failed:
                         report_failure("What the task printed could not be shown", error)
@@ -272,22 +273,22 @@ class WorkerProcess:
                     time.sleep(_FLOOD_PAUSE)
 
 
-def _takes_the_place_of(request: Request, before: Request) -> bool:
+def _replaces(request: Request, before: Request) -> bool:
     if isinstance(request, PlaceCamera):
         return isinstance(before, PlaceCamera) and before.key == request.key
-    return isinstance(request, _WHOLE) and type(before) is type(request)
+    return isinstance(request, _ONLY_LAST) and type(before) is type(request)
 
 
 def signal_main_thread(pid: int, number: signal.Signals) -> None:
-    """Send a signal to the thread of a process that Python's handlers run in.
+    """Send a signal to the main thread of a process, in which Python's handlers run.
 
-    The kernel hands a signal for the whole process to any of its threads, on a busy machine also to one of torch's
-    or the renderer's. CPython 3.11 then notes the signal and does not tell the main thread, whose endless loop goes
-    on until another Python thread wants to run: never.
+    The kernel delivers a signal for the whole process to any thread, on a busy machine also to one of torch's or the
+    renderer's. CPython 3.11 then notes the signal without waking the main thread, whose endless loop goes on until
+    another Python thread wants to run: never.
     """
     if _libc.tgkill(pid, pid, int(number)) != 0:
         error = ctypes.get_errno()
-        if error != errno.ESRCH:  # it died meanwhile: `receive` says so
+        if error != errno.ESRCH:  # it died meanwhile; `receive` reports it
             raise OSError(error, os.strerror(error))
 
 

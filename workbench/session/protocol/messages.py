@@ -1,10 +1,4 @@
-"""The words that the server and its worker say to each other: plain dataclasses over one pipe, read by their types
-(`wire`).
-
-The worker owns the env; the server owns the page. Requests go one way and are handled in order,
-between control steps; events come back. Nothing here may hold a torch tensor or a SAPIEN object:
-whatever crosses is numpy and plain data, so that a dying worker can take nothing with it.
-"""
+"""Requests to the worker and events from it: plain dataclasses with NumPy arrays."""
 
 from __future__ import annotations
 
@@ -27,36 +21,38 @@ from workbench.jobs.task import ActionSource, Stepped, TaskDescription, TaskOpti
 from workbench.machine.processes.wire import Call, Question
 
 LoadLevel = Literal["auto", "patched", "cameras", "rebuilt"]
-"""How a new version is to come in; ``auto`` for the least that is safe. See `workbench.authoring.reload.level`."""
+"""How to load a new version; ``auto`` takes the least that is safe. See `workbench.authoring.reload.level`."""
 ReloadLevel = Literal["same", "patched", "cameras", "rebuilt", "restarted"]
 SCENE_KEPT: frozenset[ReloadLevel] = frozenset({"same", "patched", "cameras"})
-"""Levels that leave the env, its episodes and its past where they are."""
+"""Levels that keep the env, its episodes and its history."""
 EpisodeEnd = Literal["reset", "continue", "pause"]
-"""What the player does with an env whose episode ends: reset that env, let it run on, or pause."""
+"""What happens to an env whose episode ends: reset that env, continue, or pause all."""
 
 
-# --- requests: server to worker ------------------------------------------------------------------
+# --- requests: server to worker, handled in order between control steps ---------------------------
 
 
 @dataclass(frozen=True)
 class Load(Question["Loaded"]):
-    """Import and build the task, replacing the one that runs if (and only if) all goes well."""
+    """Import and build the task; it replaces the running one only if all of it succeeds."""
 
     task: TaskName
     """A path, ``path:ClassName``, or a registered env id, as a person named it; or what a recording names."""
     options: TaskOptions
     source: dict[str, str] | None = None
-    """Text to use in place of what is on disk: how the last good version comes back."""
+    """Text to use in place of the files on disk, to bring back the last good version."""
     level: LoadLevel = "auto"
-    """What is done if a version of the same task runs; a level that is named is taken as asked."""
+    """How to replace a running version of the same task."""
     snapshot: bytes | None = None
-    """Pickled `core.snapshots.snapshot.Snapshot` of the moment to be shown after a build, by name, where shapes match."""
+    """Pickled `core.snapshots.snapshot.Snapshot` to restore after a build, by name, where shapes match."""
     any_task: bool = False
-    """If no class is named and the one that is taken fails, another task of the file may be opened."""
+    """If no class is named and the first one fails, open another task of the file."""
 
 
 @dataclass(frozen=True)
 class Play:
+    """Start or pause stepping."""
+
     playing: bool
 
 
@@ -67,10 +63,12 @@ class SingleStep:
 
 @dataclass(frozen=True)
 class Reset(Question[StepResult]):
+    """Reset envs."""
+
     env_idx: tuple[int, ...] | None = None
     """None resets all."""
     seed: int | None = None
-    """None goes on with the task's own random numbers."""
+    """None continues the task's own random numbers."""
 
 
 class CameraRequest(NamedTuple):
@@ -87,53 +85,51 @@ class CameraRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """What pages choose of how the batch runs and what of it is looked at: sent whole, and the worker applies what
-    differs from what it knew."""
+    """How the batch runs and which cameras are watched. Always sent whole; the worker applies what changed."""
 
     speed: float = 1.0
-    """Simulated seconds per second; ``inf`` runs as fast as the machine can."""
+    """Simulated seconds per second; ``inf`` runs as fast as possible."""
     episode_end: EpisodeEnd = "reset"
     action_source: ActionSource = "random"
     policy: str | None = None
-    """``module:function`` or ``file.py:function`` when `action_source` is ``policy``; None while none is named."""
+    """``module:function`` or ``file.py:function`` when `action_source` is ``policy``; None if not named yet."""
     policy_folder: str | None = None
-    """In which a policy's file is looked for when it is not in the current folder."""
+    """Searched for the policy's file after the current folder."""
     sliders: tuple[float, ...] = ()
     """(A,) the action of every env while `action_source` is ``sliders``."""
     selected_env: int = 0
     cameras: tuple[CameraRequest, ...] = ()
-    """Whose pictures of the selected env are made; none while no page is open."""
+    """Cameras to draw in the selected env; none while no page is open."""
 
 
 @dataclass(frozen=True)
 class ReadPolicyAgain:
-    """The file of the policy was saved."""
+    """Import the policy again: its file was saved."""
 
     play: bool
-    """Play on, once it can be taken."""
+    """Start playing if the import succeeds."""
 
 
 @dataclass(frozen=True)
 class PlaceCamera(Question["Placed"]):
-    """Put a camera elsewhere in all envs, or give it another lens, size or shader; answered with `Placed`.
+    """Change a camera's pose, lens, size or shader in all envs; answered with `Placed`.
 
-    Of several for one camera that wait, only the last is made.
+    Of several waiting requests for one camera only the last is carried out.
     """
 
     key: CameraKey
     settings: CameraSettings | None
-    """None puts it back where the task had it."""
+    """None restores the task's own."""
 
 
 @dataclass(frozen=True)
 class SetCapture:
-    """While on, every step comes back with the state columns of the batch, and with the pictures of all cameras of
-    these envs, to be recorded."""
+    """Send every step with the batch's state columns and the pictures of all cameras of these envs, for a recording."""
 
     env_idx: tuple[int, ...]
     """Empty turns it off."""
     from_reset: bool = False
-    """Of each of these envs from its next reset on: until then a picture would be made for nobody."""
+    """Begin in each env at its next reset, so that no picture is made in vain."""
 
 
 @dataclass(frozen=True)
@@ -141,79 +137,79 @@ class WayBack:
     """How an env came to a moment: from the state at an exact point, by actions."""
 
     start: int
-    """The server's number of the exact point's moment; its snapshot is among `Restore.starts`."""
+    """The server's number of the exact point's moment; its snapshot is in `Restore.starts`."""
     source: int
-    """Which env it was then."""
+    """The env's number then."""
     actions: NDArray[np.float32]
     """(T, A)"""
 
 
 @dataclass(frozen=True)
 class Restore:
-    """Put envs back to a moment of the past; the answer is a `Stepped` with `Stepped.restored`."""
+    """Put envs back to a moment of the history; answered with a `Stepped` that has `Stepped.restored`."""
 
     snapshot: bytes
     """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...]
-    """The envs to be set."""
+    """The envs to set."""
     source: tuple[int, ...]
-    """Whose state each of them gets."""
+    """For each, the env of the snapshot whose state it gets."""
     origin: int
-    """The server's number of that moment; comes back as it is."""
+    """The server's number of that moment; returned unchanged."""
     undoes: int | None = None
-    """The server's number of the jump that this takes back, if it takes one back; comes back as it is."""
+    """The server's number of the jump that this undoes, if any; returned unchanged."""
     ways: Mapping[int, WayBack] = field(default_factory=dict)
-    """Of those of `env_idx` that can live up to the moment again."""
+    """For those of `env_idx` that can be replayed up to the moment."""
     starts: Mapping[int, bytes] = field(default_factory=dict)
     """Pickled snapshots of the whole batch at the beginnings of `ways`, by number of the moment."""
 
 
 @dataclass(frozen=True)
 class EnterRecording:
-    """Put envs into a state of a recorded episode; the answer is a `Stepped` with `Stepped.restored`."""
+    """Put envs into a state of a recorded episode; answered with a `Stepped` that has `Stepped.restored`."""
 
     run: RecordedRun
     """Up to the state."""
     env_idx: tuple[int, ...]
-    """The envs to be set, all to the same state."""
+    """The envs to set, all to the same state."""
     source_file: str | None = None
     source: Mapping[str, str] = field(default_factory=dict)
-    """What the task was when it was recorded, where what has changed since is to be told."""
+    """The recorded source, to report what changed since; empty for no report."""
     number: int = 0
-    """Which request of the session this is; its answer has the same."""
+    """The session's number of this request; returned unchanged."""
 
 
 @dataclass(frozen=True)
 class DrawPast:
-    """Draw one env as it was, without touching its simulation; the answer is `PastPictures`."""
+    """Draw one env at a past moment without touching its simulation; answered with `PastPictures`."""
 
     poses: NDArray[np.float32]
     """(B, 7) of that env's bodies, as in `StepResult.poses`."""
     env: int
     cameras: tuple[CameraRequest, ...]
     origin: int
-    """The server's number of that moment; comes back as it is."""
+    """The server's number of that moment; returned unchanged."""
 
 
 @dataclass(frozen=True)
 class WarmUp(Question[None]):
-    """Do what the first load and the first picture of a process take long over; see `warm_up`."""
+    """Do the slow parts of a process's first load and first picture; see `warm_up`."""
 
     options: TaskOptions
 
 
 @dataclass(frozen=True)
 class ListenForDebugger:
-    """Have debugpy listen on this machine; what comes of it is a line of the log."""
+    """Let debugpy listen on this machine; the log tells the result."""
 
     port: int
     wait: bool = False
-    """Do nothing else until one has attached."""
+    """Wait until a debugger has attached."""
 
 
 @dataclass(frozen=True)
 class Inspect:
-    """Read one env out, once; answered with an `Inspection`, between two control steps."""
+    """Read one env's state once, between two control steps; answered with an `Inspection`."""
 
     env: int
     sections: tuple[Section, ...]
@@ -221,12 +217,12 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Cancel:
-    """Nobody waits for what was asked before. What takes long ends early at any request."""
+    """The answer to the question before is not needed. Long work ends early when any request comes."""
 
 
 @dataclass(frozen=True)
 class Quit:
-    pass
+    """End the worker."""
 
 
 Request = (
@@ -250,7 +246,7 @@ Request = (
 
 
 def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
-    """What an interrupt leaves of the requests that wait: no control steps, but the pause that a `SingleStep` begins with."""
+    """Waiting requests after an interrupt: without control steps, but with the pause that a `SingleStep` begins with."""
     for request in requests:
         if isinstance(request, SingleStep):
             yield Play(False)
@@ -263,48 +259,51 @@ def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
 
 @dataclass(frozen=True)
 class Loading:
-    """What a load is doing now, for the status line."""
+    """What a load is doing, for the status line."""
 
     activity: str
 
 
 @dataclass(frozen=True)
 class ReloadReport:
-    """How a version took the place of another."""
+    """How a version replaced the previous one."""
 
     level: ReloadLevel
     reason: str
     """For example ``only compute_dense_reward changed``."""
     carried: tuple[str, ...] = ()
-    """After a build: actors, articulations and attributes that are as they were, by name."""
+    """After a build: names of actors, articulations and attributes that kept their state."""
     not_carried: dict[str, str] = field(default_factory=dict)
-    """What is not, and why."""
+    """Names of those that did not, each with the reason."""
 
 
 @dataclass(frozen=True)
 class Loaded:
+    """A load succeeded."""
+
     task: TaskDescription
     first: StepResult
     milliseconds: dict[str, float]
     """Time of each part of the load: import, build, reset, probe, geometry."""
     reload: ReloadReport | None = None
     """None for the first version of a task. With ``same``, ``patched`` and ``cameras`` the scene, its episodes and
-    `first`'s poses are those that were there before; of the geometry, which is large, the visuals are left out."""
+    `first`'s poses are unchanged, and the geometry's visuals, which are large, are left out."""
 
 
 @dataclass(frozen=True)
 class LoadFailed:
-    """Something of the author's raised. `kept` says that the version before still runs."""
+    """The author's code raised, in a load or later."""
 
     problem: Problem
     kept: bool
+    """The previous version still runs."""
     classes: tuple[str, ...] = ()
-    """What can be chosen in the file, the one that was tried first; empty where the file has one or none was tried."""
+    """The tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """The newest pictures of the cameras that are watched, of one kind."""
+    """The newest pictures of the watched cameras of one kind."""
 
     pictures: tuple[Picture, ...]
     milliseconds: float
@@ -314,17 +313,17 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Placed:
-    """The answer to `PlaceCamera`. Pictures of that camera that come later show it as it was placed."""
+    """The answer to `PlaceCamera`. Later pictures of that camera show it as placed."""
 
     key: CameraKey
     settings: CameraSettings | None
-    """As asked."""
+    """As in the request."""
     info: CameraInfo | None
-    """Of the camera as it is now, but for what the task's config says of it (`CameraInfo.settings`)."""
+    """The camera as it is now; `CameraInfo.settings` stays what the task's config has."""
     reshaped: bool = False
-    """Its pictures are of another size, or have other modalities."""
+    """Its pictures have another size or other modalities now."""
     why_not: str = ""
-    """Why it was not placed; then nothing was changed."""
+    """Why it was not placed; nothing changed then."""
 
 
 @dataclass(frozen=True)
@@ -337,24 +336,26 @@ class PastPictures:
 
 @dataclass(frozen=True)
 class Status:
+    """Whether and how fast the batch runs."""
+
     playing: bool
     steps_per_second: float
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float
-    """Simulated seconds per wall second; below the asked speed the machine is the limit."""
+    """Simulated seconds per wall second; below the chosen speed the machine is the limit."""
     activity: str = ""
-    """What keeps the worker from its requests for a while, if anything does."""
+    """Long work that delays requests, if any."""
 
 
 @dataclass(frozen=True)
 class RulesBroken:
-    """What the version that runs has broken of the rules and is not stopped by; sent when it changes."""
+    """Rules that the running version breaks without being stopped; sent when the findings change."""
 
     rows: tuple[Finding, ...]
     more: int = 0
-    """Times at places for which there was no row left."""
+    """Number of findings beyond the limit of rows."""
     new: tuple[Finding, ...] = ()
-    """Those of the rows that the event before did not have."""
+    """Rows that the previous event did not have."""
 
 
 Event = (

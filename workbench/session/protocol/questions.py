@@ -1,10 +1,4 @@
-"""What a worker is asked besides to load a task and to reset it, each with what its answer is.
-
-About cameras: each question is small, so that a worker that plays answers it between two steps: who wants sixteen envs
-judged asks sixteen times. A search alone takes long, and is asked of a worker in the background; any request behind it
-ends it. About moments of the past: the server has them all (`history`); it hands over snapshots and actions, some at a
-time. Only of a worker that does not play, since its envs are put wherever the moments are.
-"""
+"""Questions to a worker about cameras, past moments and recordings, with the types of their answers."""
 
 from __future__ import annotations
 
@@ -27,6 +21,8 @@ from workbench.machine.processes.wire import Question
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset, WarmUp
 
 # --- cameras ---------------------------------------------------------------------------------------
+# Each question is small, so that the worker that plays answers it between two steps: sixteen envs are sixteen questions.
+# Only a search takes long: it goes to the worker in the background, and any request behind it ends it.
 
 
 @dataclass(frozen=True)
@@ -35,16 +31,16 @@ class DrawCamera(Question[Picture]):
 
     key: CameraKey
     settings: CameraSettings | None
-    """Drawn as if it were placed so, and left as it is; None for as it is placed. Of a camera that the env has not
-    they must be given: it is one that stands still, and is drawn as with a `scale`."""
+    """Settings for this picture only; None for the current ones. Required for a camera that the env does not have: it
+    stands still and is drawn as with a `scale`."""
     env: int
     modalities: tuple[str, ...] = ("rgb",)
     """Those that its shader does not give are left out."""
     poses: NDArray[np.float32] | None = None
-    """(B, 7) of the env's bodies at a moment of the past; None for now."""
+    """(B, 7) of the env's bodies at a past moment; None for now."""
     scale: float = 1.0
-    """Other than 1: in a picture whose sides are so much of `settings`' (which must be given), by a camera beside the
-    env's, with the minimal shader: colours, depth and segmentation."""
+    """Factor on the picture's size. Other than 1 it needs `settings`, and a temporary camera with the minimal shader draws:
+    colours, depth and segmentation."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ class MeasureCamera(Question[CameraReport]):
 
 @dataclass(frozen=True)
 class SuggestCameras(Question[tuple[OfferedPlacement, ...]]):
-    """Search placements of one camera that see some objects."""
+    """Search placements of one camera from which it sees the given objects."""
 
     space: SearchSpace
     envs: tuple[int, ...]
@@ -72,7 +68,7 @@ class RunCameras(Question[HookCameras]):
     """Run the camera hooks with other texts of the author's files."""
 
     task: TaskName
-    """What was opened."""
+    """As it was opened."""
     texts: Mapping[str, str]
     """By path."""
 
@@ -81,14 +77,15 @@ CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras
 
 
 # --- moments of the past -----------------------------------------------------------------------------
+# The server keeps the history and hands over snapshots and actions. Only for a worker that does not play: its envs move.
 
 
 @dataclass(frozen=True)
 class MomentToRescore:
-    """A moment of the past to be lived through again: a control step, or a jump if it has a snapshot."""
+    """A past moment to replay: a control step, or a jump if it has a snapshot."""
 
     action: NDArray[np.float32] | None
-    """(N, A) that was made; None for a jump, or a task without robots."""
+    """(N, A); None for a jump, or a task without robots."""
     snapshot: bytes | None = None
     """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...] = ()
@@ -97,26 +94,26 @@ class MomentToRescore:
 
 @dataclass(frozen=True)
 class RescoredMoments:
-    """What the task says of some moments now."""
+    """Reward and evaluate of past moments by today's code."""
 
     steps: tuple[StepResult, ...]
     """One for each moment; fewer if one raised."""
     not_carried: dict[str, str]
-    """What jumps of all envs among them could not put back, and why."""
+    """What jumps of all envs could not restore, each with the reason."""
     problem: Problem | None = None
     """What the moment after `steps` raised."""
 
 
 @dataclass(frozen=True)
 class RescoreMoments(Question[RescoredMoments]):
-    """Live through these moments, in order. Only for a worker that does not play."""
+    """Replay these moments in order."""
 
     moments: tuple[MomentToRescore, ...]
 
 
 @dataclass(frozen=True)
 class Captured:
-    """What a recording would have kept of a moment."""
+    """What a recording stores of a moment."""
 
     columns: dict[str, NDArray]
     """As `Stepped.columns`."""
@@ -125,14 +122,14 @@ class Captured:
 
 @dataclass(frozen=True)
 class CaptureMoment(Question[Captured]):
-    """Put the envs back to a moment of the past that is to be recorded after the fact. Only for a worker that does not
-    play."""
+    """Put the envs back to a past moment and read what a recording stores of it."""
 
     snapshot: bytes
     """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...]
-    """Those whose pictures are wanted, if any."""
+    """The envs to draw."""
     pictures: bool
+    """Whether to draw."""
 
 
 # --- the scene of a recording ------------------------------------------------------------------------
@@ -144,18 +141,18 @@ class SceneMade:
     poses: NDArray[np.float32]
     """(T + 1, B, 7)"""
     missed: tuple[str, ...]
-    """What of the states could not be put into the env, each with its reason."""
+    """States that could not be written into the env, each with its reason."""
 
 
 @dataclass(frozen=True)
 class MakeScene(Question[SceneMade]):
-    """Have a worker that holds no task make a recording's env, and put it into each recorded state."""
+    """Make a recording's env in a worker without a task, and put it into each recorded state."""
 
     part: ClassVar[Any] = str
     task: str
     """Registered id."""
     files: tuple[str, ...]
-    """Task files in which it may be found before ManiSkill is asked."""
+    """Task files to search before ManiSkill's registry."""
     env_kwargs: dict[str, Any]
     seed: int
     reset_options: dict[str, Any]
@@ -168,4 +165,4 @@ class MakeScene(Question[SceneMade]):
 QUESTIONS = (
     Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), RescoreMoments, CaptureMoment, Rescore, MakeScene
 )  # fmt: skip
-"""All that come in a `Call`."""
+"""All types that a `Call` may hold."""

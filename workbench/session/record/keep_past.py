@@ -174,10 +174,10 @@ class PastKeeper:
             self._process.ensure(job, what.load, what.placed)
             for episode in what.episodes:
                 if episode.env not in seeds:
-                    job.tell(len(seeds), len(what.episodes), "trying the seeds")
+                    job.report(len(seeds), len(what.episodes), "trying the seeds")
                     seeds[episode.env] = self._verified_seed(job, episode)
             while moments:
-                job.tell(total - len(moments), total, "drawing it again")
+                job.report(total - len(moments), total, "drawing it again")
                 moment, rows = moments[0]
                 question = CaptureMoment(pickle.dumps(moment.snapshot), tuple(rows), what.task.can_render)
                 captured = self._process.ask(job.check, question)
@@ -200,7 +200,7 @@ class PastKeeper:
             if isinstance(error, RecordingError | ValueError):
                 raise JobFailed(f"it could not be kept: {error}") from error
             raise
-        job.tell(1, 1, "writing the files")
+        job.report(1, 1, "writing the files")
         made = [self._finisher.finish(episode) for episode in writers.values()]
         problems = [result for future in made if isinstance(result := future.result(), str)]
         if problems:

@@ -316,13 +316,13 @@ class PastRescorer:
 
         try:
             for rows in rescored.runs():
-                self._process.in_turns(job, partial(rescore_rows, rows), aside=True)
+                self._process.in_turns(job, partial(rescore_rows, rows), low_priority=True)
         finally:
             with self._lock:
                 rescored.release()
 
     def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
-        if self._process.has(load):
+        if self._process.has_loaded(load):
             return
         self.rescoring.tell(job, state="loading")
         if self._process.num_envs == rescored.num_envs:

@@ -20,7 +20,7 @@ from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_source
 from workbench.session.process.job_lane import Stopped
-from workbench.session.process.memory_limit import in_words, total_memory
+from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 from workbench.session.review.view import START, Opened, ReviewView, find_events
 
@@ -207,7 +207,7 @@ class Review:
                 left = len(rows) - done
                 problems.append(
                     f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "
-                    f"{in_words(self._most_bytes)} of memory. Open fewer at once."
+                    f"{format_size(self._most_bytes)} of memory. Open fewer at once."
                 )
                 break
             with self._changed:

@@ -115,13 +115,13 @@ class WorkerCameras:
         self, opened: OpenedTask, question: CameraQuestion, tell: Callable[[int, int], None]
     ) -> object:
         self.settle()
-        self._held.pulse.begin("drawing")
+        self._held.heartbeat.begin("drawing")
         try:
             return answer(opened, self._placed, question, tell, self._held.line.waits)
         except (ValueError, IndexError, RuntimeError) as error:
             raise CannotAnswer(str(error)) from error
         finally:
-            self._held.pulse.begin("idle")
+            self._held.heartbeat.begin("idle")
 
     def draw_past(self, request: DrawPast) -> None:
         opened = self._held.opened
@@ -229,7 +229,7 @@ class WorkerCameras:
         if not self._renderer_ready and self._begun is None:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._on_first(False)
-        self._held.pulse.begin("drawing")
+        self._held.heartbeat.begin("drawing")
         try:
             made = None if self._begun is None else self._fetch(self._begun)
             if made is None:

@@ -20,8 +20,7 @@ from workbench.authoring.problem import Interrupted, Problem, TaskError, problem
 from workbench.core.snapshots.snapshot import restore_snapshot
 from workbench.jobs.open_task import OpenedTask
 from workbench.machine.processes.wire import MessageSocket, Unreadable
-from workbench.session.process.heartbeat import Doing, PulseWriter
-from workbench.session.process.interrupts import Interrupts
+from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import Event, Load, LoadFailed, Request, without_steps
 from workbench.session.protocol.questions import QUESTIONS
 from workbench.session.worker.step_events import StepEvents
@@ -89,7 +88,7 @@ class GuardedTask:
         self,
         line: ServerLine,
         interrupts: Interrupts,
-        pulse: PulseWriter,
+        heartbeat: HeartbeatWriter,
         steps: StepEvents,
         on_failure: Callable[[], None],
     ) -> None:
@@ -98,7 +97,7 @@ class GuardedTask:
             steps: has the moment that is gone back to.
             on_failure: called when the server has been told of one.
         """
-        self.line, self.interrupts, self.pulse, self.steps = line, interrupts, pulse, steps
+        self.line, self.interrupts, self.heartbeat, self.steps = line, interrupts, heartbeat, steps
         self._on_failure = on_failure
         self.opened: OpenedTask | None = None
         self.asked_for: Path | None = None
@@ -114,7 +113,7 @@ class GuardedTask:
         if doing is None:
             work()
             return None
-        self.pulse.begin(doing)
+        self.heartbeat.begin(doing)
         try:
             self.interrupts.run(work)
         except Exception:
@@ -128,7 +127,7 @@ class GuardedTask:
             self.back_to_the_moment()
             return problem
         finally:
-            self.pulse.begin("idle")
+            self.heartbeat.begin("idle")
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:

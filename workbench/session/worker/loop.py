@@ -6,7 +6,7 @@ nothing ever touches the env while it steps: take the requests that have come, t
 due, make pictures if somebody looks, sleep until the next of these.
 
 The server starts it through `worker_start`, with one end of a socket pair. Whatever the loop does is noted in
-shared memory (`pulse`), and while it is the author's code it can be left by hand (`interrupts`).
+shared memory (`heartbeat`), and while it is the author's code it can be left by hand (`interrupts`).
 
 What is here is the loop, and what each request does to the env. How a version comes in is in `reload`, what the
 envs do next in `acting`, what is told of each step in `step_events`, what the cameras do in `worker_cameras`, and how
@@ -42,11 +42,10 @@ from workbench.machine.processes.wire import Call, Question, pack
 from workbench.session.process.debugger import (
     CannotDebug,
     listen_for_debugger,
-    listening_for_a_debugger,
+    listening_text,
     wait_for_debugger,
 )
-from workbench.session.process.heartbeat import Doing, PulseWriter
-from workbench.session.process.interrupts import Interrupts
+from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
     Cancel,
@@ -101,12 +100,12 @@ _IDLE = 0.5
 class Worker:
     """The state of the loop; see the module's text."""
 
-    def __init__(self, connection: int, pulse: PulseWriter) -> None:
-        self._pulse = pulse
+    def __init__(self, connection: int, heartbeat: HeartbeatWriter) -> None:
+        self._heartbeat = heartbeat
         self._interrupts = Interrupts()
         self._line = ServerLine(connection, self._interrupts)
         self._steps = StepEvents()
-        self._held = GuardedTask(self._line, self._interrupts, pulse, self._steps, self._pause)
+        self._held = GuardedTask(self._line, self._interrupts, heartbeat, self._steps, self._pause)
         self._cameras = WorkerCameras(self._held, self._on_first_picture)
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
@@ -144,7 +143,7 @@ class Worker:
         """Until the server says so or hangs up."""
         self._interrupts.install()
         while not (self._quit or self._line.closed):
-            self._pulse.begin("idle")
+            self._heartbeat.begin("idle")
             self._line.listen(self._sleep())
             while (request := self._line.next()) is not None:
                 if isinstance(request, Call):
@@ -294,14 +293,14 @@ class Worker:
 
     def _listen_for_debugger(self, request: ListenForDebugger) -> None:
         try:
-            listen_for_debugger(request.port, self._pulse.hold)
+            listen_for_debugger(request.port, self._heartbeat.hold)
         except CannotDebug as error:
             print(f"workbench: no debugger can attach: {error}", file=sys.stderr)
             return
-        print(f"workbench: {listening_for_a_debugger(request.port, request.wait)}", file=sys.stderr)
+        print(f"workbench: {listening_text(request.port, request.wait)}", file=sys.stderr)
         if request.wait:
-            self._pulse.begin("waiting for a debugger")
-            wait_for_debugger(self._pulse.hold)
+            self._heartbeat.begin("waiting for a debugger")
+            wait_for_debugger(self._heartbeat.hold)
 
     def _play(self, request: Play) -> None:
         self._playing = request.playing and self._held.opened is not None
@@ -518,11 +517,11 @@ _DOING: dict[type, Doing] = {
 """The requests and questions that may run the author's code, or take long for other reasons."""
 
 
-def work(connection: int, pulse: PulseWriter) -> None:
+def work(connection: int, heartbeat: HeartbeatWriter) -> None:
     """The life of the process; `connection` is the file descriptor of its end of the socket pair."""
     # The tensors hold a few thousand numbers: threads over them only wait for each other (measured:
     # 16 PickCube envs ran 2.8 times faster with one thread than with two).
     torch.set_num_threads(1)
     mark_camera_configs()
     treat_ctrl_c_as_error()
-    Worker(connection, pulse).run()
+    Worker(connection, heartbeat).run()

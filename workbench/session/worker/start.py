@@ -24,7 +24,7 @@ from workbench.machine.processes.family import begin_family
 
 def main() -> None:
     """Entry of the process."""
-    connection, pulse_fd, stacks, server, niceness = map(int, sys.argv[1:6])
+    connection, heartbeat_fd, stacks, server, niceness = map(int, sys.argv[1:6])
     begin_family(server)
     if niceness:
         os.nice(niceness)
@@ -33,10 +33,10 @@ def main() -> None:
     _be_the_first_to_go()
     leave = os._exit
     _tell_where(stacks)
-    from workbench.session.process.heartbeat import PulseWriter
+    from workbench.session.process.heartbeat import HeartbeatWriter
 
-    pulse = PulseWriter(pulse_fd)
-    pulse.begin("starting")
+    heartbeat = HeartbeatWriter(heartbeat_fd)
+    heartbeat.begin("starting")
     from workbench.machine.processes.breakpoints import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
 
     if niceness:  # it works in the background, with a version that is being debugged elsewhere
@@ -48,7 +48,7 @@ def main() -> None:
         with quick_imports():
             from workbench.session.worker.loop import work
 
-        work(connection, pulse)
+        work(connection, heartbeat)
     except BaseException:
         traceback.print_exc()
         code = 1
@@ -72,7 +72,7 @@ def _be_the_first_to_go() -> None:
 
 def _tell_where(stacks: int) -> None:
     """Write the stack into the file `stacks`: at a crash, when the server asks, and when the code leaves."""
-    from workbench.session.process.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
+    from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL
 
     faulthandler.enable(file=stacks, all_threads=False)
     faulthandler.register(STACK_SIGNAL, file=stacks, all_threads=False)

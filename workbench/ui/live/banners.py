@@ -148,10 +148,12 @@ class BusyBanner(PagePart[SessionView]):
             return
         self._html.content = busy_html(busy, view)
         # An element of its own: the changing seconds would close an open traceback.
-        trace = render("traceback", traceback=busy.traceback) if busy.deaf and busy.traceback else ""
+        trace = (
+            render("traceback", traceback=busy.traceback) if busy.ignores_interrupt and busy.traceback else ""
+        )
         self._traceback.content = trace
         self._traceback.visible = bool(trace)
-        can_interrupt = not busy.deaf and not busy.drawing
+        can_interrupt = not busy.ignores_interrupt and not busy.drawing
         self._interrupt.visible = can_interrupt
         if not self._panel.visible:
             self._panel.visible = True
@@ -160,7 +162,7 @@ class BusyBanner(PagePart[SessionView]):
 
 def busy_html(busy: Busy, view: SessionView) -> str:
     """The banner's content."""
-    if busy.deaf:
+    if busy.ignores_interrupt:
         advice = (
             "It was interrupted and goes on: it is in native code, or it catches every exception. Restart ends the "
             "process; the last good version comes back where it was."

@@ -14,7 +14,7 @@ from rich.terminal_theme import TerminalTheme
 
 from workbench.session.live.view import SessionView
 from workbench.session.process.captured_output import PLAIN, SWITCHES, Printed, Run
-from workbench.session.process.memory_limit import in_words
+from workbench.session.process.memory_limit import format_size
 from workbench.session.process.supervisor import Vitals
 from workbench.ui.server.control_values import limit_text
 from workbench.ui.widgets.parts import PagePart
@@ -190,4 +190,4 @@ def vitals_html(vitals: Vitals) -> str:
     """Memory of the processes, in words that change only when it matters."""
     if not vitals.memory:
         return ""
-    return render("vitals", vitals=vitals, in_words=in_words)
+    return render("vitals", vitals=vitals, format_size=format_size)
