@@ -34,7 +34,7 @@ from workbench.session.protocol.messages import (
 from workbench.session.protocol.questions import CaptureMoment, DrawCamera
 from workbench.session.worker import cameras as under_test
 from workbench.session.worker.cameras import WorkerCameras
-from workbench.session.worker.guarded_task import GuardedTask, ServerLine
+from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
 from workbench.session.worker.step_events import StepEvents
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -65,7 +65,7 @@ class Desk:
         heartbeat = os.memfd_create("pulse")
         os.ftruncate(heartbeat, mmap.PAGESIZE)
         self.heartbeat, interrupts = HeartbeatReader(heartbeat), Interrupts()
-        line = ServerLine(theirs.detach(), interrupts)
+        line = ServerConnection(theirs.detach(), interrupts)
         self.held = GuardedTask(line, interrupts, HeartbeatWriter(heartbeat), StepEvents(), lambda: None)
         os.close(heartbeat)
         self.held.opened = opened
@@ -80,7 +80,7 @@ class Desk:
 
     def makes(self) -> list[Any]:
         """What is heard of one turn of the loop that has nothing else to do."""
-        self.cameras.make(nothing_else_to_do=True)
+        self.cameras.make(may_block=True)
         return self.heard()
 
     def wait(self) -> float | None:
@@ -160,12 +160,12 @@ def test_a_picture_is_fetched_when_it_should_be_ready_by_what_the_last_ones_took
     for expected in (pictures.milliseconds / 1000, 0.9 * pictures.milliseconds / 1000):
         desk.cameras.scene_changed()
         desk.clock.now += 1.0
-        desk.cameras.make(nothing_else_to_do=False)
+        desk.cameras.make(may_block=False)
         assert desk.wait() == pytest.approx(expected)
-        desk.cameras.make(nothing_else_to_do=False)
+        desk.cameras.make(may_block=False)
         assert desk.heard() == [], "not while there is something else to do"
         desk.clock.now += expected + 0.001
-        desk.cameras.make(nothing_else_to_do=False)
+        desk.cameras.make(may_block=False)
         assert shown(desk.heard()) == [BASE], "and was not waited for: the next is looked for earlier"
 
 
@@ -206,7 +206,7 @@ def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_pict
 def test_what_waits_is_placed_before_other_cameras_are_watched_and_nothing_without_a_task(desk: Desk) -> None:
     there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
     desk.cameras.place(PlaceCamera(BASE, there))
-    desk.cameras.look_again()
+    desk.cameras.update_watched()
     assert [event.settings for event in desk.heard()] == [there]
     desk.cameras.place(PlaceCamera(BASE, None))
     desk.held.opened = None

@@ -1,4 +1,4 @@
-"""In the worker: what is asked about a camera (`questions`), answered with the env as it is, and no trace left."""
+"""Answers questions about cameras in the worker, and leaves the env unchanged."""
 
 from __future__ import annotations
 
@@ -32,48 +32,47 @@ from workbench.core.cameras.visibility import (
 from workbench.core.env.hot_swap import put_class, undone
 from workbench.jobs.open_task import OpenedTask, blamed
 from workbench.session.protocol.questions import CameraQuestion, DrawCamera, MeasureCamera, RunCameras
-from workbench.session.worker.pacing import now_and_then
+from workbench.session.worker.pacing import throttled
 
 REPORT_SIDE = 128
-"""Pixels of the shorter side of what is judged, where the camera's own are more: an object that is lost in those is
-hardly to be called seen."""
+"""At most so many pixels on the shorter side of a measured picture: an object too small for these is hardly visible."""
 LARGEST_SCALE = 4.0
-_TELL_EVERY = 0.2
+_PROGRESS_PERIOD = 0.2
 
 
 def answer(
     opened: OpenedTask,
     placed: PlacedCameras,
     question: CameraQuestion,
-    tell: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
     cancelled: Callable[[], bool],
 ) -> object:
-    """No picture may be under way.
+    """Answer one question. No picture may be under way.
 
     Args:
-        tell: how far a long search is, of how much.
-        cancelled: whether nobody waits for it any more.
+        on_progress: called with done and total during a long search.
+        cancelled: whether to end a search early.
 
     Raises:
-        ValueError, IndexError, RuntimeError, TaskError: it cannot be answered.
+        ValueError, IndexError, RuntimeError, TaskError: there is no answer.
     """
     if isinstance(question, DrawCamera):
-        return _drawn(opened, placed, question)
+        return _draw(opened, placed, question)
     if isinstance(question, MeasureCamera):
-        return _measured(opened, question)
+        return _measure(opened, question)
     if isinstance(question, RunCameras):
         return run_cameras(opened, question)
-    progress = now_and_then(tell, _TELL_EVERY)
+    progress = throttled(on_progress, _PROGRESS_PERIOD)
     return suggest_cameras(
         opened.env.env, question.space, question.envs, progress=progress, cancelled=cancelled
     )
 
 
-def _looked_at(opened: OpenedTask, question: DrawCamera) -> Picture:
-    """In another size than the env's camera has, which is left alone; or by a camera that the env has not."""
+def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
+    """A picture in another size than the camera's, or by a camera that the env does not have."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= LARGEST_SCALE:
-        raise ValueError(f"a camera is looked through in up to {LARGEST_SCALE} times its size, not {scale}")
+        raise ValueError(f"a picture can have up to {LARGEST_SCALE} times its camera's size, not {scale}")
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = opened.description.camera(question.key)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
@@ -87,10 +86,10 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> Picture:
     )
 
 
-def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
+def _draw(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     env, key = opened.env.env, question.key
     if question.scale != 1.0 or opened.description.camera(key) is None:
-        return _looked_at(opened, question)
+        return _draw_temporary(opened, question)
     before = placed.settings(key)
     if question.settings is not None:
         placed.place(env, key, question.settings)
@@ -104,7 +103,7 @@ def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> P
             placed.place(env, key, before)
 
 
-def _measured(opened: OpenedTask, question: MeasureCamera) -> CameraReport:
+def _measure(opened: OpenedTask, question: MeasureCamera) -> CameraReport:
     env = opened.env.env
     placement = placement_of(env, question.key, question.env, question.settings)
     size = small_size(placement.settings.width, placement.settings.height, REPORT_SIDE)
@@ -115,7 +114,7 @@ def _measured(opened: OpenedTask, question: MeasureCamera) -> CameraReport:
 
 
 def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
-    """The hooks are called on the live env, which is given the new text's classes meanwhile.
+    """Call the camera hooks on the live env, which has the new text's classes meanwhile.
 
     Raises:
         TaskError: the text does not load, or a hook fails.
@@ -125,7 +124,10 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
         raise ValueError("the task has no file")
     loaded = load_task(reference_to_class(question.task, file, opened.loaded.chosen), source=question.texts)
     try:
-        with blamed("build", loaded, opened.env), _being(env, opened.loaded, loaded, question.texts):
+        with (
+            blamed("build", loaded, opened.env),
+            _with_classes_of(env, opened.loaded, loaded, question.texts),
+        ):
             undone(env, lambda: found.append(run_hooks(env, question.texts)))
     finally:
         undo_load(loaded)
@@ -133,8 +135,10 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
 
 
 @contextmanager
-def _being(env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, str]) -> Iterator[None]:
-    """Within this the env and its robots are of the new text's classes, with what their constructors set in it."""
+def _with_classes_of(
+    env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, str]
+) -> Iterator[None]:
+    """Give the env and its robots the new text's classes, and the attributes that its constructors set, within this."""
     agents = [] if env.agent is None else getattr(env.agent, "agents", [env.agent])
     classes = [(agent, type(agent)) for agent in agents]
     task, kept = maniskill_private.task_class(env), [(owner, dict(vars(owner))) for owner in (env, *agents)]
@@ -145,7 +149,7 @@ def _being(env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, 
             if getattr(module, "__file__", None) in texts:
                 agent.__class__ = getattr(module, cls.__qualname__, cls)
         for owner, _ in kept:
-            for name, value in _set_otherwise(before.source, texts, owner).items():
+            for name, value in _changed_attributes(before.source, texts, owner).items():
                 vars(owner)[name] = value
         yield
     finally:
@@ -157,10 +161,10 @@ def _being(env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, 
             vars(owner).update(names)
 
 
-def _set_otherwise(before: Mapping[str, str], after: Mapping[str, str], owner: Any) -> dict[str, Any]:
-    """What the new text sets an object's attributes to, of those that the old one sets to something else.
+def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], owner: Any) -> dict[str, Any]:
+    """The attributes of an object that the new text sets to another value, with that value.
 
-    A live env has its attributes from the text that built it, and a camera may stand where one of them says.
+    A live env has its attributes from the text that built it, and a camera's pose may depend on one.
     """
     old, new = Project(before), Project(after)
     edited = [path for path, text in after.items() if before.get(path) != plain_line_ends(text)]

@@ -1,16 +1,4 @@
-"""The cameras of the worker's envs: looked through, placed by hand, asked about, and drawn as of the past.
-
-All of it draws the one scene with the one renderer, which works on threads of its own. So before anything else draws or
-changes the scene, the picture under way is finished and the cameras that wait to be placed are (`settle`).
-
-Pictures of the cameras on screen are made beside the simulation and never in its way. A picture takes 25 to 90 ms on a
-software renderer; made in one go between two steps it would halve the rate of the player. So a picture is begun, steps go
-on, and it is fetched when it should be ready, by what the last ones took (see `begin_pictures`). Sensors come before
-human cameras, since the two see different objects and cannot be drawn at once, and are handed over as soon as they are
-there. No more than 15 rounds a second are made, and after each there is a pause in proportion, so that the browser on the
-same machine gets its share. But a camera that is being dragged somebody follows with the hand: its picture is made next
-and alone, without a pause, and the others when it rests.
-"""
+"""Draws, places and measures the cameras of the worker's envs."""
 
 from __future__ import annotations
 
@@ -55,55 +43,65 @@ _PAUSE_SHARE = 0.3
 
 @dataclass(frozen=True)
 class _Begun:
-    """Pictures of one kind that the renderer is at work on."""
+    """Pictures of one kind that the renderer is drawing."""
 
     pictures: PendingPictures
-    asked: tuple[CameraRequest, ...]
+    requested: tuple[CameraRequest, ...]
     number: int
     """Of the moment that they show."""
     at: float
     ready_at: float
-    """What they should be ready at, in seconds of `time.monotonic` as `at`."""
+    """Expected end; seconds of `time.monotonic`, as `at`."""
 
 
 class WorkerCameras:
-    """See the module's text."""
+    """The cameras of the open task: pictures for the page, placements, and questions.
+
+    All pictures share one scene and one renderer, which works on threads of its own. So before anything else draws or
+    changes the scene, `settle` finishes the picture under way and places the cameras that wait.
+
+    A picture takes 25 to 90 ms on a software renderer; drawn in one go between two steps it would halve the step rate. So
+    a picture is begun, steps go on, and it is fetched when it should be ready by the time that the last ones took (see
+    `begin_pictures`). Sensors come before human cameras, since the two see different objects and cannot be drawn at once,
+    and each kind is sent as soon as it is ready. At most 15 rounds a second, each with a proportional pause, leave the
+    browser on the same machine its share. A camera that is being dragged is drawn next, alone and without a pause.
+    """
 
     def __init__(self, held: GuardedTask, on_first: Callable[[bool], None]) -> None:
         """
         Args:
-            on_first: called with False before the first picture of the process is begun, and with True when it is there.
+            on_first: called with False before the first picture of the process, and with True when it is ready.
         """
         self._held, self._on_first = held, on_first
         self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
-        """The env, and its cameras, whose pictures are kept being made."""
+        """The env and the cameras that the page shows."""
         self._there: tuple[CameraRequest, ...] = ()
         """Those of them that the version has."""
         self._wanted = False
-        """Their pictures are not of the moment that is."""
+        """Their pictures are out of date."""
         self._hurried: set[CameraKey] = set()
         self._left: list[tuple[CameraRequest, ...]] = []
-        """What of a round is not begun, kind by kind."""
+        """Groups of the round that are not begun, one for each kind."""
         self._begun: _Begun | None = None
         self._expected: dict[tuple[CameraRequest, ...], float] = {}
         """Seconds that pictures take."""
         self._round_began = self._next_round = 0.0
-        self._nothing_else_to_do = False
-        """No step is due: a picture is waited for where it is not ready, since guessing when it will be takes longer."""
+        self._may_block = False
+        """No step is due, so the loop may block until a picture is ready."""
         self._placed = PlacedCameras()
         self._to_place: dict[CameraKey, PlaceCamera] = {}
         self._renderer_ready = False
 
-    # --- what is asked -------------------------------------------------------------------------------
+    # --- requests ------------------------------------------------------------------------------------
 
     def watch(self, env: int, cameras: tuple[CameraRequest, ...]) -> None:
-        # It is said with every setting, also when the first picture is under way already.
+        # Every `Settings` has it, changed or not.
         if (env, cameras) != self._watched:
             self._watched = env, cameras
-            self.look_again()
+            self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
-        # Not at once: the picture under way is finished first, or a drag faster than the renderer would see none.
+        # Not at once: the picture under way is finished first, or a drag faster than the renderer would show none.
         self._to_place.pop(request.key, None)
         self._to_place[request.key] = request
 
@@ -112,12 +110,12 @@ class WorkerCameras:
         return self._place(opened, request)
 
     def answer(
-        self, opened: OpenedTask, question: CameraQuestion, tell: Callable[[int, int], None]
+        self, opened: OpenedTask, question: CameraQuestion, on_progress: Callable[[int, int], None]
     ) -> object:
         self.settle()
         self._held.heartbeat.begin("drawing")
         try:
-            return answer(opened, self._placed, question, tell, self._held.line.waits)
+            return answer(opened, self._placed, question, on_progress, self._held.line.waits)
         except (ValueError, IndexError, RuntimeError) as error:
             raise CannotAnswer(str(error)) from error
         finally:
@@ -127,7 +125,7 @@ class WorkerCameras:
         opened = self._held.opened
         if opened is None:
             return
-        self.settle()  # its cameras and bodies are about to be drawn elsewhere
+        self.settle()  # the same scene is about to be drawn
         try:
             pictures = take_pictures(opened.env.env, request.env, request.cameras, request.poses)
         except (RuntimeError, ValueError, IndexError) as error:
@@ -136,29 +134,29 @@ class WorkerCameras:
         self._held.line.send(PastPictures(request.origin, pictures))
 
     def capture(self, opened: OpenedTask, request: CaptureMoment) -> Captured:
-        """What the server's history has not: env states, observations and pictures, of envs that are put back.
+        """Put the envs back to a past moment and read what the history lacks: env states, observations and pictures.
 
         Raises:
             TaskError: a hook of the author's raised.
         """
         self.settle()  # the same scene is about to be drawn
         with blamed("restore", opened.loaded, opened.env):
-            # All of them: what the task keeps for the batch, and the process's generators, go back with all only. They
-            # make no step, so their physics needs no fresh scene.
+            # All envs: what the task keeps for the batch, and the process's generators, are restored only with all. No
+            # step follows, so the physics needs no fresh scene.
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
         drawn: list[Picture] = []
         for env in request.env_idx:
             if self._held.line.waits():
-                raise CannotAnswer("nobody waits for it any more")
+                raise CannotAnswer("it was cancelled")
             drawn += step_pictures(opened.env, [env], wanted)
         return Captured(columns, tuple(drawn))
 
     # --- what the worker does to the scene -----------------------------------------------------------
 
-    def look_again(self) -> None:
-        """The cameras may be others than before: watch those that are wanted and there are."""
+    def update_watched(self) -> None:
+        """Watch the requested cameras that the version has; call when either may have changed."""
         self.settle()
         opened = self._held.opened
         if opened is None:
@@ -170,41 +168,41 @@ class WorkerCameras:
         self._there, self._wanted = cameras, bool(cameras)
         self._hurried.clear()
         self._expected.clear()
-        self._next_round = 0.0  # somebody waits for these
+        self._next_round = 0.0  # a person waits for these
 
     def scene_changed(self) -> None:
-        """What was drawn is old."""
+        """Mark the pictures as out of date."""
         self._wanted = bool(self._there)
 
     def settle(self) -> None:
-        """The scene is about to be drawn or built otherwise: what is under way ends, and cameras stand as asked."""
+        """Finish the picture under way and place the waiting cameras; call before anything else draws the scene."""
         self.finish_picture()
         self.place_waiting()
 
     def finish_picture(self) -> None:
-        """The envs are about to be moved: what is under way ends."""
+        """Finish the picture under way; call before the envs move."""
         if self._begun is not None:
             self._begun.pictures.finish()
             self._begun, self._left = None, []
             self._wanted = bool(self._there)
 
     def put_back(self) -> None:
-        """The scene's cameras may be new ones: those that were placed stand there again."""
+        """Place the placed cameras again; call when the scene's cameras may be new ones."""
         if self._held.opened is not None:
             self._placed.put_back(self._held.opened.env.env)
 
     def forget_placed(self) -> None:
-        """The cameras are those of another version: nothing is placed."""
+        """Forget all placements: the cameras belong to another version."""
         self._placed.forget()
 
-    # --- the loop's turns ----------------------------------------------------------------------------
+    # --- called by the loop --------------------------------------------------------------------------
 
     def wait(self, now: float) -> float | None:
-        """Seconds until `make` has something to do; None while nobody looks."""
+        """Seconds until `make` has something to do; None if no camera is watched."""
         if self._held.opened is None:
             return None
         if self._begun is not None:
-            return 0.0 if self._nothing_else_to_do else max(0.0, self._begun.ready_at - now)
+            return 0.0 if self._may_block else max(0.0, self._begun.ready_at - now)
         if self._hurried:
             return 0.0
         return max(0.0, self._next_round - now) if self._wanted else None
@@ -214,15 +212,15 @@ class WorkerCameras:
         return bool(self._to_place) and self._begun is None
 
     def place_waiting(self) -> None:
-        """Those that wait. No picture may be under way."""
+        """Place the cameras that wait. No picture may be under way."""
         wanted, self._to_place = self._to_place, {}
         for request in wanted.values():
             if self._held.opened is not None:
                 self._held.line.send(self._place(self._held.opened, request))
 
-    def make(self, nothing_else_to_do: bool) -> None:
-        """Move the pictures on that somebody looks at."""
-        self._nothing_else_to_do = nothing_else_to_do
+    def make(self, may_block: bool) -> None:
+        """Fetch a picture that is ready and begin the next."""
+        self._may_block = may_block
         opened, wait = self._held.opened, self.wait(time.monotonic())
         if opened is None or wait is None or wait > 0:
             return
@@ -236,7 +234,7 @@ class WorkerCameras:
                 self._begin_round()
             self._begin(opened.env)
         except RuntimeError as error:
-            self._watch(())  # until others are asked for, or another version is loaded
+            self._watch(())  # until other cameras are requested, or another version is loaded
             self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
         if made is None:
@@ -246,7 +244,7 @@ class WorkerCameras:
             self._renderer_ready = True
             self._on_first(True)
 
-    # --- the inside ----------------------------------------------------------------------------------
+    # --- private -------------------------------------------------------------------------------------
 
     def _begin_round(self) -> None:
         chosen = tuple(camera for camera in self._there if camera.key in self._hurried) or self._there
@@ -259,22 +257,24 @@ class WorkerCameras:
         self._begun, asked_at = None, time.monotonic()
         made = begun.pictures.finish()
         done = time.monotonic()
-        # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
+        # A wait measures how long it took; without one it was ready earlier, so the estimate shrinks.
         took, waited = done - begun.at, done - asked_at > 0.004
-        self._expected[begun.asked] = min(took, 1.0) if waited else 0.9 * self._expected.get(begun.asked, 0.0)
+        self._expected[begun.requested] = (
+            min(took, 1.0) if waited else 0.9 * self._expected.get(begun.requested, 0.0)
+        )
         if not self._left:
             pause = _PAUSE_SHARE * (done - self._round_began)
             self._next_round = max(self._round_began + _PERIOD, done + pause)
         return Pictures(made, 1000 * took, begun.number)
 
     def _begin(self, env: TaskEnv) -> None:
-        """What is next of the round, if anything is left of it."""
+        """Begin the next group of the round, if there is one."""
         if self._left:
-            asked = self._left.pop(0)
-            pictures = begin_pictures(env.env, min(self._watched[0], env.num_envs - 1), asked)
+            requested = self._left.pop(0)
+            pictures = begin_pictures(env.env, min(self._watched[0], env.num_envs - 1), requested)
             at = time.monotonic()
-            ready_at = at + self._expected.get(asked, 0.0)
-            self._begun = _Begun(pictures, asked, self._held.steps.number, at, ready_at)
+            ready_at = at + self._expected.get(requested, 0.0)
+            self._begun = _Begun(pictures, requested, self._held.steps.number, at, ready_at)
 
     def _place(self, opened: OpenedTask, request: PlaceCamera) -> Placed:
         key, env = request.key, opened.env.env
@@ -283,15 +283,15 @@ class WorkerCameras:
                 reshaped = self._placed.place(env, key, request.settings)
         except (ValueError, RuntimeError) as error:
             return Placed(key, request.settings, None, why_not=str(error))
-        said = {c.key: c for c in opened.description.cameras}
+        described = {c.key: c for c in opened.description.cameras}
         infos = tuple(
             replace(info, settings=before.settings, varies=before.varies, site=before.site)
             for info in list_cameras(env)
-            if (before := said.get(info.key)) is not None
+            if (before := described.get(info.key)) is not None
         )
         self._held.opened = replace(opened, description=replace(opened.description, cameras=infos))
         self.scene_changed()
-        # Somebody moves this camera: if it is watched, its picture comes first.
+        # A person moves this camera: if it is watched, its picture comes first.
         self._hurried |= {key} & {camera.key for camera in self._there}
         if reshaped and key[0] == "sensor" and opened.env.observes_pictures:
             self._held.guarded(_observe_again)
@@ -300,7 +300,7 @@ class WorkerCameras:
 
 
 def _observe_again(opened: OpenedTask) -> None:
-    """A policy must not be given pictures of the size that was."""
+    """Renew the observation, or a policy would get pictures of the old size."""
     with blamed("step", opened.loaded, opened.env):
         opened.env.rescore()
     keep_observation_space(opened.env.env, opened.env.obs)

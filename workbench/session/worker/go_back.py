@@ -1,13 +1,4 @@
-"""The worker's part in the past: a moment is gone back to, lived up to again where that can be, put there otherwise;
-and moments are judged again by the code that it has.
-
-A state that is put into an env lacks what PhysX keeps to itself, its contacts above all, so the run goes on otherwise
-than it did wherever bodies press on each other (`core.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an
-episode of this session begins where PhysX has no past (`core.snapshots.snapshot.begin_anew`), as does what follows a moment that was
-put there. From such an exact point the same actions lead to the same moment, contacts and all. Whether they did is
-compared to the last byte, and where they did not (the code was edited, the task draws numbers for the whole batch)
-the moment is put there as before. What is not in PhysX comes from the moment's snapshot either way.
-"""
+"""Goes back to a past moment or into a recording, and rescores past moments."""
 
 from __future__ import annotations
 
@@ -36,16 +27,23 @@ from workbench.session.protocol.messages import EnterRecording, Restore
 from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
 
 MOST_SECONDS = 8.0
-"""A way back that takes longer is given up, and the moment put there."""
+"""A replay that takes longer is given up, and the moment's state restored instead."""
 
 
 def go_back(
     opened: OpenedTask, request: Restore, on_step: Callable[[int, int], None]
 ) -> tuple[StepResult, Restored]:
-    """Let the envs of `request` stand at its moment.
+    """Put the envs of `request` back to its moment: replayed where possible, else by restoring its state.
+
+    A restored state lacks what PhysX keeps inside, above all contacts, so a run continues differently wherever bodies
+    press on each other (`core.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an episode
+    begins without such inner state (`core.snapshots.snapshot.begin_anew`), and so does what follows a restored moment.
+    From such an exact point the same actions lead to the same moment, contacts included. The result is compared to the
+    last byte; where it differs (edited code, a task that draws numbers for the whole batch) the state is restored. What
+    is not in PhysX comes from the moment's snapshot in both cases.
 
     Args:
-        on_step: called with the number of steps that were made again, and of all.
+        on_step: called with the steps that were replayed, and their total.
 
     Raises:
         TaskError: the task's code raised at the moment itself.
@@ -60,7 +58,7 @@ def go_back(
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
         if replayed:
-            # Of all of them together: what the task keeps for the batch belongs to the moment of all.
+            # All replayed envs together: what the task keeps for the batch belongs to the moment of all.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
             whole = own and snapshot.num_envs == env.num_envs == len(every)
@@ -86,7 +84,7 @@ def _replay_steps(
     source: Mapping[int, int],
     on_step: Callable[[int, int], None],
 ) -> list[int]:
-    """Make the steps of all ways again; gives the envs that are at the moment then, to the last byte."""
+    """Replay all ways; returns the envs that are then at the moment to the last byte."""
     task, env = opened.env, opened.env.env
     width = actions.width(task.parts)
     ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (width,)}
@@ -122,11 +120,11 @@ def _replay_steps(
     except TaskError as error:
         if isinstance(error.__cause__, Interrupted):
             raise
-        return []  # an edited hook fails on the way: what it says of the moment itself is told
+        return []  # an edited hook fails on the way: only an error at the moment itself is reported
 
 
 def _of_simulation(report: RestoreReport) -> dict[str, str]:
-    """What was missed of it in envs that were put there; of the task's memory all is said anew."""
+    """The part of `not_carried` about physics; the task's memory has a report of its own."""
     return {what: why for what, why in report.not_carried.items() if what.startswith("fresh physics")}
 
 
@@ -139,13 +137,13 @@ def _how(request: Restore, replayed: int, put: int, steps: int) -> str:
     return f"{again}in {replayed} of {replayed + put} envs every body is where it was, to the last bit; the others were put there."
 
 
-def going_back(done: int, total: int) -> str:
-    """For the status line, while it takes long."""
+def going_back_text(done: int, total: int) -> str:
+    """The status line's text."""
     return f"going back: step {done} of {total}"
 
 
 def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMoments:
-    """Live through the moments of `request`, in order; stops at the first that raises, which is then told."""
+    """Replay the moments of `request` in order; the first that raises ends it, with its problem."""
     steps: list[StepResult] = []
     missed: dict[str, str] = {}
     for moment in request.moments:
@@ -161,7 +159,7 @@ def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMome
             return RescoredMoments(tuple(steps), missed, error.problem)
         steps.append(step)
         if len(moment.env_idx) == opened.env.num_envs:
-            # With some of the envs what holds for the whole batch is never put back: neither was it in the record.
+            # A jump of some envs never restores what belongs to the whole batch: it did not then either.
             missed |= report.not_carried
     return RescoredMoments(tuple(steps), missed)
 
@@ -172,10 +170,10 @@ def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMome
 def enter_recording(
     opened: OpenedTask, request: EnterRecording, on_step: Callable[[int], None]
 ) -> tuple[StepResult, Restored]:
-    """Let the envs of `request` stand at the last state of its run.
+    """Put the envs of `request` into the last state of its run.
 
     Raises:
-        TaskError: the task's code raised on the way; the envs stand somewhere on it.
+        TaskError: the task's code raised on the way; the envs are left there.
     """
     run = request.run
     step, replay_result = arrive(opened, run, run.length, request.env_idx, on_step)
@@ -184,16 +182,16 @@ def enter_recording(
     loaded = opened.loaded
     file = None if loaded.file is None else str(loaded.file)
     changed = changed_since(request.source_file, request.source, file, loaded.source)
-    said = (
+    text = (
         f"{where} (changed since: {changed}): {how(replay_result)}"
         if changed
         else f"{where}: {how(replay_result)}"
     )
     return step, Restored(
-        request.env_idx, source, NO_MOMENT, None, replay_result.missed, where, said, number=request.number
+        request.env_idx, source, NO_MOMENT, None, replay_result.missed, where, text, number=request.number
     )
 
 
-def going_there(request: EnterRecording, done: int) -> str:
-    """For the status line, while it takes long."""
+def entering_text(request: EnterRecording, done: int) -> str:
+    """The status line's text."""
     return f"going to {request.run.name}: step {done} of {request.run.length}"

@@ -1,10 +1,4 @@
-"""The worker's line to the server, the task that it holds open, and what happens when its author's code raises or is left
-by hand.
-
-Whichever part of the worker calls into the task does it through here, so that each failure ends the same way: the steps
-that wait are dropped if somebody interrupted, the server is told with the author's line, and the batch stands again
-where the last step ended.
-"""
+"""The worker's connection to the server, and calls into the author's code with their errors handled."""
 
 from __future__ import annotations
 
@@ -28,29 +22,28 @@ from workbench.session.worker.step_events import StepEvents
 _STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting": "reset"}
 
 
-class ServerLine:
-    """What the server asks, in order, and what it is told. One that is gone is an end like any other: nothing raises here,
-    and `closed` says so. What is sent is sent whole, whatever the person at the page interrupts meanwhile.
-    """
+class ServerConnection:
+    """The connection to the server: requests in order, and events. Nothing raises if the server is gone; `closed` says
+    it. An interrupt never cuts a message in two."""
 
     def __init__(self, connection: int, interrupts: Interrupts) -> None:
         self._line = MessageSocket(socket.socket(fileno=connection), get_args(Request), QUESTIONS)
         self._interrupts = interrupts
         self._queue: deque[Request] = deque()
-        """What has come and was not carried out."""
+        """Requests that were received and not handled."""
         self.closed = False
-        """The server hung up."""
+        """The server closed the connection."""
 
     def listen(self, timeout: float) -> None:
-        """Wait so many seconds for requests, and queue what has come."""
+        """Wait at most `timeout` seconds for requests, and queue them."""
         self._queue.extend(self._requests(timeout))
 
     def next(self) -> Request | None:
-        """The next request that is queued."""
+        """The next queued request."""
         return self._queue.popleft() if self._queue else None
 
     def waits(self) -> bool:
-        """Whether something has come that is not even queued."""
+        """Whether a request has come that is not queued yet."""
         return self._line.waits()
 
     def send(self, event: Event) -> None:
@@ -61,20 +54,20 @@ class ServerLine:
             self.closed = True
 
     def drop_steps(self) -> None:
-        """What was pressed while a hook hung is not to make it hang again. Before the page is told of the
-        interrupt: what is pressed after that is meant."""
+        """Drop waiting control steps, which were pressed while a hook hung and would make it hang again. Call before the
+        page is told of the interrupt: what is pressed after that is meant."""
         with self._interrupts.shielded():
             waiting = [*self._queue, *self._requests(0.0)]
             self._queue = deque(without_steps(waiting))
 
     def _requests(self, timeout: float) -> list[Request]:
-        """What has come; of several loads only the last, since each replaces the one before."""
+        """New requests; of several loads only the last, since each replaces the one before."""
         requests: list[Request] = []
         try:
             while (request := self._line.receive(0.0 if requests else timeout)) is not None:
                 requests.append(request)
         except Unreadable:
-            raise  # the server is believed: what it sent and cannot be read is a fault of ours
+            raise  # the server is trusted: an unreadable request is a fault of the workbench
         except EOFError:
             self.closed = True
         loads = [request for request in requests if isinstance(request, Load)]
@@ -82,11 +75,13 @@ class ServerLine:
 
 
 class GuardedTask:
-    """See the module's text."""
+    """The open task. All parts of the worker call the author's code through this, so that each failure ends the same way:
+    an interrupt drops the waiting steps, the server gets the problem with the author's line, and the batch is put back to
+    the end of the last step."""
 
     def __init__(
         self,
-        line: ServerLine,
+        line: ServerConnection,
         interrupts: Interrupts,
         heartbeat: HeartbeatWriter,
         steps: StepEvents,
@@ -94,21 +89,21 @@ class GuardedTask:
     ) -> None:
         """
         Args:
-            steps: has the moment that is gone back to.
-            on_failure: called when the server has been told of one.
+            steps: has the snapshot of the last step.
+            on_failure: called after a failure was sent.
         """
         self.line, self.interrupts, self.heartbeat, self.steps = line, interrupts, heartbeat, steps
         self._on_failure = on_failure
         self.opened: OpenedTask | None = None
-        self.asked_for: Path | None = None
-        """The file that is to be loaded, whether or not it ever was."""
+        self.requested_file: Path | None = None
+        """The file that was requested last, loaded or not."""
 
-    def at_work(self, doing: Doing | None, work: Callable[[], object]) -> Problem | None:
-        """Do `work`; if the author's code is at work in it, it can be left. What it failed with was told.
+    def run(self, doing: Doing | None, work: Callable[[], object]) -> Problem | None:
+        """Run `work`; if `doing` is not None it may run the author's code, and can be interrupted. Returns the failure,
+        which was sent.
 
-        An exception that is none of Python's ordinary ones (a KeyboardInterrupt, which nobody but the author's code
-        raises here, or a class of theirs) is a failure like others; an ordinary one is the workbench's own, and ends
-        the process.
+        A BaseException that is no Exception (KeyboardInterrupt, which only the author's code raises here, or a class of
+        theirs) is a failure; an Exception is the workbench's own, and ends the process.
         """
         if doing is None:
             work()
@@ -119,55 +114,55 @@ class GuardedTask:
         except Exception:
             raise
         except BaseException as error:
-            # Outside of what knows its task: between two hooks, or in the workbench's own code.
+            # Outside of `blamed`: between two hooks, or in the workbench's own code.
             if isinstance(error, Interrupted):
                 self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
             self.fail(problem)
-            self.back_to_the_moment()
+            self.restore_last_step()
             return problem
         finally:
             self.heartbeat.begin("idle")
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
-        """The author's files, with those on the traceback that lie beside the task and were never loaded whole."""
+        """The author's files, with those of the traceback in the task's folder, whose import may not have finished."""
         known = [] if self.opened is None else list(self.opened.loaded.source_files)
-        if self.asked_for is not None:
-            beside, frames = self.asked_for.parent, traceback.extract_tb(error.__traceback__)
-            known += [Path(frame.filename) for frame in frames if is_own_file(frame.filename, beside)]
+        if self.requested_file is not None:
+            folder, frames = self.requested_file.parent, traceback.extract_tb(error.__traceback__)
+            known += [Path(frame.filename) for frame in frames if is_own_file(frame.filename, folder)]
         return known
 
     def guarded(self, do: Callable[[OpenedTask], object]) -> None:
-        """Do it with the task, if there is one; what raises a TaskError has failed."""
+        """Call `do` with the task, if there is one; a TaskError is sent as a failure."""
         if self.opened is None:
             return
         try:
             do(self.opened)
         except TaskError as error:
-            left = self.drop_steps_if_left(error)
+            interrupted = self.drop_steps_if_interrupted(error)
             self.fail(error.problem)
-            if left:
-                self.back_to_the_moment()
+            if interrupted:
+                self.restore_last_step()
 
-    def drop_steps_if_left(self, error: TaskError) -> bool:
-        """Whether somebody had the author's code left; then the steps that wait are dropped."""
-        left = isinstance(error.__cause__, Interrupted)
-        if left:
+    def drop_steps_if_interrupted(self, error: TaskError) -> bool:
+        """Whether a person interrupted the author's code; then the waiting steps are dropped."""
+        interrupted = isinstance(error.__cause__, Interrupted)
+        if interrupted:
             self.line.drop_steps()
-        return left
+        return interrupted
 
     def fail(self, problem: Problem) -> None:
-        """Tell the server, and stop playing."""
+        """Send a failure, and stop playing."""
         self.line.send(LoadFailed(problem, kept=self.opened is not None))
         self._on_failure()
 
-    def back_to_the_moment(self) -> None:
-        """After a step was left half done: the batch stands again where the last one ended."""
+    def restore_last_step(self) -> None:
+        """Put the batch back to the end of the last step, after one that was cut short."""
         if self.opened is None or self.steps.moment is None:
             return
         try:
-            # Not `TaskEnv.restore`: that calls `evaluate`, which may be what would not end.
+            # Not `TaskEnv.restore`: that calls `evaluate`, which may be what did not end.
             restore_snapshot(self.opened.env.env, self.steps.moment)
         except (RuntimeError, ValueError, TypeError) as error:
             self.fail(problem_from_exception(error, "reset", self.opened.loaded.source_files))

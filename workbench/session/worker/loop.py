@@ -1,17 +1,4 @@
-"""The worker process: it imports the author's file, owns the env, and is the only one that steps it.
-
-It is a process of its own because SAPIEN holds the interpreter lock while it steps and renders, and
-because the author's code may loop for ever or crash: the page must go on. One loop does everything, so
-nothing ever touches the env while it steps: take the requests that have come, take a step if one is
-due, make pictures if somebody looks, sleep until the next of these.
-
-The server starts it through `worker_start`, with one end of a socket pair. Whatever the loop does is noted in
-shared memory (`heartbeat`), and while it is the author's code it can be left by hand (`interrupts`).
-
-What is here is the loop, and what each request does to the env. How a version comes in is in `reload`, what the
-envs do next in `acting`, what is told of each step in `step_events`, what the cameras do in `worker_cameras`, and how
-the author's code is called, and left, in `held_task`.
-"""
+"""The worker's loop: handles requests, steps the env, draws pictures."""
 
 from __future__ import annotations
 
@@ -81,14 +68,14 @@ from workbench.session.protocol.questions import (
 from workbench.session.worker.cameras import WorkerCameras
 from workbench.session.worker.go_back import (
     enter_recording,
+    entering_text,
     go_back,
-    going_back,
-    going_there,
+    going_back_text,
     rescore_moments,
 )
-from workbench.session.worker.guarded_task import GuardedTask, ServerLine
+from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv
-from workbench.session.worker.pacing import Pacer, Rate, now_and_then
+from workbench.session.worker.pacing import Pacer, Rate, throttled
 from workbench.session.worker.reload import Running, load_version
 from workbench.session.worker.step_events import StepEvents
 
@@ -98,27 +85,33 @@ _IDLE = 0.5
 
 
 class Worker:
-    """The state of the loop; see the module's text."""
+    """The loop and its state. Only this process steps the env.
+
+    It is a process of its own because SAPIEN holds the interpreter lock while it steps and renders, and because the
+    author's code may loop for ever or crash. One loop does everything, so that nothing touches the env during a step:
+    handle the requests that have come, step if one is due, draw watched cameras, sleep. It writes what it does into shared
+    memory (`heartbeat`), and the author's code can be interrupted (`Interrupts`).
+    """
 
     def __init__(self, connection: int, heartbeat: HeartbeatWriter) -> None:
         self._heartbeat = heartbeat
         self._interrupts = Interrupts()
-        self._line = ServerLine(connection, self._interrupts)
+        self._line = ServerConnection(connection, self._interrupts)
         self._steps = StepEvents()
         self._held = GuardedTask(self._line, self._interrupts, heartbeat, self._steps, self._pause)
         self._cameras = WorkerCameras(self._held, self._on_first_picture)
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
-        self._started_in = CurrentFolder()
+        self._start_folder = CurrentFolder()
         self._scene = SceneEnv()
-        self._acting = Acting(self._started_in)
+        self._acting = Acting(self._start_folder)
         self._settings = Settings()
         self._pacer = Pacer(0.05)
         self._rate = Rate()
         self._status_sent = 0.0
         self._rules_sent = 0.0
-        self._rules_told = RulesBroken(())
+        self._rules_reported = RulesBroken(())
         self._rules_serial: tuple[object, int] = None, 0
         self._quit = False
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -126,7 +119,7 @@ class Worker:
             Play: self._play,
             SingleStep: self._single_step,
             Reset: self._reset,
-            Settings: self._change,
+            Settings: self._apply_settings,
             ReadPolicyAgain: self._read_policy_again,
             PlaceCamera: self._cameras.place,
             SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
@@ -140,7 +133,7 @@ class Worker:
         }
 
     def run(self) -> None:
-        """Until the server says so or hangs up."""
+        """Run until the server sends Quit or closes the connection."""
         self._interrupts.install()
         while not (self._quit or self._line.closed):
             self._heartbeat.begin("idle")
@@ -150,43 +143,43 @@ class Worker:
                     self._call(request)
                     continue
                 work = partial(self._handlers[type(request)], request)
-                self._held.at_work(_DOING.get(type(request)), work)
+                self._held.run(_DOING.get(type(request)), work)
             now = time.monotonic()
             if self._playing and self._pacer.due(now):
                 self._pacer.spend()
-                self._held.at_work("stepping", self._control_step)
+                self._held.run("stepping", self._control_step)
             if self._cameras.placing_due:
-                self._held.at_work("stepping", self._cameras.place_waiting)
-            self._cameras.make(nothing_else_to_do=not self._playing)
+                self._held.run("stepping", self._cameras.place_waiting)
+            self._cameras.make(may_block=not self._playing)
             self._send_status(time.monotonic())
             if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
-                self._tell_of_rules()
+                self._send_rules()
 
     # --- questions ---------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
-        """Answered whatever happens, or who asked would wait for ever."""
+        """Always answer, or the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
-        problem = self._held.at_work(doing, lambda: answers.append(self._answer(call)))
+        problem = self._held.run(doing, lambda: answers.append(self._answer(call)))
         if problem is not None:
             answers = [Answer(call.number, why=problem.message, problem=problem)]
         self._line.send(answers[0])
 
     def _answer(self, call: Call) -> Answer:
-        def tell(done: int, total: int, part: object = None) -> None:
+        def report(done: int, total: int, part: object = None) -> None:
             self._line.send(Progress(call.number, done, total, b"" if part is None else pack(part)))
 
         try:
-            return Answer(call.number, pack(self._value(call.request, tell)))
+            return Answer(call.number, pack(self._value(call.request, report)))
         except CannotAnswer as error:
             return Answer(call.number, why=str(error))
         except TaskError as error:
-            if self._held.drop_steps_if_left(error):
-                self._held.back_to_the_moment()
+            if self._held.drop_steps_if_interrupted(error):
+                self._held.restore_last_step()
             return Answer(call.number, why=str(error), problem=error.problem)
 
-    def _value(self, question: Question[Any], tell: Callable[..., None]) -> object:
+    def _value(self, question: Question[Any], report: Callable[..., None]) -> object:
         if isinstance(question, WarmUp):
             return warm_up(question.options, lambda: not self._line.waits())
         if isinstance(question, Load):
@@ -194,12 +187,12 @@ class Worker:
             self._load_version(question, loaded.append)
             return loaded[0]
         if isinstance(question, MakeScene):
-            return self._scene.scene(question, tell)
+            return self._scene.scene(question, report)
         opened = self._held.opened
         if opened is None:
             raise CannotAnswer("no task is loaded")
         if isinstance(question, CameraQuestion):
-            return self._cameras.answer(opened, question, tell)
+            return self._cameras.answer(opened, question, report)
         if isinstance(question, PlaceCamera):
             return self._cameras.place_now(opened, question)
         if isinstance(question, Reset):
@@ -209,10 +202,10 @@ class Worker:
         if isinstance(question, CaptureMoment):
             return self._cameras.capture(opened, question)
         assert isinstance(question, Rescore)
-        # Not for every worker: it brings rerun and what reads recordings, a third of a second.
+        # Imported late: rerun and the readers take a third of a second.
         from workbench.jobs import rescore_run
 
-        return rescore_run.answer(opened, question, tell)
+        return rescore_run.answer(opened, question, report)
 
     # --- requests ----------------------------------------------------------------------------------
 
@@ -229,62 +222,62 @@ class Worker:
         try:
             self._load_version(request, self._line.send)
         except TaskError as error:
-            self._held.drop_steps_if_left(error)
+            self._held.drop_steps_if_interrupted(error)
             self._line.send(LoadFailed(error.problem, self._held.opened is not None, error.classes))
 
-    def _load_version(self, request: Load, tell: Callable[[Loaded], None]) -> None:
+    def _load_version(self, request: Load, send: Callable[[Loaded], None]) -> None:
         self._cameras.settle()
-        with self._started_in.again():
-            self._held.asked_for = named_file(request.task)
+        with self._start_folder.again():
+            self._held.requested_file = named_file(request.task)
         before, running = self._held.opened, None
         if before is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, before, self._last)
         try:
-            # What the version before did to the current folder is not for this one, unless it fails.
-            with self._started_in.again(stay=True):
+            # A changed current folder of the previous version is undone for this one, unless it fails.
+            with self._start_folder.again(stay=True):
                 opened, report = load_version(
                     request,
                     running,
                     Opening(
                         on_activity=lambda activity: self._line.send(Loading(activity)),
-                        on_finding=lambda finding: None,  # see `_tell_of_rules`
+                        on_finding=lambda finding: None,  # see `_send_rules`
                         begins_anew=True,
                     ),
                 )
         except TaskError:
-            self._cameras.put_back()  # trying new cameras took the old ones away
+            self._cameras.put_back()  # trying the new cameras removed the old ones
             raise
-        # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
+        # No interrupt here: it would leave the page with another task than the worker's.
         with self._interrupts.shielded():
-            self._take_over(opened, report, request, tell)
-            self._tell_of_rules()
+            self._replace_task(opened, report, request, send)
+            self._send_rules()
 
-    def _take_over(
-        self, opened: OpenedTask, report: ReloadReport | None, request: Load, tell: Callable[[Loaded], None]
+    def _replace_task(
+        self, opened: OpenedTask, report: ReloadReport | None, request: Load, send: Callable[[Loaded], None]
     ) -> None:
         before, self._held.opened = self._held.opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):
             self._cameras.forget_placed()
         if report is not None and report.level in SCENE_KEPT:
-            self._cameras.look_again()
+            self._cameras.update_watched()
             self._cameras.scene_changed()
-            # The meshes are 9 MB for a Panda, and the server has them: 0.2 s on a reload's way to the page.
+            # The server has the meshes: 9 MB for a Panda would add 0.2 s to a reload.
             unchanged = replace(opened.description.geometry, visuals=())
             description = replace(opened.description, geometry=unchanged)
-            tell(Loaded(description, opened.first, opened.milliseconds, report))
+            send(Loaded(description, opened.first, opened.milliseconds, report))
             return
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         if report is None or not report.carried:
             self._acting.seed(request.options.seed)
         self._rate.clear()
-        # Those of the scene before; the server, which hears of the new one later, says the same.
+        # The sliders belong to the previous scene; the server clears them too.
         self._settings = replace(self._settings, sliders=())
         self._acting.sliders = ()
-        self._cameras.look_again()
+        self._cameras.update_watched()
         self._steps.new_scene()
-        tell(Loaded(opened.description, opened.first, opened.milliseconds, report))
-        # The past begins with the reset, and what a first step is taken back to is this.
+        send(Loaded(opened.description, opened.first, opened.milliseconds, report))
+        # The history begins with this reset.
         resumed = report is not None and report.level == "restarted" and bool(report.carried)
         mask = np.ones(opened.env.num_envs, bool)
         self._send_step(opened.first, mask, opened.env.episode_seeds, resumed=resumed)
@@ -314,13 +307,13 @@ class Worker:
             self._held.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
 
     def _seeds(self, request: Reset) -> int | list[int] | None:
-        # The random actions start again with the seed, or "reset" would not repeat an episode.
+        # The random actions restart with the seed, or a reset with it would not repeat an episode.
         if request.seed is not None:
             self._acting.seed(request.seed)
         count = 0 if request.env_idx is None else len(request.env_idx)
         return self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
 
-    def _change(self, new: Settings) -> None:
+    def _apply_settings(self, new: Settings) -> None:
         old, self._settings = self._settings, new
         if new.speed != old.speed:
             self._pacer.speed = new.speed
@@ -332,28 +325,28 @@ class Worker:
             old.policy,
             old.policy_folder,
         ):
-            self._held.at_work("importing the policy", self._take_actions)
+            self._held.run("importing the policy", self._use_action_source)
 
-    def _take_actions(self) -> bool:
-        """From where the settings say. Whether they can be had from there."""
+    def _use_action_source(self) -> bool:
+        """Set the source of actions as in the settings. Returns whether it can be used."""
         s = self._settings
         try:
-            beside = None if s.policy_folder is None else Path(s.policy_folder)
-            self._acting.use(s.action_source, s.policy, beside)
+            folder = None if s.policy_folder is None else Path(s.policy_folder)
+            self._acting.use(s.action_source, s.policy, folder)
         except TaskError as error:
-            self._held.drop_steps_if_left(error)
-            # Before a task is loaded it would pass for a failure of the load; the first step says it.
+            self._held.drop_steps_if_interrupted(error)
+            # Before a task is loaded it would look like a failed load; the first step reports it.
             if self._held.opened is not None:
                 self._held.fail(error.problem)
             return False
         return True
 
     def _read_policy_again(self, request: ReadPolicyAgain) -> None:
-        if self._take_actions() and request.play and not self._playing:
+        if self._use_action_source() and request.play and not self._playing:
             self._play(Play(True))
 
     def _inspect(self, request: Inspect) -> None:
-        # The page asked while another version, with fewer envs, was on its way.
+        # The page may have asked before it knew of a version with fewer envs.
         if self._held.opened is not None and request.env < self._held.opened.env.num_envs:
             self._line.send(inspect_env(self._held.opened.env, request.env, request.sections))
 
@@ -389,7 +382,7 @@ class Worker:
     def _reset_envs(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
-        self._cameras.finish_picture()  # a reset may build the scene anew
+        self._cameras.finish_picture()  # a reset may rebuild the scene
         with blamed("reset", opened.loaded, opened.env):
             step = self._reset_with_seeds(opened.env, env_idx, seed)
         self._cameras.put_back()
@@ -399,9 +392,9 @@ class Worker:
     def _reset_with_seeds(
         self, task: TaskEnv, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
-        """Reset these envs: those that are recorded each alone, so that its seed gives the same start anywhere.
+        """Reset these envs; the recorded ones one by one, so that a seed gives the same start anywhere.
 
-        What envs that are reset together draw from torch's generator hangs on all of them, and on the first one's seed.
+        Envs that are reset together share torch's generator: their numbers depend on all of them and on the first seed.
         """
         every = range(task.num_envs) if env_idx is None else env_idx
         alone = [env for env in every if env in self._steps.recorded] if len(every) > 1 else []
@@ -412,7 +405,7 @@ class Worker:
         )
         step = None
         if env_idx is None:
-            step = task.reset(seed)  # what only a reset of all does: a new scene
+            step = task.reset(seed)  # of all: only that can build a new scene
         elif rest := [env for env in every if env not in alone]:
             step = task.reset([seeds[env] for env in rest], rest)
         for env in alone:
@@ -421,24 +414,24 @@ class Worker:
         return step
 
     def _go(self, request: Restore | EnterRecording, opened: OpenedTask) -> None:
-        self._cameras.settle()  # the envs get new scenes, with the same entities, and may make steps
+        self._cameras.settle()  # the envs get new physics scenes with the same entities, and may step
         try:
             if isinstance(request, Restore):
-                step, restored = go_back(opened, request, self._tell_now_and_then(going_back))
+                step, restored = go_back(opened, request, self._throttled_status(going_back_text))
             else:
-                tell = self._tell_now_and_then(partial(going_there, request))
-                step, restored = enter_recording(opened, request, tell)
+                on_step = self._throttled_status(partial(entering_text, request))
+                step, restored = enter_recording(opened, request, on_step)
         except TaskError:
-            self._held.back_to_the_moment()
+            self._held.restore_last_step()
             raise
         finally:
             self._cameras.put_back()
         self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
-    def _tell_now_and_then(self, words: Callable[..., str]) -> Callable[..., None]:
-        """What tells how far a long way is, in `words` of its arguments."""
-        return now_and_then(lambda *done: self._send_status(None, words(*done)), _STATUS_PERIOD)
+    def _throttled_status(self, text: Callable[..., str]) -> Callable[..., None]:
+        """A callback for progress: sends `text` of its arguments as the status, at most every `_STATUS_PERIOD`."""
+        return throttled(lambda *done: self._send_status(None, text(*done)), _STATUS_PERIOD)
 
     def _send_step(
         self,
@@ -457,7 +450,7 @@ class Worker:
         self._cameras.scene_changed()
         self._line.send(event)
 
-    # --- what the server is told besides -----------------------------------------------------------
+    # --- status and findings -----------------------------------------------------------------------
 
     def _pause(self) -> None:
         self._playing = False
@@ -471,7 +464,7 @@ class Worker:
         self._send_status(None)
 
     def _send_status(self, now: float | None, activity: str = "") -> None:
-        """Every quarter of a second while playing, or at once when `now` is None."""
+        """Send the status every `_STATUS_PERIOD` while playing, or at once if `now` is None."""
         moment = time.monotonic()
         if now is not None and (not self._playing or now - self._status_sent < _STATUS_PERIOD):
             return
@@ -479,8 +472,8 @@ class Worker:
         steps = self._rate.per_second(moment) if self._playing else 0.0
         self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
 
-    def _tell_of_rules(self) -> None:
-        """What the task that is held has broken, if that is something else than was told."""
+    def _send_rules(self) -> None:
+        """Send the rules that the task breaks, if they changed."""
         self._rules_sent = time.monotonic()
         opened = self._held.opened
         rules = None if opened is None else opened.env.broken_rules
@@ -489,15 +482,15 @@ class Worker:
             return
         self._rules_serial = serial
         rows, more = ((), 0) if rules is None else (rules.rows, rules.more)
-        known = {row.key for row in self._rules_told.rows}
-        told = RulesBroken(rows, more, tuple(row for row in rows if row.key not in known))
-        if told.rows or self._rules_told.rows:
-            self._line.send(told)
-        self._rules_told = told
+        known = {row.key for row in self._rules_reported.rows}
+        event = RulesBroken(rows, more, tuple(row for row in rows if row.key not in known))
+        if event.rows or self._rules_reported.rows:
+            self._line.send(event)
+        self._rules_reported = event
 
 
 def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
-    """(N,) True for these envs; for all where it is None."""
+    """(N,) True for these envs; all if None."""
     mask = np.zeros(opened.env.num_envs, bool)
     mask[slice(None) if env_idx is None else list(env_idx)] = True
     return mask
@@ -514,13 +507,13 @@ _DOING: dict[type, Doing] = {
     WarmUp: "warming up",
     ListenForDebugger: "starting",
 }
-"""The requests and questions that may run the author's code, or take long for other reasons."""
+"""Requests and questions that may run the author's code or take long."""
 
 
 def work(connection: int, heartbeat: HeartbeatWriter) -> None:
-    """The life of the process; `connection` is the file descriptor of its end of the socket pair."""
-    # The tensors hold a few thousand numbers: threads over them only wait for each other (measured:
-    # 16 PickCube envs ran 2.8 times faster with one thread than with two).
+    """Run the process; `connection` is the file descriptor of its end of the socket pair."""
+    # Tensors of a few thousand numbers: threads only wait for each other (measured: 16 PickCube envs ran 2.8 times faster
+    # with one thread than with two).
     torch.set_num_threads(1)
     mark_camera_configs()
     treat_ctrl_c_as_error()

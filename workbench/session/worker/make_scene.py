@@ -1,7 +1,4 @@
-"""In a worker: the scenes of recordings that hold none; see `recorded_scene`.
-
-An env is kept for the next episode as long as that was made in the same way.
-"""
+"""Makes the 3-D scenes of recordings that hold none, in a worker; see `recorded_scene`."""
 
 from __future__ import annotations
 
@@ -14,74 +11,74 @@ import numpy as np
 
 from workbench.jobs.pool import CannotAnswer
 from workbench.session.protocol.questions import MakeScene, SceneMade
-from workbench.session.worker.pacing import now_and_then
+from workbench.session.worker.pacing import throttled
 
 if TYPE_CHECKING:
     from workbench.core.env.task_env import TaskEnv
 
-_SAY_EVERY = 0.2
+_PROGRESS_PERIOD = 0.2
 """Seconds."""
 
 
 class SceneEnv:
-    """The env that is kept."""
+    """Makes scenes; keeps the env for the next episode with the same task and options."""
 
     def __init__(self) -> None:
         self._made: tuple[object, TaskEnv] | None = None
 
-    def scene(self, wanted: MakeScene, tell: Callable[[int, int, str], None]) -> SceneMade:
+    def scene(self, request: MakeScene, on_progress: Callable[[int, int, str], None]) -> SceneMade:
         """
         Args:
-            tell: what is being done.
+            on_progress: called with done, total and the activity.
 
         Raises:
-            CannotAnswer: it cannot be made.
+            CannotAnswer: the scene cannot be made.
         """
-        key = (wanted.task, wanted.files, repr(sorted(wanted.env_kwargs.items())))
+        key = (request.task, request.files, repr(sorted(request.env_kwargs.items())))
         try:
             if self._made is None or self._made[0] != key:
                 if self._made is not None:
                     self._made[1].close()
                     self._made = None
-                tell(0, 0, f"making {wanted.task}")
-                self._made = (key, make(wanted))
-            return scene_of(self._made[1], wanted, tell)
+                on_progress(0, 0, f"making {request.task}")
+                self._made = (key, make(request))
+            return scene_of(self._made[1], request, on_progress)
         except CannotAnswer:
             raise
         except Exception as error:
             traceback.print_exc()
             raise CannotAnswer(
-                f"The scene of {wanted.task} could not be made ({type(error).__name__}: {_line(error)}), so there "
+                f"The scene of {request.task} could not be made ({type(error).__name__}: {_line(error)}), so there "
                 "are numbers and curves only."
             ) from error
 
 
-def make(wanted: MakeScene) -> TaskEnv:
-    """One env of the recorded task, as it was made for the recording."""
+def make(request: MakeScene) -> TaskEnv:
+    """One env of the recorded task, made with the recording's options."""
     from workbench.authoring.loading.load import import_modules, load_task
     from workbench.authoring.loading.reference import RecordedTask
     from workbench.authoring.problem import TaskError
     from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 
     try:
-        import_modules(wanted.imports)
+        import_modules(request.imports)
     except TaskError as error:
         raise CannotAnswer(error.problem.message) from error
     loaded = None
-    for file in wanted.files:
+    for file in request.files:
         try:
             found = load_task(file)
-            loaded = found if found.env_id == wanted.task or loaded is None else loaded
-            if found.env_id != wanted.task and wanted.task in found.others:
-                loaded = load_task(f"{file}:{wanted.task}")
+            loaded = found if found.env_id == request.task or loaded is None else loaded
+            if found.env_id != request.task and request.task in found.others:
+                loaded = load_task(f"{file}:{request.task}")
         except TaskError as error:
             raise CannotAnswer(f"{Path(file).name} cannot be loaded: {error.problem.message}") from error
-    if loaded is None or loaded.env_id != wanted.task:
+    if loaded is None or loaded.env_id != request.task:
         try:
-            loaded = load_task(RecordedTask(wanted.task))  # an id that is registered, never a path
+            loaded = load_task(RecordedTask(request.task))  # an id that is registered, never a path
         except TaskError as error:
             raise CannotAnswer(
-                f"There is no env {wanted.task} here to make the scene with, so there are numbers and curves only. If it "
+                f"There is no env {request.task} here to make the scene with, so there are numbers and curves only. If it "
                 "is yours, say which file it is in (workbench review --task FILE), or which package registers it "
                 "(workbench review --import PACKAGE)."
             ) from error
@@ -89,37 +86,37 @@ def make(wanted: MakeScene) -> TaskEnv:
         env = make_env(
             loaded.cls,
             EnvOptions(
-                num_envs=1, backend="cpu", rules="off", kwargs={**wanted.env_kwargs, "obs_mode": "none"}
+                num_envs=1, backend="cpu", rules="off", kwargs={**request.env_kwargs, "obs_mode": "none"}
             ),
             default_kwargs=loaded.default_kwargs,
         )
     except BaseException as error:  # a constructor may end the program (SystemExit)
         traceback.print_exc()
         raise CannotAnswer(
-            f"{wanted.task} cannot be made here ({type(error).__name__}: {_line(error)}), so there are numbers and "
+            f"{request.task} cannot be made here ({type(error).__name__}: {_line(error)}), so there are numbers and "
             "curves only."
         ) from error
     return TaskEnv(env)
 
 
-def scene_of(env: TaskEnv, wanted: MakeScene, tell: Callable[[int, int, str], None]) -> SceneMade:
-    """Its geometry, and the poses of every body at each recorded state."""
+def scene_of(env: TaskEnv, request: MakeScene, on_progress: Callable[[int, int, str], None]) -> SceneMade:
+    """The geometry, and the poses of every body at each recorded state."""
     from workbench.core.capture.recorded_state import state_mismatches, write_states
     from workbench.core.scene.read_scene import read_geometry
     from workbench.core.scene.scene_index import read_poses
 
-    seed = wanted.seed if wanted.seed >= 0 else None
-    env.reset(seed=seed, options=wanted.reset_options)
+    seed = request.seed if request.seed >= 0 else None
+    env.reset(seed=seed, options=request.reset_options)
     geometry = read_geometry(env.env)
-    states = wanted.env_states
+    states = request.env_states
     count = min(len(values) for values in states.values())
     poses: list[Any] = []
-    say = now_and_then(tell, _SAY_EVERY)
+    report = throttled(on_progress, _PROGRESS_PERIOD)
     missed = (
         state_mismatches(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
     )
     for row in range(count):
-        say(row, count, f"putting it into state {row} of {count - 1}")
+        report(row, count, f"putting it into state {row} of {count - 1}")
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
         poses.append(read_poses(env.env)[0])
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))

@@ -1,10 +1,4 @@
-"""When the next control step is due: a budget of simulated time.
-
-The player should run at a chosen multiple of real time, whatever a step costs and however uneven the
-loop is. So wall time earns simulated time (times the speed), a step spends ``control_dt`` of it, and a
-step is due when there is enough. What the machine cannot keep up with is forgotten after a tenth of a
-second, or one slow picture would be followed by a burst. (The idea is that of mjlab's base viewer.)
-"""
+"""Realtime pacing: when the next control step is due, how many are made, how often progress is reported."""
 
 from __future__ import annotations
 
@@ -16,11 +10,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 _LONGEST_DEBT = 0.1
-"""Wall seconds of simulation that may be caught up with."""
+"""Wall seconds of simulation that are caught up with."""
 
 
 @dataclass
 class Pacer:
+    """A budget of simulated time, as in mjlab's base viewer.
+
+    Wall time earns simulated time (times the speed), a step spends ``control_dt`` of it, and a step is due when there is
+    enough. So the speed holds whatever a step costs and however uneven the loop is. What the machine cannot keep up with
+    is forgotten after `_LONGEST_DEBT`, or one slow picture would be followed by a burst.
+    """
+
     control_dt: float
     """Simulated seconds of one control step."""
     speed: float = 1.0
@@ -29,7 +30,7 @@ class Pacer:
     _last: float | None = None
 
     def start(self, now: float) -> None:
-        """Begin (again) to earn time; the first step is due at once."""
+        """Start or restart the clock; the first step is due at once."""
         self._last, self._budget = now, self.control_dt
 
     def due(self, now: float) -> bool:
@@ -45,7 +46,7 @@ class Pacer:
         return self._budget >= self.control_dt * (1 - 1e-9)
 
     def spend(self) -> None:
-        """A control step was taken."""
+        """Subtract a control step from the budget."""
         if not math.isinf(self.speed):
             self._budget -= self.control_dt
 
@@ -78,14 +79,14 @@ class Rate:
         self._times.clear()
 
 
-def now_and_then(tell: Callable[..., None], seconds: float) -> Callable[..., None]:
-    """Calls `tell` with what it is called with; not within the first `seconds`, nor so soon after the last time."""
-    told = time.monotonic()
+def throttled(report: Callable[..., None], seconds: float) -> Callable[..., None]:
+    """`report`, called at most every `seconds` and not in the first `seconds`; other calls are dropped."""
+    last = time.monotonic()
 
-    def tell_if_due(*what: Any) -> None:
-        nonlocal told
-        if time.monotonic() - told > seconds:
-            told = time.monotonic()
-            tell(*what)
+    def report_if_due(*arguments: Any) -> None:
+        nonlocal last
+        if time.monotonic() - last > seconds:
+            last = time.monotonic()
+            report(*arguments)
 
-    return tell_if_due
+    return report_if_due

@@ -1,11 +1,4 @@
-"""From the version that runs to the version that was saved, with as much of the moment as can be kept.
-
-Three things can happen to the env. It stays, and gets the new class (``patched``, and ``cameras`` with the cameras
-made anew). Or another is built beside it, and takes over its state by name (``rebuilt``). Or it has gone with its
-worker, and a new one takes over a snapshot that the server kept (``restarted``). Whichever it is, the new version
-must first show that it works: on a copy of the present moment where only what looks at it changed, with a reset and a
-step (which are undone) where those changed too. What fails leaves everything as it was, and raises.
-"""
+"""Loads a saved version of the task in place of the running one, and keeps as much state as possible."""
 
 from __future__ import annotations
 
@@ -51,17 +44,17 @@ from workbench.session.protocol.messages import Load, ReloadReport
 
 @dataclass(frozen=True)
 class Running:
-    """The version that runs now."""
+    """The running version."""
 
     request: Load
-    """How it was loaded."""
+    """The load that made it."""
     opened: OpenedTask
     last: StepResult
-    """The present moment."""
+    """The last step's result."""
 
 
 class _MustRebuild(Exception):
-    """Why the new code does not fit the live env after all."""
+    """Why the new code does not fit the live env, and a new env must be built."""
 
 
 def load_version(
@@ -69,13 +62,16 @@ def load_version(
     running: Running | None,
     opening: Opening | None = None,
 ) -> tuple[OpenedTask, ReloadReport | None]:
-    """Load the task, or the version of it that is on disk now, keeping what can be kept of `running`.
+    """Load the task, or its version on disk now, and keep what can be kept of `running`.
 
-    With the levels ``same``, ``patched`` and ``cameras`` the env of the result is that of `running`; with the
-    others it is another, and closing the old one is the caller's. No picture may be under way.
+    The env stays and gets the new class (``same``, ``patched``; ``cameras`` makes the cameras again); or another is built
+    and takes over the state by name (``rebuilt``), and the caller closes the old one; or a new worker's env takes over a
+    snapshot that the server kept (``restarted``). In each case the new version is tried first: on a copy of the current
+    moment if only reward, evaluate or observation changed, and with a reset and a step, which are undone, if those
+    changed. No picture may be under way.
 
     Raises:
-        TaskError: the version does not work; `running` is as it was.
+        TaskError: the version does not work; `running` is unchanged.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -83,17 +79,17 @@ def load_version(
     try:
         return _bring_in(request, running, before, loaded, opening)
     except TaskError as error:
-        # The author of a task that runs knows what else is in the file, and so does a person who chose one in it.
+        # No advice about other tasks of the file to a person who runs one of them, or has chosen one.
         knows_others = False
         if running is None:
-            found = _another(request, loaded, error, opening)
+            found = _open_another(request, loaded, error, opening)
             if found is not None:
                 return found, None
         else:
             same = running.opened.loaded.chosen == loaded.chosen
             knows_others = same or not loaded.alternatives
             if same and not isinstance(error.__cause__, _MAY_BE_OF_THE_BATCH):
-                raise  # a slip in a name is told at once
+                raise  # a misspelt name cannot depend on the batch: report it without trying one env
         raise with_advice(
             error,
             loaded,
@@ -104,11 +100,11 @@ def load_version(
 
 
 _MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
-"""What torch and numpy raise over shapes, of which one env may have none."""
+"""What torch and numpy raise for shapes, which may be right with one env."""
 
 
-def _another(request: Load, tried: LoadedTask, error: TaskError, opening: Opening) -> OpenedTask | None:
-    """The first other task of a file that opens, where any will do; None if there is none."""
+def _open_another(request: Load, tried: LoadedTask, error: TaskError, opening: Opening) -> OpenedTask | None:
+    """The first other task of the file that opens, if the request allows another; else None."""
     if not request.any_task or isinstance(error.__cause__, Interrupted) or tried.file is None:
         return None
     for name in tried.alternatives:
@@ -144,7 +140,7 @@ def _bring_in(
                 change = replace(change, level="rebuilt", reason=str(why))
         return _build(request, running, loaded, change, opening)
     except BaseException:
-        # The last good version must not go on with the new one's helper modules and registrations.
+        # The running version must not use the failed one's helper modules and registrations.
         undo_load(loaded)
         raise
 
@@ -164,27 +160,27 @@ def _what_changed(
     if before.chosen != loaded.chosen:
         return Change("rebuilt", f"{loaded.chosen} is another task than {before.chosen}")
     if before.env_id != loaded.env_id:
-        return Change("rebuilt", _registered_otherwise(before, loaded))
+        return Change("rebuilt", _registration_text(before, loaded))
     if replace(running.request.options, seed=0) != replace(request.options, seed=0):
         return Change("rebuilt", "the options changed")
     files = {*before.source, *loaded.source}
     inherited = inherited_names(loaded.cls, files)
-    texts = {**_still_there(before, request), **loaded.source}
+    texts = {**_earlier_modules(before, request), **loaded.source}
     change = find_change(before.source, texts, str(loaded.file), loaded.class_name, inherited)
     if loaded.robot is not None and change.level != "same":
         return Change("rebuilt", f"a robot is part of the scene ({change.reason})")
     if request.level in ("auto", change.level):
         return change
-    said = f"{request.level} was asked for"
+    reason = f"{request.level} was asked for"
     if request.level != "rebuilt":
-        said += f" ({change.level} would have been chosen: {change.reason})"
-    # What was not found safe is tried as if everything had changed.
+        reason += f" ({change.level} would have been chosen: {change.reason})"
+    # A level that was not found safe is tried as if every hook had changed.
     hooks = change.hooks if change.level in ("patched", "cameras") else RESET_HOOKS
-    return Change(request.level, said, hooks)
+    return Change(request.level, reason, hooks)
 
 
-def _registered_otherwise(before: LoadedTask, loaded: LoadedTask) -> str:
-    """Of one class with another id; an unregistered one goes by its own name."""
+def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
+    """How the class's registered id changed; an unregistered class has its own name as id."""
     if loaded.env_id == loaded.class_name:
         lost = "" if before.max_episode_steps is None else ", and so has no time limit"
         return f"{loaded.chosen} is not registered as {before.env_id} any more{lost}"
@@ -193,8 +189,8 @@ def _registered_otherwise(before: LoadedTask, loaded: LoadedTask) -> str:
     return f"{loaded.chosen} is registered as {loaded.env_id} now, and not as {before.env_id}"
 
 
-def _still_there(before: LoadedTask, request: Load) -> dict[str, str]:
-    """Modules that the version before imported inside its hooks, which the new one may do as well."""
+def _earlier_modules(before: LoadedTask, request: Load) -> dict[str, str]:
+    """Today's texts of the previous version's modules: a hook may import one late, and so may the new version's."""
     texts: dict[str, str] = {}
     for path in before.source:
         given = (request.source or {}).get(path)
@@ -221,7 +217,7 @@ def _exchange(
     left: dict[str, str] = {}
     try:
         if change.level != "same":
-            rules.edited(lambda row: _place_now(row, opened.loaded, loaded))
+            rules.edited(lambda row: _find_place(row, opened.loaded, loaded))
         task = TaskEnv(
             env,
             loaded.max_episode_steps,
@@ -264,8 +260,8 @@ def _exchange(
     return OpenedTask(loaded, task, description, first, clock.laps), report
 
 
-def _place_now(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str, int] | None:
-    """Where a row's line is in the new version; None where its function says something else now."""
+def _find_place(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str, int] | None:
+    """The place of a finding in the new version; None if its function has changed."""
     if row.file is None or row.line is None or row.file not in before.source:
         return None if row.file is None else (row.file, row.line or 1)
     text = after.source.get(row.file)
@@ -274,7 +270,7 @@ def _place_now(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str
 
 
 def _rescore(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
-    # Without an action no reward is given; it is computed all the same, or its mistakes would come out later.
+    # Without an action the reward is computed all the same, to find its mistakes now.
     action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
     try:
         with blamed("step", loaded, task):
@@ -305,7 +301,7 @@ def _build(
     try:
         first, restored = _restore(opened, snapshot, action)
     except TaskError as error:
-        # The new version works, as its rehearsal has shown; only not from this moment on.
+        # The new version works, as its rehearsal has shown, but not from this moment on.
         with blamed("reset", opened.loaded, opened.env):
             first = opened.env.reset(request.options.seed)
         restored = RestoreReport((), {"the moment": f"the new version fails in it: {error.problem.message}"})
@@ -320,7 +316,7 @@ def _build(
 
 
 def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snapshot | None:
-    """What is to be shown after the build; None for a fresh episode."""
+    """The snapshot to restore after the build; None for a new episode."""
     if request.snapshot is not None:
         return pickle.loads(request.snapshot)
     if running is None or running.opened.loaded.chosen != loaded.chosen:

@@ -1,11 +1,4 @@
-"""How a worker process begins: ready to say where it died before anything that may die is imported.
-
-The heavy modules are imported last. By then a crash writes its stack, the server can look at the process by
-a signal, the kernel knows whom to end when memory is short, and the process goes when its server does (`family`).
-
-The server starts it as ``python -m workbench.session.worker.start SOCKET PULSE STACKS SERVER NICENESS``: three file
-descriptors (see `process`), the server's process id, and by how much others come first.
-"""
+"""Entry of a worker process: installs its crash handlers before any heavy import."""
 
 from __future__ import annotations
 
@@ -23,23 +16,28 @@ from workbench.machine.processes.family import begin_family
 
 
 def main() -> None:
-    """Entry of the process."""
+    """Run a worker: ``python -m workbench.session.worker.start SOCKET HEARTBEAT STACKS SERVER NICENESS``.
+
+    The first three are file descriptors (see `WorkerProcess`), SERVER is the server's process id. Heavy modules are
+    imported last: by then a crash writes its stack, the server can read the stack by a signal, the kernel ends this
+    process first when memory is short, and the process ends with its server (`family`).
+    """
     connection, heartbeat_fd, stacks, server, niceness = map(int, sys.argv[1:6])
     begin_family(server)
     if niceness:
         os.nice(niceness)
-    # A server that a script has started in the background hands down that SIGINT is ignored.
+    # A server that a script started in the background inherits an ignored SIGINT, and so would we.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    _be_the_first_to_go()
+    _let_kernel_end_us_first()
     leave = os._exit
-    _tell_where(stacks)
+    _install_stack_writers(stacks)
     from workbench.session.process.heartbeat import HeartbeatWriter
 
     heartbeat = HeartbeatWriter(heartbeat_fd)
     heartbeat.begin("starting")
     from workbench.machine.processes.breakpoints import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
 
-    if niceness:  # it works in the background, with a version that is being debugged elsewhere
+    if niceness:  # in the background; the worker that plays is the one that is debugged
         pass_breakpoints()
     else:
         refuse_breakpoints(OPEN_WITH_DEBUG)
@@ -52,7 +50,7 @@ def main() -> None:
     except BaseException:
         traceback.print_exc()
         code = 1
-    # Else the interpreter would wait for threads of the task, and the page for a process that answers nothing.
+    # Or the interpreter would wait for the task's threads, and the page for this process.
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     if code or not all(thread.daemon for thread in others):
         try:
@@ -62,32 +60,32 @@ def main() -> None:
             leave(code)
 
 
-def _be_the_first_to_go() -> None:
-    """When memory runs out the kernel ends the process with the highest score: not the page's, ours."""
+def _let_kernel_end_us_first() -> None:
+    """When memory runs out the kernel ends the process with the highest score: this one, and not the server."""
     try:
         Path("/proc/self/oom_score_adj").write_text("1000")
     except OSError:
-        pass  # a sandbox may forbid it; the server watches over the memory as well
+        pass  # a sandbox may forbid it; the supervisor checks the memory as well
 
 
-def _tell_where(stacks: int) -> None:
-    """Write the stack into the file `stacks`: at a crash, when the server asks, and when the code leaves."""
+def _install_stack_writers(stacks: int) -> None:
+    """Write the stack into the file `stacks`: at a crash, at the server's signal, and at ``os._exit``."""
     from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL
 
     faulthandler.enable(file=stacks, all_threads=False)
     faulthandler.register(STACK_SIGNAL, file=stacks, all_threads=False)
-    # Until the worker takes it up there is nothing to interrupt, and its default would end us.
+    # Until the worker installs its handler there is nothing to interrupt, and the default would end the process.
     signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
     leave, us = os._exit, os.getpid()
 
-    def leave_with_words(code: int) -> NoReturn:
-        # The one way out that tells nobody: no exception, no handler, only an exit code.
+    def leave_with_stack(code: int) -> NoReturn:
+        # os._exit runs no handler and raises nothing: only the exit code would be known.
         if os.getpid() == us:  # not in a process that the author's code forked
             os.write(stacks, f"os._exit({code})\n".encode())
             faulthandler.dump_traceback(file=stacks, all_threads=False)
         leave(code)
 
-    os._exit = leave_with_words
+    os._exit = leave_with_stack
 
 
 if __name__ == "__main__":

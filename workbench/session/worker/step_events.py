@@ -1,9 +1,4 @@
-"""What the server is told of every reset, control step and restore: the result, and all it takes to come back.
-
-The server never asks the worker for the past: with each event it gets a snapshot of the batch, packed so that what
-did not change is sent once (`core.snapshots.packing`), and while somebody records the state columns of exactly this step
-(`core.capture.state_columns`) and its pictures. The newest snapshot stays here as well, for a step that is left half done.
-"""
+"""Makes the event of each reset, control step and restore, with a snapshot of the batch."""
 
 from __future__ import annotations
 
@@ -23,35 +18,39 @@ from workbench.jobs.task import Restored, Stepped
 
 
 class StepEvents:
-    """Makes the events, and counts them."""
+    """Makes `Stepped` events, and counts them.
+
+    The server never asks for the past: each event has a snapshot of the batch, packed so that unchanged parts are sent
+    once (`core.snapshots.packing`), and during a recording the state columns and pictures of exactly this step.
+    """
 
     def __init__(self) -> None:
         self._captured: set[int] = set()
         self._armed: set[int] = set()
         self._columns_fail = False
         self.moment: Snapshot | None = None
-        """The batch as the newest event left it; None for a task whose state cannot be kept."""
+        """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
         self.number = 0
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
-        """Another env takes over: nothing that was sent before is of use for it."""
+        """Start again for another env: parts that were sent before do not belong to it."""
         self.capture((), from_reset=False)
         self._packer = SnapshotPacker()
         self._columns_fail = False
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
-        """As `messages.SetCapture`; an env that is captured already stays so, whenever it is to begin."""
+        """As `SetCapture`; an env that is captured already continues, also with `from_reset`."""
         begun = self._captured & set(env_idx) if from_reset else set(env_idx)
         self._captured, self._armed = begun, set(env_idx) - begun
 
     @property
     def recorded(self) -> frozenset[int]:
-        """The envs that somebody records, from now on or from their next reset."""
+        """The envs that are recorded, now or from their next reset."""
         return frozenset(self._captured | self._armed)
 
     def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
-        """Whether the event of this step draws: no other pictures may be under way then."""
+        """Whether the event of this step draws; no other picture may be under way then."""
         begun = {env for env in self._armed if reset_mask[env] and step.elapsed_steps[env] == 0}
         self._captured |= begun
         self._armed -= begun
@@ -67,7 +66,7 @@ class StepEvents:
         acted_by: str,
         resumed: bool,
     ) -> Stepped:
-        """See `Stepped` for what the arguments become."""
+        """The next event; see `Stepped` for the arguments."""
         self.number += 1
         captured: tuple[Picture, ...] = ()
         columns: dict[str, NDArray] = {}
@@ -92,7 +91,7 @@ class StepEvents:
         )
 
     def _state_columns(self, opened: OpenedTask) -> dict[str, NDArray]:
-        """Those of this moment; none for a task whose own ``get_state_dict`` raises, which is said once."""
+        """Of this moment; empty for a task whose ``get_state_dict`` raises, which is printed once."""
         try:
             return {} if self._columns_fail else read_state_columns(opened.env)
         except Exception as error:
@@ -104,7 +103,7 @@ class StepEvents:
             return {}
 
     def _packed_snapshot(self, opened: OpenedTask) -> PackedSnapshot:
-        """The batch as it is; empty for a task whose state cannot be kept, which is said once."""
+        """A snapshot of the batch; empty if the task's state cannot be copied, which is printed once."""
         nothing = PackedSnapshot(b"", None, {})
         if self._packer is None:
             return nothing
@@ -112,8 +111,7 @@ class StepEvents:
             self.moment = opened.env.snapshot()
             return self._packer.pack(self.moment)
         except Exception as error:
-            # What a task keeps on itself is open: an array of objects that cannot be pickled must not end
-            # the run of a task that works.
+            # A task may keep anything on itself: objects that cannot be pickled must not end a task that works.
             self._packer = self.moment = None
             print(
                 f"The past of this task can be looked at, but not gone back to: {type(error).__name__}: {error}",
