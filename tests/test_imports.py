@@ -20,7 +20,6 @@ APART = {("recording", "authoring")}
 MOST_ENTRIES = 12
 FEWEST_LINES = 60
 SHORT_FOR_A_REASON = {
-    "cli/view": "`workbench view` does not wait for the page",
     "core/env_numbers": "snapshots, cameras and resets read the numbers of envs by it, and none of them may import another",
     "jobs/record_options": "`--help` does not wait for what records",
     "machine/chromium": "the tests ask it, and the doctor",

@@ -1,4 +1,4 @@
-"""Workbench: an interactive authoring workbench for ManiSkill tasks. What is importable by promise is in `__all__`."""
+"""Workbench: an interactive authoring workbench for ManiSkill tasks. `__all__` is the public API."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    # Not imported above: the process that serves the page imports this package, and must start without
-    # the seconds and the graphics driver that ManiSkill takes.
+    # Lazily, since the process that serves the page imports this package, and must start without ManiSkill, which takes
+    # seconds and a graphics driver.
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,21 +1,4 @@
-"""``workbench.make``: a ManiSkill task, batched on the CPU, as a standard gymnasium env.
-
-Training code, ManiSkill's wrappers and its baselines expect what ``gym.make`` gives: an env with a spec,
-ManiSkill's time limit around it, and the class underneath. So gymnasium's own ``make`` is called, with a spec
-made on the spot whose entry point builds the batched env. Nothing is registered and nothing replaced:
-``gym.make`` of the same id stays ManiSkill's, and the keyword arguments in ``env.spec`` are those that stock
-ManiSkill takes, so that what ``RecordEpisode`` writes can be replayed by ManiSkill's own tools.
-
-Where this differs from ``gym.make``, it is where stock would fail:
-
-* ``num_envs`` above 1 works without a GPU.
-* A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock) gets
-  the richest that is. In all other cases the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
-* ``render_backend`` is found when it is not given; where no driver is there, an env without pictures is made
-  as with ``render_backend="none"``, and one that needs them is refused.
-* ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper takes it for one that is over.
-* What has to be downloaded is named in an error, and not asked for on standard input.
-"""
+"""``workbench.make``: a ManiSkill task, batched on the CPU, as a standard gymnasium env."""
 
 from __future__ import annotations
 
@@ -58,34 +41,47 @@ def make(
 ) -> gym.Env:
     """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
 
+    gymnasium's own ``make`` is called with a spec whose entry point builds the batched env, so training code, ManiSkill's
+    wrappers and its baselines find the usual spec, time limit and class. Nothing is registered or replaced: ``gym.make`` of
+    the same id stays ManiSkill's, and the arguments in ``env.spec`` are those of stock ManiSkill, so that its own tools
+    replay what ``RecordEpisode`` writes. It differs from ``gym.make`` where stock would fail:
+
+    * ``num_envs`` above 1 works without a GPU.
+    * A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock) gets the richest
+      one that is. Otherwise the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
+    * ``render_backend`` is found if it is not given; without a driver an env without pictures is made as with
+      ``render_backend="none"``, and one that needs pictures is refused.
+    * ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper would end every episode.
+    * Assets to download are named in an error, not asked for on standard input.
+
     Args:
         task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``), a class of a module
-            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. A file is executed anew with each call, as the
-            page does; an id that it registers is then known to ``gym.make`` too. A module is imported as by ``import``.
-        num_envs: how many envs stand in the batch.
+            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. A file is executed again by each call, as by the
+            page; an id that it registers is then known to ``gym.make`` too. A module is imported as by ``import``.
+        num_envs: number of envs in the batch.
         backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and PhysX's GPU
-            library. ``auto``: the CPU, also where there is a GPU, since the tests of GPU simulation have passed
-            nowhere so far. Takes the place of ``sim_backend``.
+            library. ``auto``: the CPU, also if there is a GPU, since the tests of GPU simulation have passed nowhere
+            so far. Replaces ``sim_backend``.
         max_episode_steps: the time limit; None for the registered one, -1 for none.
-        threads: how many step the envs on the CPU; None for one on each core that the process may use.
+        threads: threads that step the envs on the CPU; None for one per core that the process may use.
         rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``
-            checks none. None stops where other envs are written over and warns elsewhere; of a task that is
-            installed it only warns.
-        kwargs: whatever ``gym.make`` takes for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
+            checks none. None stops if other envs' state is overwritten and warns otherwise; for an installed task it
+            only warns.
+        kwargs: arguments of ``gym.make`` for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
             ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
 
     Raises:
         TaskError: no such id, file or class, or the file cannot be imported; says where and why.
         MissingAssets: a download is needed; names it and the command.
-        BackendUnavailable: no GPU simulation, or no renderer for what shall be drawn, on this machine.
+        BackendUnavailable: this machine has no GPU simulation, or no renderer for the requested pictures.
         ValueError, TypeError: arguments that contradict each other.
     """
     _refuse_contradictions(num_envs, kwargs)
-    found = _find(task)
+    found = _find_task(task)
     _refuse_unknown_modes(found.cls, kwargs)
     given = {**found.default_kwargs, **kwargs}
     if rules is None and not found.followed and class_is_installed(found.cls):
-        rules = "warn"  # nobody here can mend it
+        rules = "warn"  # an installed task cannot be fixed here
     if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
         # Among the spec's arguments, so that a replay by gym.make has a reward too.
         kwargs["reward_mode"] = default_reward_mode(found.cls)
@@ -94,8 +90,7 @@ def make(
         max_episode_steps = limit = None
     else:
         limit = found.max_episode_steps
-        # As ``register_env`` has it. gymnasium's own limit, which gives one bool for all envs, is taken
-        # out again by this one.
+        # As ``register_env`` does. This wrapper removes gymnasium's own limit, which gives one bool for all envs.
         entry = "mani_skill.utils.registration:TimeLimitWrapper"
         limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
     options = EnvOptions(num_envs=int(num_envs), backend=backend, threads=threads, rules=rules)
@@ -114,7 +109,7 @@ def make(
 
 
 class _RaisedInConstructor(Exception):
-    """A TypeError on its way past gymnasium, which makes another of it, without the frames of whoever raised it."""
+    """Carries a TypeError past gymnasium, which would replace it by one without the author's frames."""
 
     def __init__(self, error: TypeError) -> None:
         super().__init__(error)
@@ -127,13 +122,13 @@ def _build(
     try:
         return _built(cls, asset_ids, options, num_envs, **kwargs)
     except TypeError as error:
-        if (place := _place_in(cls, error)) is not None:
+        if (place := _line_of(cls, error)) is not None:
             error.add_note(f"{place[0]}:{place[1]}: {linecache.getline(*place).strip()}")
         raise _RaisedInConstructor(error) from error
 
 
-def _place_in(cls: type[BaseEnv], error: TypeError) -> tuple[str, int] | None:
-    """The author's line that raised it; where none did, as for an unknown keyword, the constructor's."""
+def _line_of(cls: type[BaseEnv], error: TypeError) -> tuple[str, int] | None:
+    """The author's line that raised `error`; else (as for an unknown keyword) that of the constructor."""
     lines = [(frame.filename, frame.lineno or 1) for frame in traceback.extract_tb(error.__traceback__)]
     raised_at = next((line for line in reversed(lines) if not is_installed(line[0])), None)
     return raised_at or definition_line(cls.__init__)
@@ -149,7 +144,7 @@ def _built(
                 f"{needs} needs a renderer, and SAPIEN finds no Vulkan driver on this machine: "
                 "`workbench doctor` says which one to install."
             )
-    # The number again, since it is among the spec's arguments: gym.make(env.spec, num_envs=2) may change it.
+    # gym.make(env.spec, num_envs=2) may change the number.
     return build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
 
 
@@ -184,7 +179,7 @@ def _refuse_unknown_modes(cls: type[BaseEnv], kwargs: Mapping[str, Any]) -> None
 
 
 def _what_needs_pictures(cls: type[BaseEnv] | None, kwargs: Mapping[str, Any]) -> str | None:
-    """The argument for which something must be drawn, as it is written, or None."""
+    """The argument, as text, that needs rendering; None if there is none."""
     if kwargs.get("render_mode") is not None:
         return f"render_mode={kwargs['render_mode']!r}"
     obs_mode = kwargs.get("obs_mode") or (cls.SUPPORTED_OBS_MODES[0] if cls is not None else "state")
@@ -194,13 +189,13 @@ def _what_needs_pictures(cls: type[BaseEnv] | None, kwargs: Mapping[str, Any]) -
 
 
 def _stock_reward_works(cls: type[BaseEnv]) -> bool:
-    """Whether the class implements the reward mode that ManiSkill takes when none is named."""
+    """Whether the class implements ManiSkill's default reward mode."""
     mode = cls.SUPPORTED_REWARD_MODES[0]
     hook = f"compute_{mode}_reward"
     return mode not in ("dense", "normalized_dense") or getattr(cls, hook) is not getattr(BaseEnv, hook)
 
 
-def _find(task: str | Path | type[BaseEnv]) -> LoadedTask:
+def _find_task(task: str | Path | type[BaseEnv]) -> LoadedTask:
     if not isinstance(task, (str, Path, type)):
         raise TypeError(
             f"make() takes a registered id, a file or a class that inherits BaseEnv, not {type(task).__name__}"

@@ -1,21 +1,4 @@
-"""``workbench.Recorder``: record whatever runs an env that `workbench.make` gave.
-
-    env = workbench.make("PickCube-v1", num_envs=16)
-    env = workbench.Recorder(env, "recordings/")
-    env = ManiSkillVectorEnv(env, auto_reset=True)  # goes around it: training, evaluation, anything
-    env.reset(seed=0)
-    for _ in range(200):
-        env.step(policy(obs))
-    env.close()  # waits for the files
-
-The same files come out as from the page and from ``workbench record``, one set an episode: .rrd, .h5 and .json. An episode of an env
-begins with its reset and ends with its next one, so partial resets and auto-resets bear it, and so does a wrapper that
-goes on after success. What is recorded is the env's own state, observation and reward, so it must be put right around
-what `make` gave, inside all wrappers that change actions.
-
-A loop that trains must not end because a disk is full: what goes wrong with the files is said once, as a warning, the
-recording ends, and `problem` keeps it.
-"""
+"""``workbench.Recorder``: a gymnasium wrapper that records the episodes of an env of `workbench.make`."""
 
 from __future__ import annotations
 
@@ -52,14 +35,14 @@ from workbench.recording.writing.journal import before_writing
 from workbench.recording.writing.publish import RecordingError
 
 logger = logging.getLogger(__name__)
-_MOST_HELD = 2048
-"""Steps times envs that are taken apart together: 3 MB; fewer where half a second is over, or an episode begins."""
+_MOST_PENDING = 2048
+"""Steps times envs that wait at most: 3 MB; fewer after half a second, or when an episode begins."""
 _MOST_PICTURES = 1 << 25
-"""Bytes of pictures that wait, too."""
+"""Bytes of pictures that wait at most."""
 
 
-class _Held(NamedTuple):
-    """A step that waits."""
+class _PendingStep(NamedTuple):
+    """A step that waits for the gatherer."""
 
     step: StepResult
     reset_mask: np.ndarray
@@ -73,7 +56,24 @@ class _Held(NamedTuple):
 
 
 class Recorder(gym.Wrapper):
-    """See the module's text."""
+    """Records the episodes of an env that `workbench.make` gave::
+
+        env = workbench.make("PickCube-v1", num_envs=16)
+        env = workbench.Recorder(env, "recordings/")
+        env = ManiSkillVectorEnv(env, auto_reset=True)  # goes around it: training, evaluation, anything
+        env.reset(seed=0)
+        for _ in range(200):
+            env.step(policy(obs))
+        env.close()  # waits for the files
+
+    Writes the files of the page and of ``workbench record``, one set per episode: .rrd, .h5 and .json. An episode of an env
+    lasts from its reset to its next one, so partial resets, auto-resets and wrappers that continue after success work. The
+    env's own state, observation and reward are recorded, so it goes directly around the env of `make`, inside all wrappers
+    that change actions.
+
+    A training loop must not end because a disk is full: an error of the files is one warning, ends the recording, and is
+    kept in `problem`.
+    """
 
     def __init__(
         self,
@@ -87,14 +87,14 @@ class Recorder(gym.Wrapper):
         """
         Args:
             env: as `workbench.make` gives it.
-            folder: made if it is missing. What an earlier recording left half written there is mended.
+            folder: created if it is missing. Half-written files of an earlier recording in it are repaired.
             env_idx: which envs; None for all.
-            pictures: record what every camera sees at every step, or those of these names. Sensors that the env
-                observes are there already; any other picture takes 25 to 50 ms without a GPU.
-            acted_by: what chooses the actions, in words, for who reads the recordings: the name of a policy, say.
+            pictures: record every camera at every step, or the cameras of these names. Sensors that the env observes are
+                rendered already; any other picture takes 25 to 50 ms without a GPU.
+            acted_by: what chooses the actions, such as the name of a policy; for readers of the recordings.
 
         Raises:
-            TypeError: `env` is no ManiSkill env, or wrapped for vectors already.
+            TypeError: `env` is not a ManiSkill env, or is wrapped as a vector env already.
             IndexError: there is no such env.
             RecordingError: `folder` cannot be written to.
         """
@@ -111,21 +111,21 @@ class Recorder(gym.Wrapper):
         self._acted_by = acted_by
         if self._folder.is_dir():
             mended = [str(files.rrd) for files in recover(self._folder)]
-            if said := recovered_text(mended):
-                logger.warning("%s", said)
+            if notice := recovered_text(mended):
+                logger.warning("%s", notice)
         self._task = TaskEnv(base)
         self._finisher = EpisodeFinisher()
         self._made: list[Future[EpisodeFiles | str]] = []
-        """Episodes that are over, and not known to have their files."""
+        """Files of finished episodes that are being written."""
         self._gatherer: EpisodeGatherer | None = None
-        self._held: deque[_Held] = deque()
-        """What the gatherer does not have yet: taken apart one by one, while the env waits and with the processor's caches
-        full of physics, steps cost twice as much."""
+        self._pending: deque[_PendingStep] = deque()
+        """Steps that the gatherer does not have yet. Given one by one, while the env waits and the caches are full of physics,
+        they cost twice as much."""
         self._waiting_pictures = 0
-        """Bytes, about: another thread may take them at the same time."""
+        """Bytes, approximate: another thread may gather at the same time."""
         self._gathering = threading.Lock()
         self._failure: Exception | None = None
-        """Of gathering; it may be another thread's."""
+        """Of gathering, perhaps on another thread."""
         before_writing(self._gather)
         self._scene: Any = None
         self._description: TaskDescription | None = None
@@ -133,7 +133,7 @@ class Recorder(gym.Wrapper):
         self._elapsed = np.zeros(base.num_envs, np.int32)
         self._finished = False
         self.problem: str | None = None
-        """Why the recording ended, if it did."""
+        """Why the recording ended because of an error; None if it did not."""
 
     @property
     def episodes_written(self) -> int:
@@ -151,25 +151,24 @@ class Recorder(gym.Wrapper):
         if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
         if self._gatherer is not None:
-            self._gather()  # with the options of the resets before
+            self._gather()  # with the options of earlier resets
             kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
             self._gatherer.reset_options = kept
-        self._take(step, mask)
+        self._add_step(step, mask)
         return obs, info
 
     def _seeds_of_reset(self, seed: Any) -> np.ndarray:
-        """(N,) what each env of a reset was seeded with.
+        """(N,) seeds of the envs of a reset; NO_SEED without one.
 
-        A reset without a seed, as auto-resets are, draws on from wherever the generators stand, and ManiSkill goes on
-        saying the seed of an earlier episode.
+        A reset without a seed, such as an auto-reset, continues the random generators, while ManiSkill still reports the seed
+        of an earlier episode.
         """
         task = self._task
         if seed is None and not draws_its_own_seeds(task.env):
             return np.full(task.num_envs, NO_SEED, np.int64)
-        said = (
-            task.episode_seeds
-        )  # (N,), or shorter: one for each env of a partial reset, which ManiSkill counts from 0
-        return np.concatenate([said, np.full(max(0, task.num_envs - len(said)), NO_SEED, np.int64)])
+        # (N,), or shorter: one for each env of a partial reset, which ManiSkill counts from 0.
+        seeds = task.episode_seeds
+        return np.concatenate([seeds, np.full(max(0, task.num_envs - len(seeds)), NO_SEED, np.int64)])
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         task = self._task
@@ -181,16 +180,16 @@ class Recorder(gym.Wrapper):
                 made = np.zeros((task.num_envs, 0), np.float32)
             task.obs = last_observation(task.env)
             step = task.result(info, reward, made, terminated, truncated, look=False)
-            self._take(step, np.zeros(task.num_envs, bool))
+            self._add_step(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
 
     def finish(self) -> None:
-        """End the recording: the episodes under way end here, and their files are waited for. The env goes on."""
+        """End the recording: running episodes end here, and their files are waited for. The env stays usable."""
         if not self._finished:
             self._finished = True
             self._end()
             self._finisher.close()
-            self._say_what_failed()
+            self._report_failures()
 
     def close(self) -> None:
         """`finish`, and close the env."""
@@ -198,7 +197,7 @@ class Recorder(gym.Wrapper):
         super().close()
 
     def _begin(self) -> None:
-        """A scene is there that was not before."""
+        """Start gathering for a new scene."""
         self._end()
         base = self._task.env
         self._scene = base.scene
@@ -209,38 +208,38 @@ class Recorder(gym.Wrapper):
         self._description = describe(loaded, self._task, given, find_max_episode_steps_value(self.env))
         if self.problem is None:
             self._gatherer = EpisodeGatherer(
-                self._description, self._envs, self._folder, self._over, ends="reset"
+                self._description, self._envs, self._folder, self._on_episode_end, ends="reset"
             )
             self._gatherer.acted_by = self._acted_by
 
-    def _take(self, step: StepResult, reset_mask: np.ndarray) -> None:
+    def _add_step(self, step: StepResult, reset_mask: np.ndarray) -> None:
         gatherer, task = self._gatherer, self._task
         if gatherer is None or self._description is None:
             return
-        wanted = self._wanted()
-        pictures = step_pictures(task, self._envs, wanted)
+        requests = self._picture_requests()
+        pictures = step_pictures(task, self._envs, requests)
         seeds = self._seeds.copy() if reset_mask.any() else None
-        self._held.append(_Held(step, reset_mask, pictures, seeds, copy_states(task)))
+        self._pending.append(_PendingStep(step, reset_mask, pictures, seeds, copy_states(task)))
         self._waiting_pictures += sum(picture.nbytes for picture in pictures)
         follows = np.array_equal(step.elapsed_steps, self._elapsed + 1)
         self._elapsed = step.elapsed_steps
-        full = len(self._held) * len(reset_mask) > _MOST_HELD or self._waiting_pictures > _MOST_PICTURES
-        # What does not follow is said at its own step.
+        full = len(self._pending) * len(reset_mask) > _MOST_PENDING or self._waiting_pictures > _MOST_PICTURES
+        # A step that does not continue its episode raises at once.
         if full or not follows:
             self._gather()
-        self._say_what_failed()
+        self._report_failures()
 
     def _gather(self) -> None:
         with self._gathering:
             self._waiting_pictures = 0
             try:
-                while self._held and self._gatherer is not None:
-                    self._gatherer.take(self._held.popleft().stepped())
-            except Exception as error:  # whoever steps has to hear of it, and this may be another thread
-                self._held.clear()
+                while self._pending and self._gatherer is not None:
+                    self._gatherer.take(self._pending.popleft().stepped())
+            except Exception as error:  # raised by the next step: this may be another thread
+                self._pending.clear()
                 self._failure = error
 
-    def _wanted(self) -> Sequence[Request]:
+    def _picture_requests(self) -> Sequence[Request]:
         if not self._pictures or self._description is None:
             return ()
         cameras = self._description.cameras
@@ -248,12 +247,12 @@ class Recorder(gym.Wrapper):
             cameras = [camera for camera in cameras if camera.name in self._pictures]
         return recorded_pictures(cameras)
 
-    def _give_up(self, error: Exception) -> None:
+    def _stop_recording(self, error: Exception) -> None:
         self._end()
         self.problem = str(error)
         warnings.warn(f"the recording ended: {error}", stacklevel=4)
 
-    def _over(self, episode: GatheredEpisode) -> None:
+    def _on_episode_end(self, episode: GatheredEpisode) -> None:
         self._made.append(self._finisher.finish(episode))
 
     def _end(self) -> None:
@@ -262,10 +261,10 @@ class Recorder(gym.Wrapper):
         if gatherer is not None:
             gatherer.finish()
 
-    def _say_what_failed(self) -> None:
+    def _report_failures(self) -> None:
         failure, self._failure = self._failure, None
         if isinstance(failure, (RecordingError, ValueError)):
-            self._give_up(failure)
+            self._stop_recording(failure)
         elif failure is not None:
             raise failure
         done = [future for future in self._made if future.done()]

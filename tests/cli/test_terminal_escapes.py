@@ -35,7 +35,7 @@ from tests.drive.waiting import until
 from tests.ui.tabs import handshake
 from workbench.authoring.problem import Problem
 from workbench.cli import terminal
-from workbench.cli.terminal import SafeConsole, print_line, print_problem, refuse, say, warn
+from workbench.cli.terminal import SafeConsole, print_line, print_problem, print_text, refuse, warn
 from workbench.machine.text import SafeStream, guard_terminal
 from workbench.recording.library.library import Library
 from workbench.session.process.captured_output import PrintedLine, Run
@@ -192,7 +192,7 @@ def both_streams() -> Iterator[io.StringIO]:
 
 def test_all_that_the_commands_say_is_text() -> None:
     with both_streams() as streams:
-        say(EVIL)
+        print_text(EVIL)
         refuse(f"there is no file {EVIL}")
         warn(EVIL)
         print_problem(Problem("import", EVIL, f"/{EVIL}.py", 3, EVIL, f"Traceback\n  {EVIL}\n"))

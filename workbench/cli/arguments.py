@@ -1,7 +1,4 @@
-"""Arguments of several commands, and what they turn into: where a page is, how a task is made, sizes of memory.
-
-Raises ValueError throughout, with a sentence that names the argument.
-"""
+"""Command line arguments that several commands share, and their conversion to options."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ Rules = Annotated[
         choices=DEGREES,
     ),
 ]
-"""None is each rule's own degree, and no word for the command line."""
+"""None is each rule's own degree; the command line has no word for it."""
 
 
 Imports = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import")]
@@ -73,6 +70,7 @@ class BatchArguments:
     imports: Imports = ()
 
     def options(self) -> TaskOptions:
+        """Raises ValueError with a message that names the argument, as all functions here."""
         from workbench.jobs.task import TaskOptions
 
         if not 1 <= self.num_envs <= 4096:
@@ -100,7 +98,7 @@ class EnvArguments(BatchArguments):
 
 
 def imported(names: Sequence[str]) -> tuple[str, ...]:
-    """Of each ``--import``: modules, which are not imported here."""
+    """The modules of ``--import``, checked and not imported. Raises ValueError."""
     from workbench.authoring.loading.reference import find_module, is_module_name, not_found_text
 
     for name in names:
@@ -122,7 +120,7 @@ def _env_argument(pair: str) -> tuple[str, Any]:
 
 
 def history_bytes(text: str) -> int:
-    """Of ``--history``: ``256MB``, ``1.5 GB`` or a plain number."""
+    """Bytes of ``--history``: ``256MB``, ``1.5 GB`` or a plain number. Raises ValueError."""
     from workbench.session.process.memory_limit import size_in_bytes
 
     size = size_in_bytes(text)

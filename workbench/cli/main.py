@@ -1,12 +1,8 @@
-"""The commands and their arguments, as ``workbench --help`` shows them.
-
-What a command does is in a module named for it. Heavy imports wait until a command is chosen, so that ``--help``
-and a mistyped option answer at once.
-"""
+"""The commands of ``workbench`` and their arguments, as ``workbench --help`` shows them."""
 
 from __future__ import annotations
 
-# First of all: a file in the current folder could have the name of anything that is imported below.
+# First: a file in the current folder could have the name of a module that is imported below.
 import workbench.machine.processes.own_path  # noqa: F401
 
 # isort: split
@@ -26,7 +22,7 @@ from workbench.cli.arguments import (
     history_bytes,
     imported,
 )
-from workbench.cli.terminal import Exit, print_problem, refuse, say
+from workbench.cli.terminal import Exit, print_problem, print_text, refuse
 from workbench.jobs.record_options import RecordArguments
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
@@ -38,6 +34,7 @@ Task = Annotated[str, tyro.conf.Positional]
 _FEW = EnvArguments(num_envs=4)
 
 app = tyro.extras.SubcommandApp()
+# Commands import what they need when they are chosen, so that ``--help`` and a mistyped option answer at once.
 
 
 @app.command(name="open")
@@ -126,7 +123,7 @@ def record(
         if debug and recording.workers > 1:
             raise ValueError("--debug is for one process: leave out --workers")
         if debug:
-            debug_here(say)
+            debug_here(print_text)
     except ValueError as error:
         return refuse(str(error))
     return record_in_terminal(RecordOptions(**vars(recording), options=options))
@@ -163,7 +160,7 @@ def review(
             return refuse(f"there is no file {file}")
     from workbench.recording.reader.reading import start_reading
 
-    # While the page is imported, so that its first rows need not wait for it.
+    # Meanwhile the page is imported.
     start_reading()
     from workbench.cli.page import review_in_terminal
     from workbench.jobs.task import TaskOptions
@@ -219,14 +216,14 @@ def rescore(
         return refuse(str(error))
     use_private_driver()
     from workbench.authoring.problem import TaskError
-    from workbench.cli.terminal import not_trusted
+    from workbench.cli.terminal import not_trusted_lines
     from workbench.session.clearance import NotTrusted
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)
     try:
         return run_rescore(what, csv, json, trust)
     except NotTrusted as error:
-        for line in not_trusted(error):
+        for line in not_trusted_lines(error):
             refuse(line)
         return Exit.NOT_TRUSTED
     except TaskError as error:
@@ -315,7 +312,7 @@ def view(
         host: address to serve the page on.
         port: port of the page; 0 takes any free one.
     """
-    from workbench.cli.view import view_in_terminal
+    from workbench.cli.share import view_in_terminal
 
     return view_in_terminal(files, web, host, port)
 
@@ -329,7 +326,7 @@ def doctor() -> int:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Entry of the ``workbench`` command."""
+    """Entry point of the ``workbench`` command."""
     guard_terminal()
     try:
         code: Any = app.cli(
@@ -338,7 +335,7 @@ def main(args: Sequence[str] | None = None) -> None:
             args=args,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
         )
-    except KeyboardInterrupt:  # in the seconds before a command listens for it: importing torch takes some
+    except KeyboardInterrupt:  # during the imports of a command: torch takes seconds
         code = refuse("interrupted")
     sys.exit(code)
 

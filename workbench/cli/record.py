@@ -1,4 +1,4 @@
-"""``workbench record`` in a terminal: a bar with rate and time left, an end by Ctrl-C that keeps what is over, a list."""
+"""Runs ``workbench record``: a progress bar, then a list of the episodes. Ctrl-C keeps finished episodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.terminal import err, print_finding, print_problem, progress_bar, refuse, say, warn
+from workbench.cli.terminal import err, print_finding, print_problem, print_text, progress_bar, refuse, warn
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, record, with_given_actions
@@ -22,13 +22,13 @@ from workbench.session.rescore.recordings import hidden_modules_text
 
 
 class _RecordBar:
-    """The bar, and Ctrl-C: while episodes are made it ends the recording in good order; before that, or again, at once."""
+    """The progress bar, and Ctrl-C: the first ends the recording after the current step; before it, or again, at once."""
 
     def __init__(self, bar: Bar, total: int | None) -> None:
         self._bar, self._row = bar, bar.add_task("opening", total=total)
-        self.asked = False
+        self.stop_requested = False
         self._began: float | None = None
-        """When the first episode began to be made."""
+        """When the first episode began."""
 
     def __enter__(self) -> _RecordBar:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
@@ -38,29 +38,29 @@ class _RecordBar:
         signal.signal(signal.SIGINT, self._before)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self.asked or self._began is None:
+        if self.stop_requested or self._began is None:
             raise KeyboardInterrupt
-        self.asked = True
-        # Whoever waits for a step that never ends has to know of the second.
-        self.say("ending after this step; Ctrl-C again ends at once")
+        self.stop_requested = True
+        # A step may never end.
+        self.describe("ending after this step; Ctrl-C again ends at once")
 
-    def say(self, words: str, kept: int | None = None) -> None:
-        self._bar.update(self._row, description=words, completed=kept)
+    def describe(self, text: str, kept: int | None = None) -> None:
+        self._bar.update(self._row, description=text, completed=kept)
 
     def show(self, now: RecordProgress) -> None:
         self._began = self._began or time.monotonic()
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.kept)
-        if not self.asked:
-            self.say(f"recording, {now.steps / seconds:.0f} steps a second")
+        if not self.stop_requested:
+            self.describe(f"recording, {now.steps / seconds:.0f} steps a second")
 
 
 def record_in_terminal(what: RecordOptions) -> int:
-    """Record, and say what came of it; returns the exit code."""
+    """Record and print the result; returns the exit code."""
     before = set(what.out.glob("*.json"))
     try:
         try_folder(what.out)
-        asked, _ = with_given_actions(what)
+        requested, _ = with_given_actions(what)
         if mended := recover_confined(what.out):
             err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
         for notice in hidden_modules_text(what.task):
@@ -69,49 +69,57 @@ def record_in_terminal(what: RecordOptions) -> int:
             warn(left_alone)
         left = (TextColumn("left"), TimeRemainingColumn())
         with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
-            with _RecordBar(bar, asked.successes or asked.episodes) as shown:
-                recorded = record(what, shown.say, shown.show, lambda: shown.asked, print_finding)
-            shown.say("recorded", len(recorded.written))
+            with _RecordBar(bar, requested.successes or requested.episodes) as record_bar:
+                recorded = record(
+                    what,
+                    record_bar.describe,
+                    record_bar.show,
+                    lambda: record_bar.stop_requested,
+                    print_finding,
+                )
+            record_bar.describe("recorded", len(recorded.written))
     except TaskError as error:
         print_problem(error.problem)
-        _say_what_is_kept(what, before)
+        _print_kept(what, before)
         return 1
     except (OSError, ValueError, PoolError) as error:
-        _say_what_is_kept(what, before)
+        _print_kept(what, before)
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted; episodes that had ended are kept")
-    return _say(asked, recorded)
+    return _print_result(requested, recorded)
 
 
-def _say_what_is_kept(asked: RecordOptions, before: set[Path]) -> None:
-    kept = len(set(asked.out.glob("*.json")) - before)
+def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
+    kept = len(set(requested.out.glob("*.json")) - before)
     if kept:
-        folder = shlex.quote(str(asked.out))
-        say(
+        folder = shlex.quote(str(requested.out))
+        print_text(
             f"{_episodes(kept)} that had ended before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
         )
 
 
-def _say(asked: RecordOptions, recorded: Recorded) -> int:
+def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
     for episode in recorded.written:
         ended = {None: "", True: "success", False: "no success"}[episode.success]
-        say(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
+        print_text(
+            f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip()
+        )
     kept = len(recorded.written)
-    if asked.successes is not None:
-        say(f"{kept} of {recorded.tried} episodes succeeded and were kept.")
+    if requested.successes is not None:
+        print_text(f"{kept} of {recorded.tried} episodes succeeded and were kept.")
     if recorded.put_right:
         count = _episodes(recorded.put_right)
-        say(
+        print_text(
             f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
         )
     if recorded.written:
         folder = shlex.quote(str(recorded.written[0].path.parent))
-        say(f"Look at them with: workbench review {folder}")
+        print_text(f"Look at them with: workbench review {folder}")
     if recorded.stopped:
         return refuse("interrupted; episodes that had ended are kept")
-    if asked.successes is not None and kept < asked.successes:
-        wanted = "1 success was" if asked.successes == 1 else f"{asked.successes} successes were"
+    if requested.successes is not None and kept < requested.successes:
+        wanted = "1 success was" if requested.successes == 1 else f"{requested.successes} successes were"
         return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")
     return 0
 

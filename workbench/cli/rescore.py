@@ -1,4 +1,4 @@
-"""``workbench rescore``: recorded episodes judged again in this process; a bar while it works, then the table."""
+"""Runs ``workbench rescore``: a progress bar, then a table of results."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class RescoreOptions:
     places: tuple[Path, ...]
     """Files and folders."""
     task: str | None = None
-    """Opened for all of them, in place of what each names."""
+    """The task for all of them, instead of the one that each names."""
     recorded_source: bool = False
     use_env_states: bool = False
     num_envs: int = 16
     base: TaskOptions = field(default_factory=TaskOptions)
-    """Which backend, and what else is the same for all."""
+    """The backend and other options that are the same for all."""
 
 
 def rescore_all(
@@ -63,18 +63,18 @@ def rescore_all(
     clearances: Clearances | None = None,
     on_notice: Callable[[str], None] = lambda notice: None,
 ) -> tuple[list[Verdict[Source]], tuple[str, ...]]:
-    """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
+    """The verdicts in the order of the files, and notes about intended differences from the recording.
 
     Args:
-        on_progress: gets how many episodes are judged, of how many, and the control steps that were made.
-        clearances: says what of the code that the recordings name may run; None asks nobody.
-        on_notice: gets a sentence for each file beside a task that no import finds, before the task is opened.
+        on_progress: gets the rescored episodes, all episodes, and the control steps so far.
+        clearances: decides which code that recordings name may run; None asks no one.
+        on_notice: gets a sentence for each file in a task's folder that no import finds, before the task is opened.
 
     Raises:
-        NotTrusted: a recording names code that nobody agreed to, and there is nobody to ask; or the answer to all was no.
-        FileNotFoundError, UnreadableRecording: there is nothing to judge.
-        TaskError: no task can be opened, or each raises; where others can be judged, it is said of its episodes.
-        CannotStepIn: as TaskError, where a recorded text cannot be opened.
+        NotTrusted: a recording names code that is not trusted and no one can be asked, or the answer to all was no.
+        FileNotFoundError, UnreadableRecording: there is nothing to rescore.
+        TaskError: no task can be opened, or each raises; if some can, the verdicts of the others carry the error.
+        CannotStepIn: as TaskError, for a recorded text that cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     here = CurrentFolder()
@@ -88,34 +88,34 @@ def rescore_all(
     )
     cleared = _cleared(groups, clearances or Clearances())
     steps = 0
-    told: set[object] = set()
+    printed: set[object] = set()
 
-    def tell_once(finding: Finding) -> None:
-        if finding.key not in told:  # a task may be opened several times, and break the rule each time
-            told.add(finding.key)
+    def report_once(finding: Finding) -> None:
+        if finding.key not in printed:  # a task that is opened several times breaks the rule each time
+            printed.add(finding.key)
             on_finding(finding)
 
     def rescore_group(group: Group, reference: TaskName) -> None:
         nonlocal steps
         for notice in hidden_modules_text(reference):
-            if notice not in told:
-                told.add(notice)
+            if notice not in printed:
+                printed.add(notice)
                 on_notice(notice)
-        begin = partial(open_task, reference, on_activity=on_activity, on_finding=tell_once)
-        with here.again(stay=True):  # the task before may have gone to another one
+        begin = partial(open_task, reference, on_activity=on_activity, on_finding=report_once)
+        with here.again(stay=True):  # the task before may have changed the current folder
             try:
                 opened = begin(group.options)
             except TaskError:
                 opened = begin(with_renderer(group.options))
         before = steps
 
-        def tell(now: int) -> None:
+        def report(now: int) -> None:
             nonlocal steps
             steps = before + now
             on_progress(len(verdicts), len(files), steps)
 
         try:
-            for verdict in rescore(opened, group.files, use_env_states=what.use_env_states, on_steps=tell):
+            for verdict in rescore(opened, group.files, use_env_states=what.use_env_states, on_steps=report):
                 verdicts.append(verdict)
                 on_progress(len(verdicts), len(files), steps)
         finally:
@@ -128,7 +128,7 @@ def rescore_all(
 
 
 def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
-    """What may be opened for each of the groups. Before any of them runs: who is not there to be asked gets all or nothing."""
+    """The task to open for each group, decided before any of them runs: all or nothing if no one can be asked."""
     cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
     refused = [one.question for one in not_cleared if one.question is not None]
@@ -140,15 +140,15 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
 
 
 def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust: bool) -> int:
-    """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
-    here = CurrentFolder()  # a task may go to another
+    """Rescore, print, and write the requested tables; raises as `rescore_all`, and OSError for a table."""
+    here = CurrentFolder()  # a task may change it
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
     with progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
         row = bar.add_task("reading the recordings", total=None)
 
-        def tell(episodes: int, total: int, steps: int) -> None:
+        def report(episodes: int, total: int, steps: int) -> None:
             bar.update(row, total=total, completed=episodes, description=f"judging, {steps} steps")
 
         @contextmanager
@@ -161,7 +161,7 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
         verdicts, notes = rescore_all(
             what,
             lambda activity: bar.update(row, description=activity),
-            tell,
+            report,
             print_finding,
             Clearances(ask=ask, all_trusted=trust),
             warn,
@@ -180,10 +180,10 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
 
 
 def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
-    """The table, and a sentence over all of it.
+    """Print the table and a summary.
 
-    Names of recordings take 55 characters. Where that leaves no room for the rest, as in a terminal of 80 columns, a
-    name has a line of its own, whole, so that it can be taken from there.
+    Names of recordings take 55 characters. If the rest does not fit, as in 80 columns, each name has its own line, unbroken
+    so that it can be copied.
     """
     table = Table(box=None, pad_edge=False)
     for name in ("episode", "seed", "steps", "return", "what changed", "drift"):

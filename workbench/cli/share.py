@@ -1,17 +1,22 @@
-"""``workbench share`` and ``workbench export`` in a terminal: a bar while it is made, and what was made at the end."""
+"""Runs ``workbench share``, ``export`` and ``view`` in a terminal."""
 
 from __future__ import annotations
 
+# What makes files and pages is imported in the functions: `workbench view` must not wait for it.
+import os
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.progress import TimeRemainingColumn
 
-from workbench.cli.terminal import progress_bar, refuse, say
-from workbench.recording.episode.row import Source
-from workbench.recording.lerobot.export import DoesNotFit, ExportOptions
-from workbench.recording.reader.reading import find_all_sources
-from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, make
+from workbench.cli.terminal import print_addresses, print_text, progress_bar, refuse, warn
+
+if TYPE_CHECKING:
+    from workbench.recording.episode.row import Source
+    from workbench.recording.lerobot.export import ExportOptions
+    from workbench.ui.share.make import Made, MakeRequest
 
 SCENE, CAMERAS = "scene", "cameras"
 
@@ -23,9 +28,10 @@ def share_in_terminal(
     sheet: bool,
     out: Path,
 ) -> int:
-    """Returns the exit code."""
+    """Make films, pages and sheets of recordings; returns the exit code."""
+    from workbench.ui.share.make import EVERY_CAMERA, MakeRequest
 
-    def wanted(sources: tuple[Source, ...]) -> list[MakeRequest]:
+    def requests(sources: tuple[Source, ...]) -> list[MakeRequest]:
         films = [
             MakeRequest("scene", sources, out)
             if name == SCENE
@@ -40,31 +46,37 @@ def share_in_terminal(
 
     if not (mp4 or html or sheet):
         return refuse("say what to make: --mp4 CAMERA, --mp4 scene, --html or --sheet")
-    return _make_all(files, wanted)
+    return _make_all(files, requests)
 
 
 def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
-    """Returns the exit code."""
+    """Make a LeRobot dataset of recordings; returns the exit code."""
+    from workbench.ui.share.make import MakeRequest
+
     return _make_all(files, lambda sources: [MakeRequest("lerobot", sources, folder, export=options)])
 
 
-def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
+def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
+    from workbench.recording.lerobot.export import DoesNotFit
+    from workbench.recording.reader.reading import find_all_sources
+    from workbench.ui.share.make import make
+
     try:
-        wanted = wanted_of(find_all_sources(files))
+        requests = requests_of(find_all_sources(files))
     except (OSError, ValueError) as error:
         return refuse(str(error))
     made: list[Made] = []
     not_made: list[str] = []
     try:
         with progress_bar(TimeRemainingColumn()) as bar:
-            row = bar.add_task("reading", total=len(wanted))
-            for number, one in enumerate(wanted):
+            row = bar.add_task("reading", total=len(requests))
+            for number, request in enumerate(requests):
 
-                def told(done: float, doing: str, number: int = number) -> None:
+                def on_progress(done: float, doing: str, number: int = number) -> None:
                     bar.update(row, completed=number + done, description=doing)
 
                 try:
-                    made.append(make(one, told))
+                    made.append(make(request, on_progress))
                     not_made += made[-1].not_made
                 except DoesNotFit as error:
                     not_made.append(f"{error} With --only-fitting such recordings are left out.")
@@ -77,7 +89,56 @@ def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], l
     finally:
         for one in made:
             for path in one.paths:
-                say(path if path.is_file() else f"{path}: {one.words}")
+                print_text(path if path.is_file() else f"{path}: {one.words}")
     for why in not_made:
         refuse(why)
     return 2 if not_made else 0
+
+
+def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
+    """Show recordings in rerun's viewer until the window is closed or Ctrl-C; returns the exit code.
+
+    In a window, or with `web` or without a screen in a page.
+    """
+    from workbench.recording.rerun.viewer import has_screen, open_window, resolve_recordings
+
+    try:
+        if web or not has_screen(os.environ):
+            return _in_page(resolve_recordings(files), host, port)
+        viewer = open_window(files)
+    except (OSError, ValueError, RuntimeError) as error:
+        return refuse(str(error))
+    try:
+        viewer.wait()
+    except RuntimeError as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        print_text("closing")
+    finally:
+        viewer.close()
+    return 0
+
+
+def _in_page(files: Sequence[Path], host: str, port: int) -> int:
+    from workbench.recording.rerun.viewer import web_viewer_folder
+    from workbench.ui.server.file_response import Downloads
+    from workbench.ui.server.gated_server import ServerOptions, open_server
+    from workbench.ui.share.rerun_view import RerunPages
+
+    web_viewer_folder()
+    gated_server = open_server(ServerOptions(host=host, port=port))
+    try:
+        address = RerunPages(gated_server, Downloads(gated_server)).address(files)
+        if gated_server.warning:
+            warn(gated_server.warning)
+        print_addresses(gated_server.addresses(address))
+        print_text(f"  remote  {gated_server.ssh_hint}")
+        print_text("  Ctrl-C ends it.")
+        while True:
+            # In short sleeps: a signal that the kernel delivers to another thread does not wake this one.
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        print_text("closing")
+    finally:
+        gated_server.close()
+    return 0

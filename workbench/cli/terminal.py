@@ -1,13 +1,10 @@
-"""What every command says in a terminal, and how: results to stdout, refusals and problems in colour to stderr.
-
-Much of it comes from elsewhere: names of files, notes of recordings, what the author's code raises and prints, the
-paths of requests. What is said here is made harmless where it is known (`terminal_text`); and for what libraries, loggers
-and tracebacks say past this module, `machine.text` stands before both streams of every command.
-"""
+"""Prints results, errors and questions of all commands to a terminal, with escape sequences removed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import IO, TYPE_CHECKING
 
@@ -15,37 +12,36 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.segment import Segment
+from rich.text import Text
 
 from workbench.machine.text import SafeStream, plain_text
+from workbench.session.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
     from workbench.core.rules import Finding
     from workbench.session.process.captured_output import PrintedLine
     from workbench.session.protocol.messages import Event
-import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-
-from rich.text import Text
-
-from workbench.session.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
 
 
 class Exit(IntEnum):
-    """What the commands end with."""
+    """Exit codes of the commands."""
 
     DONE = 0
     FAILED = 1
-    """The author's code raised, or there is less than was asked for."""
+    """The author's code raised, or fewer results than requested."""
     REFUSED = 2
-    """Nothing was done, and it was said why: a wrong argument, a missing file."""
+    """Nothing was done: a wrong argument, a missing file."""
     NOT_TRUSTED = 4
-    """Nothing was run, because recordings name code that nobody agreed to; ``--trust`` agrees."""
+    """Nothing was run: recordings name code that is not trusted (see ``--trust``)."""
 
 
 class SafeConsole(Console):
-    """Its own colours, bars and cursor moves reach the terminal; those in the text that it is given do not."""
+    """A rich console whose own colours, bars and cursor moves reach the terminal, but not those within printed text.
+
+    Text comes from file names, recordings, the author's code and requests. What libraries, loggers and tracebacks print past
+    this console is guarded by `machine.text`.
+    """
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
@@ -53,7 +49,7 @@ class SafeConsole(Console):
                 yield segment
                 continue
             style = segment.style
-            # The address of a link goes to the terminal as it is.
+            # A link's address would be printed unescaped.
             if style is not None and style.link is not None:
                 style = style.update_link(None)
             yield Segment(plain_text(segment.text, "\n"), style)
@@ -72,41 +68,42 @@ out = SafeConsole(highlight=False)
 err = SafeConsole(stderr=True, highlight=False)
 
 _LINES = "\n\t"
-_told: set[str] = set()
-"""Notices of the task; each reload brings them again."""
+_printed_notices: set[str] = set()
+"""Notices of the task that were printed; each reload repeats them."""
 
 
-def say(text: object) -> None:
-    """One line to stdout, not broken where the terminal ends: it can be taken from there."""
+def print_text(text: object) -> None:
+    """Print one line to stdout without wrapping, so that it can be copied."""
     print(plain_text(str(text)), flush=True)
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
-    """What is being done, how far it is, and `columns`; on stderr, so that what comes of it can be taken from stdout."""
+    """A progress bar with `columns` on stderr, which keeps stdout for results."""
     return Progress(TextColumn("{task.description}", markup=False), BarColumn(), *columns, console=err)
 
 
-def say_addresses(addresses: Sequence[str]) -> None:
-    """Where a page is: the address to open, and others that lead to it from elsewhere."""
+def print_addresses(addresses: Sequence[str]) -> None:
+    """Print the addresses of a page: the one to open, then those for other machines."""
     for i, address in enumerate(addresses):
-        say(f"  {'or' if i else 'page':8}{address}")
+        print_text(f"  {'or' if i else 'page':8}{address}")
 
 
 def refuse(message: str) -> int:
-    """Say in a sentence why nothing is done; returns the exit code."""
+    """Print why a command does nothing; returns the exit code."""
     err.print(f"[red]{escape(plain_text(message))}[/]", soft_wrap=True)
     return Exit.REFUSED
 
 
 def warn(message: str) -> None:
+    """Print a warning."""
     err.print(f"[yellow]{escape(plain_text(message))}[/]", soft_wrap=True)
 
 
 def print_problem(problem: Problem) -> None:
-    """What went wrong in the author's code, with its place."""
+    """Print an error in the author's code, with its line."""
     place = "" if problem.file is None else f"{problem.file}:{problem.line or 1}: "
-    said = escape(plain_text(f"{place}{problem.message}"))
-    err.print(f"[red]{escape(problem.stage)} failed[/] {said}", soft_wrap=True)
+    message = escape(plain_text(f"{place}{problem.message}"))
+    err.print(f"[red]{escape(problem.stage)} failed[/] {message}", soft_wrap=True)
     if problem.code:
         err.print(f"    {escape(plain_text(problem.code))}", soft_wrap=True)
     if problem.traceback:
@@ -114,7 +111,7 @@ def print_problem(problem: Problem) -> None:
 
 
 def print_finding(finding: Finding) -> None:
-    """A rule of GPU simulation that the author's code broke, with its place; the task goes on."""
+    """Print a rule of GPU simulation that the author's code broke, with its line."""
     place = "" if finding.file is None else f"{finding.file}:{finding.line or 1}: "
     err.print(
         f"[yellow]warning[/] {escape(place)}{escape(finding.message)} [dim](rule {finding.rule})[/]",
@@ -125,7 +122,7 @@ def print_finding(finding: Finding) -> None:
 
 
 def print_event(event: Event) -> None:
-    """What the page shows of loads and failures, in the terminal as well."""
+    """Print loads and failures, which the page shows too."""
     from workbench.session.protocol.messages import Loaded, LoadFailed, RulesBroken
 
     if isinstance(event, Loaded):
@@ -139,8 +136,8 @@ def print_event(event: Event) -> None:
             soft_wrap=True,
         )
         for notice in event.task.notices:
-            if notice not in _told:
-                _told.add(notice)
+            if notice not in _printed_notices:
+                _printed_notices.add(notice)
                 warn(notice)
     elif isinstance(event, LoadFailed):
         print_problem(event.problem)
@@ -153,19 +150,19 @@ def print_event(event: Event) -> None:
 
 
 def print_line(line: PrintedLine) -> None:
-    """What the author's code printed, told apart from the workbench's own lines."""
+    """Print a line of the author's code, marked to distinguish it from the workbench's own."""
     from workbench.session.process.captured_output import for_terminal
 
     coloured = line.runs and out.color_system is not None and not out.no_color
     print(f"  | {for_terminal(line.runs) if coloured else line.text}", flush=True)
 
 
-# --- The question whether code that a recording names may run, in a terminal ------------------
+# --- Asking whether code of a recording may run ------------------------------------------------
 
 
 MOST_NAMED = 20
-"""Questions that are listed where nobody can answer them."""
-TAB = "\t"
+"""Most questions that are listed if they cannot be asked."""
+_TAB = "\t"
 _SHOW = ("s", "show")
 _ANSWERS = {
     "y": Consent.ONCE,
@@ -177,15 +174,16 @@ _ANSWERS = {
 
 
 def can_ask() -> bool:
-    """Whether somebody sits at both ends: a question into a file, or an answer out of one, is none."""
+    """Whether stdin and stdout are terminals, so that a person can answer."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 class TerminalPrompt:
-    """
+    """Asks for consent in a terminal.
+
     Args:
-        out: Where it asks.
-        quiet: Keeps everything else from writing there meanwhile.
+        out: the console to ask on.
+        quiet: context in which nothing else writes to it.
     """
 
     def __init__(self, out: Console, quiet: Callable[[], AbstractContextManager[None]]) -> None:
@@ -211,54 +209,56 @@ class TerminalPrompt:
 
 
 def print_question(question: TrustQuestion, out: Console) -> None:
-    """What would run."""
+    """Print which files would run and what is known of them."""
 
-    def tell(text: str, style: str = "") -> None:
+    def print_escaped(text: str, style: str = "") -> None:
         out.print(escape(plain_text(text)), style=style, soft_wrap=True)
 
     holds = "hold this text" if question.recorded_text else "name this file"
-    tell(f"Recordings of {question.task} that were not made by this installation {holds}:")
+    print_escaped(f"Recordings of {question.task} that were not made by this installation {holds}:")
     for place, file in enumerate(question.files):
         if place == 1:
-            tell(_about_modules(question))
+            print_escaped(_modules_text(question))
         name = escape(plain_text(file.name))
-        out.print(f"    {name if place else f'[bold]{name}[/]'}  {_marks(file)}", soft_wrap=True)
+        out.print(f"    {name if place else f'[bold]{name}[/]'}  {_file_mark(file)}", soft_wrap=True)
     if question.nothing_known:
-        tell(
+        print_escaped(
             "You trusted another version of this file and the modules beside it before. Which of them has changed since is "
             "not known.",
             "yellow",
         )
     elif question.trusted_before:
         gone = f"; gone since: {', '.join(question.gone)}" if question.gone else ""
-        tell(f"You trusted another version of this before. What has changed since is marked{gone}.", "yellow")
+        print_escaped(
+            f"You trusted another version of this before. What has changed since is marked{gone}.", "yellow"
+        )
     for what in question.unseen:
-        tell(what, "yellow")
-    tell(
+        print_escaped(what, "yellow")
+    print_escaped(
         "It can read and change all that you can. The digits are the first that sha256sum says of each file."
     )
 
 
 def print_texts(question: TrustQuestion, out: Console) -> None:
-    """The texts that would run, with nothing in them that a terminal takes for more than text."""
+    """Print the texts that would run, escaped."""
     for file in question.files:
         out.print(f"[bold]{escape(plain_text(file.name))}[/]  {file.hash}", soft_wrap=True)
         for number, line in enumerate(file.text.split("\n"), 1):
-            # Not as markup, in which `:x:` would be a picture.
-            out.print(Text.assemble((f"{number:5} ", "dim"), plain_text(line, TAB)), soft_wrap=True)
+            # Not as markup, in which `:x:` is an emoji.
+            out.print(Text.assemble((f"{number:5} ", "dim"), plain_text(line, _TAB)), soft_wrap=True)
 
 
-def not_trusted(error: NotTrusted) -> list[str]:
-    """Why nothing was run, and what to do; a line each."""
-    said = [
+def not_trusted_lines(error: NotTrusted) -> list[str]:
+    """Lines: why nothing was run, and what to do."""
+    lines = [
         f"Nothing was run: {reason}. Add it, which agrees to all in this run, if you know where the recording comes from."
         for reason in error.reasons
     ]
     questions = error.questions
     if not questions:
-        return said
+        return lines
     if can_ask():
-        return [*said, "Nothing was run: you agreed to none of it."]
+        return [*lines, "Nothing was run: you agreed to none of it."]
     named: list[str] = []
     for question in questions[:MOST_NAMED]:
         named.append(f"    {question_text(question)}")
@@ -266,7 +266,7 @@ def not_trusted(error: NotTrusted) -> list[str]:
     if len(questions) > MOST_NAMED:
         named.append(f"    and {len(questions) - MOST_NAMED} more")
     return [
-        *said,
+        *lines,
         "Nothing was run: the recordings were not made by this installation, and nobody has agreed to the code that they name:",
         *named,
         "Read it. Then run the command in a terminal, where you are asked, and where show prints the text; or add --trust, which "
@@ -274,7 +274,7 @@ def not_trusted(error: NotTrusted) -> list[str]:
     ]
 
 
-def _about_modules(question: TrustQuestion) -> str:
+def _modules_text(question: TrustQuestion) -> str:
     if question.recorded_text:
         return "Beside it they hold what it may import:"
     if question.computed:
@@ -282,5 +282,5 @@ def _about_modules(question: TrustQuestion) -> str:
     return "It imports from beside it:"
 
 
-def _marks(file: CodeFile) -> str:
+def _file_mark(file: CodeFile) -> str:
     return file.hash if file.since is Since.SAME else f"{file.hash}  [yellow]{file.since.value} since[/]"

@@ -17,7 +17,7 @@ import viser._messages
 import viser.infra._infra
 
 from tests.drive.page import page_at
-from workbench.cli.terminal import say_addresses
+from workbench.cli.terminal import print_addresses
 from workbench.machine.web_assets import web_assets_folder
 from workbench.ui.server import gated_server as door_module
 from workbench.ui.server import listening, viser_private
@@ -100,7 +100,7 @@ def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys
             )
             assert connection.getresponse().status in (200, 303), host
             connection.close()
-        say_addresses(gated_server.addresses())
+        print_addresses(gated_server.addresses())
         printed = capsys.readouterr().out.splitlines()
         assert [line.split() for line in printed] == [
             ["or" if i else "page", url] for i, url in enumerate(dict.fromkeys(gated_server.addresses()))
