@@ -1,9 +1,4 @@
-"""An episode that a reader has read, as it crosses to the server, and what is checked of it there.
-
-Whoever shows an episode takes it for granted that its columns have a row a state, that faces name vertices that there
-are, that an action has as many numbers as names. Here is where that is made sure of, for files that are broken as for
-a reader that was taken over.
-"""
+"""Packs an episode for the way from reader to server, and validates it there."""
 
 from __future__ import annotations
 
@@ -23,18 +18,18 @@ from workbench.recording.episode.episode import BrokenFile, CameraTrack, Episode
 from workbench.recording.reader.requests import CameraRead, EpisodeRead, PictureRead, ShapeRead, VisualRead
 
 FetchPicture = Callable[[int, Modality, int, bool], PictureRead]
-"""Of a camera by its number: the picture of that number; encoded or not. Raises OSError."""
+"""Arguments: camera, modality, index, encoded. Raises OSError."""
 
 
 class InvalidEpisode(Exception):
-    """What came does not fit together."""
+    """Parts of a received episode do not fit together."""
 
 
 # --- in the reader -----------------------------------------------------------------------------------
 
 
 class SentShapes:
-    """Which shapes were sent to who asks for episodes with one number of `OpenEpisode.sharing`."""
+    """Shapes that were sent for one number of `OpenEpisode.sharing`."""
 
     _numbers = itertools.count()
 
@@ -44,7 +39,7 @@ class SentShapes:
 
     def sent(self, mesh: Mesh, material: Material) -> tuple[ShapeRead, bool]:
         """The shape with its number, and whether it was sent before."""
-        # They are kept with their number, so their ids are nobody else's.
+        # `_sent` keeps the objects alive, so ids are not reused.
         key = (id(mesh), id(material))
         before = key in self._sent
         if not before:
@@ -75,7 +70,7 @@ def _camera(track: CameraTrack) -> CameraRead:
 
 
 class KnownShapes:
-    """What readers have sent of shapes, for as long as those are shared."""
+    """Shapes received from readers, while they are shared."""
 
     def __init__(self) -> None:
         self._of: WeakKeyDictionary[
@@ -84,14 +79,14 @@ class KnownShapes:
         self._numbers = itertools.count(1)
 
     def of(self, shapes: SharedShapes) -> tuple[int, dict[tuple[int, int], tuple[Mesh, Material]]]:
-        """The number to ask with, and what came; by which process it came from, and its number there."""
+        """The number for `OpenEpisode.sharing`, and the received shapes by process and number."""
         if shapes not in self._of:
             self._of[shapes] = (next(self._numbers), {})
         return self._of[shapes]
 
 
 def _pictures(modality: Modality, camera: int, count: int, fetch: FetchPicture) -> EncodedPictures:
-    """Of a recording that a reader has open, decoded there when one is asked for."""
+    """Pictures of an episode that is open in a reader, which decodes them."""
 
     def one(number: int) -> bytes:
         blob = fetch(camera, modality, number, True).blob
@@ -118,13 +113,16 @@ def unpack_episode(
     shapes: SharedShapes,
     known: dict[tuple[int, int], tuple[Mesh, Material]],
 ) -> Episode:
-    """
+    """The episode, validated: the file may be broken, and the reader compromised.
+
+    Users of an episode rely on columns with a row per state, faces of existing vertices, actions as long as their names.
+
     Args:
-        process: the number of the process that it came from.
-        known: shapes that came before.
+        process: number of the process that read it.
+        known: shapes received before.
 
     Raises:
-        InvalidEpisode: it does not fit together; the message says what of it.
+        InvalidEpisode: parts do not fit together.
     """
     episode = read.episode
     reward = _checked(episode.reward, "rewards", None)
@@ -160,7 +158,7 @@ def unpack_episode(
 
 
 def _checked(array: NDArray, what: str, *shape: int | None, kinds: str = "biuf") -> NDArray:
-    """`array`, where it is of that shape, with any size for None, and of plain numbers of these kinds."""
+    """`array`, if it has this shape (None: any size) and a dtype of these kinds."""
     fits = array.ndim == len(shape) and all(want in (None, size) for want, size in zip(shape, array.shape))
     wanted = " x ".join("any" if size is None else str(size) for size in shape)
     _require(
@@ -173,7 +171,7 @@ def _checked(array: NDArray, what: str, *shape: int | None, kinds: str = "biuf")
 def _rows(
     held: dict[str, NDArray], states: int, broken_files: list[BrokenFile]
 ) -> Iterator[tuple[str, NDArray]]:
-    """Those with a row a state; of others it is said that they are left out."""
+    """Entries with a row per state; others are left out and reported in `broken_files`."""
     for name, rows in held.items():
         if rows.ndim > 0 and len(rows) == states and rows.dtype.kind in "biuf":
             yield name, rows

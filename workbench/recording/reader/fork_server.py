@@ -1,10 +1,4 @@
-"""The process that readers are made of, which has imported what they need and has read nothing itself; and their loop.
-
-Started as ``python -m workbench.recording.reader.fork_server SOCKET``, it forks a reader for each folder that somebody
-wants to look into. That takes milliseconds where starting Python takes half a second, and a reader that was ended is
-replaced as quickly. It has one thread (numpy's threads are turned off in its environment), since a fork takes no other
-along, and ends when its socket closes; a reader ends with it.
-"""
+"""The process that forks readers, and the readers' request loop."""
 
 from __future__ import annotations
 
@@ -19,7 +13,6 @@ from typing import Literal, get_args
 from workbench.machine.processes.confinement import confine
 from workbench.machine.processes.family import end_with_parent
 from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
-from workbench.recording.episode.encoded_pictures import EncodedPictures
 from workbench.recording.episode.episode import CameraTrack
 from workbench.recording.episode.row import Source, UnreadableRecording, clean_text
 from workbench.recording.reader.episode_wire import SentShapes, pack_episode
@@ -50,14 +43,19 @@ MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
 LONGEST = 1 << 20
 MOST_RECOVERY_MEMORY = 4 << 30
-"""Of one that writes."""
+"""The same for a reader that recovers recordings."""
 MOST_SHARED = 4
-"""Groups of episodes whose shapes are remembered."""
+"""Groups of episodes (`OpenEpisode.sharing`) whose shapes are kept."""
 LONGEST_MESSAGE = 600
 
 
 def main() -> None:
-    """Entry of the process."""
+    """Run the fork server: ``python -m workbench.recording.reader.fork_server SOCKET``.
+
+    Forking takes milliseconds where starting Python takes half a second. It has imported what readers need and reads no
+    recording itself. It has one thread, since a fork copies no other (numpy's are turned off in its environment), and
+    ends when its socket closes; its readers end with it.
+    """
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
@@ -77,9 +75,9 @@ def main() -> None:
             _run_reader(socket.socket(fileno=fds[0]), wanted, fork_server)
         os.close(fds[0])
         try:
-            os.setpgid(pid, pid)  # whoever ends it ends its group, perhaps before it has come to this itself
+            os.setpgid(pid, pid)  # also here: its group may be killed before the reader has made it
         except OSError:
-            pass  # it has, or it is gone
+            pass  # the reader made it, or has ended
         control.send(pack(pid))
 
 
@@ -106,7 +104,7 @@ def import_episode_readers() -> None:
 
 
 def serve(line: MessageSocket) -> None:
-    """Answer one request after the other, until nobody asks any more."""
+    """Answer requests until the socket closes."""
     reader = _Reader()
     while True:
         try:
@@ -130,20 +128,20 @@ class _Reader:
             self._opened.pop(number, None)
 
     def answer(self, wanted: Request) -> bytes:
-        """Packed, which a reader may have no memory for either."""
+        """The packed answer; packing may run out of memory too."""
         try:
             return pack_message(self._answer(wanted))
         except UnreadableRecording as error:
             failed = _failed("unreadable", str(error))
         except MemoryError:
-            failed = _failed("unreadable", "To read it takes more memory than a recording may take.")
+            failed = _failed("unreadable", "Reading it needs more memory than a recording may use.")
         except OSError as error:
             failed = _failed("system", str(error))
         except Exception as error:
-            # Files of strangers: what they can be wrong in has no end, and the next one is to be read too.
+            # Untrusted files can fail in any way, and the reader must serve the next request.
             failed = _failed("unreadable", f"It cannot be read ({type(error).__name__}: {error}).")
         except BaseException as error:
-            if type(error).__name__ != "PanicException":  # of rerun's reader, which is Rust
+            if type(error).__name__ != "PanicException":  # raised by rerun's Rust code
                 raise
             failed = _failed("unreadable", f"It cannot be read (rerun's reader gave up: {error}).")
         return pack_message(failed)
@@ -188,7 +186,7 @@ class _Reader:
         cameras = self._opened.get(wanted.opened, [])
         if not 0 <= wanted.camera < len(cameras):
             return _failed("gone", "That recording is not open.")
-        pictures: EncodedPictures | None = getattr(cameras[wanted.camera], wanted.modality)
+        pictures = cameras[wanted.camera].pictures.get(wanted.modality)
         if pictures is None or not 0 <= wanted.index < len(pictures):
             return _failed("unreadable", "There is no such picture.")
         if wanted.encoded:
@@ -214,7 +212,7 @@ def _rerun_info(wanted: ReadRerunInfo) -> RerunInfo:
         try:
             found.append(ask(wanted.path))
         except (ValueError, OSError, RuntimeError, AssertionError):
-            found.append(None)  # rerun then shows it in an arrangement of its own, from its first moment on
+            found.append(None)  # rerun then uses its own layout, at the first step
     return RerunInfo(found[0], found[1])
 
 

@@ -1,4 +1,4 @@
-"""The processes of readers, from outside: how they are started, asked one thing at a time, and ended."""
+"""Starts, asks and ends the reader processes."""
 
 from __future__ import annotations
 
@@ -21,41 +21,41 @@ from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable
 from workbench.recording.reader.requests import Answer, CloseEpisodes, Ended, NewReader, Request
 
 START_SECONDS = 60.0
-"""For a nursery to be there; it imports for half a second."""
+"""Timeout of the fork server's start, which imports for half a second."""
 
 
 FOR_READING = {
-    # It forks, which takes one thread along.
+    # A fork copies one thread only.
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
-    # Nobody brings filters for HDF5 along.
+    # Load no filter plugins of HDF5.
     "HDF5_PLUGIN_PRELOAD": "::",
-    # Arrow and rerun would each take 1 GB at once that they do not need, and memory is limited.
+    # Arrow and rerun would each commit 1 GB at once, and a reader's memory is limited.
     "MIMALLOC_ARENA_EAGER_COMMIT": "0",
 }
 
 
 class ReaderEnded(OSError):
-    """What was asked for last ended the reader; the message goes on from the name of what was read."""
+    """A request ended the reader; the message follows the name of what was read."""
 
 
 class ReaderBusy(OSError):
-    """The reader is at something else."""
+    """The reader is busy with another request."""
 
 
 class WrongProcess(Exception):
-    """The process that was meant is not the one that reads now."""
+    """The requested process has ended; another one reads now."""
 
 
 @dataclass(frozen=True)
 class Answered:
     answer: Answer
     process: int
-    """The number of the process that it came from."""
+    """Number of the process that answered."""
 
 
 class _ForkServer:
-    """One a process, started when it is first needed."""
+    """The fork server of this process, started on first use."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -63,12 +63,12 @@ class _ForkServer:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Begin to start it; returns at once."""
+        """Start it without waiting."""
         with self._lock:
             self._start()
 
     def new_reader(self, wanted: NewReader) -> tuple[int, MessageSocket]:
-        """Its process id and the line to it. Raises OSError."""
+        """Fork a reader: its process id and socket. Raises OSError."""
         ours, theirs = socket.socketpair()
         message = pack(wanted)
         with theirs, self._lock:
@@ -78,12 +78,12 @@ class _ForkServer:
                     socket.send_fds(control, [message], [theirs.fileno()])
                     return self._answer(control), MessageSocket(ours, get_args(Answer))
                 except (OSError, Unreadable):
-                    self._end()  # somebody ended it: once more, with another
+                    self._end()  # it was killed: try again with a new one
         ours.close()
         raise OSError("the process that reads recordings cannot be started")
 
     def ended(self, pid: int) -> int | None:
-        """The exit status of a reader that has ended or was killed; None where nobody knows."""
+        """The exit code of a reader that has ended; None if unknown."""
         with self._lock:
             if self._control is None:
                 return None
@@ -118,7 +118,7 @@ class _ForkServer:
 
     @staticmethod
     def _answer(control: socket.socket) -> int:
-        """Raises Unreadable where it has ended."""
+        """Raises Unreadable if the server has ended."""
         return Unpacker().unpack(control.recv(64), int)
 
     def _end(self) -> None:
@@ -134,9 +134,9 @@ fork_server = _ForkServer()
 
 
 class Reader:
-    """A process that reads below one folder and may do little else. It is there when it is first asked.
+    """A process that may read one folder and do little else, started on first use.
 
-    Safe to use from several threads; who asks first is answered first.
+    Thread-safe; requests are answered in their order.
     """
 
     _numbers = itertools.count(1)
@@ -144,20 +144,20 @@ class Reader:
     def __init__(self, folder: Path, episodes: bool, writes: Path | None = None) -> None:
         """
         Args:
-            episodes: it is for whole episodes, not for rows.
-            writes: below which it may write too.
+            episodes: it reads whole episodes, not rows.
+            writes: folder that it may write to.
         """
         self._folder, self._episodes, self._writes = Path(folder), episodes, writes
         self._allowed: set[Path] = set()
-        """Further files: what links in the folder lead to."""
+        """Further files: targets of links in the folder."""
         self._turns = _Turns()
         self._pid = 0
         self._line: MessageSocket | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
-        """What those and the folder were when the present process began."""
+        """Device and inode of the folder and these files when the present process began."""
         self._forgotten: deque[tuple[int, int]] = deque()
         self.process = 0
-        """The number of the present process; 0 where there is none."""
+        """Number of the present process; 0 if there is none."""
 
     def ask(
         self,
@@ -168,12 +168,12 @@ class Reader:
     ) -> Answered:
         """
         Args:
-            seconds: that the answer may take.
-            patience: seconds to wait for its turn; None waits for as long as it takes.
-            process: which is meant, for a request that makes sense there alone.
+            seconds: timeout of the answer.
+            patience: timeout of waiting for other requests; None waits for ever.
+            process: the process that the request refers to, such as one with an open episode.
 
         Raises:
-            ReaderEnded: it ended the reader, or was not answered in time. Another one reads what comes next.
+            ReaderEnded: it ended the reader, or timed out. A new reader serves the next request.
             ReaderBusy, WrongProcess
             OSError: no reader can be started.
         """
@@ -189,13 +189,13 @@ class Reader:
         patience: float | None = None,
         process: int | None = None,
     ) -> list[Answered | ReaderEnded]:
-        """Several at once, of which each may take so long; one that ends the reader does not end the others.
+        """Send several requests at once, each with this timeout; one that ends the reader does not affect the others.
 
-        One whose reader dies is asked for once more: somebody else may have killed it.
+        A request whose reader dies is sent once more: the cause may have been outside.
         """
         answers: list[Answered | ReaderEnded] = []
         again = -1
-        """The number of the one that is asked for once more."""
+        """Index of the request that was sent once more."""
         with self._turns.turn(patience):
             while len(answers) < len(requests):
                 line = self._started()
@@ -220,26 +220,26 @@ class Reader:
         return answers
 
     def allow(self, paths: Sequence[Path]) -> None:
-        """Let it read these files too, wherever they are. What is open in it is not any more."""
+        """Allow it to read these files too. A new reader starts for new paths, without open episodes."""
         with self._turns.turn(None):
             if not self._allowed.issuperset(paths):
                 self._allowed.update(paths)
                 self._kill()
 
     def forget(self, process: int, opened: int) -> None:
-        """That episode is of no use any more. Returns at once: it may be called by a finalizer, on any thread."""
+        """Close an episode with the next request. Does not block: a finalizer may call it on any thread."""
         self._forgotten.append((process, opened))
 
     def close(self) -> None:
-        """End it; who asks it then has another one started."""
+        """End it; the next request starts a new one."""
         with self._turns.turn(None):
             self._kill()
 
     def _started(self) -> MessageSocket:
         paths = (self._folder, *sorted(self._allowed))
-        # It may read what was there when it began: a folder that was made anew is another one.
+        # It may read the folder that existed when it began, not a new one of the same name.
         there = tuple(map(_identity, paths))
-        # Nothing is asked, so what came is its end: nobody's fault but of who ended it.
+        # Without a request, input means that it was killed from outside.
         if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
         if self._line is None:
@@ -262,24 +262,24 @@ class Reader:
         if isinstance(error, TimeoutError):
             return ReaderEnded(f"takes longer to read than {seconds:.0f} s")
         if isinstance(error, Unreadable):
-            return ReaderEnded(f"is not what it should be: {error}")
+            return ReaderEnded(f"gave an invalid answer: {error}")
         with_what = "" if status is None else f" (it {describe_exit(status)})"
         return ReaderEnded(f"ended the process that reads recordings{with_what}")
 
     def _kill(self) -> int | None:
-        """Its exit status, where it had ended by itself or is known."""
+        """Kill it; its exit code, if known."""
         if self._line is None:
             return None
         self._line.end.close()
         self._line, self.process = None, 0
-        # With what it started. Its number is its own until the nursery was told.
+        # With its children. The fork server reaps it in `ended`, so the id cannot have been reused.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
         return fork_server.ended(self._pid)
 
 
 class _Turns:
-    """A lock whose turn is that of who came first: Python's own goes to who lets it go, if they want it again."""
+    """A fair lock, first come, first served: Python's own may return to the thread that released it."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -293,7 +293,7 @@ class _Turns:
             self._waiting.append(me)
             if not self._changed.wait_for(lambda: self._waiting[0] is me, patience):
                 self._waiting.remove(me)
-                raise ReaderBusy("the process that reads recordings is at another one")
+                raise ReaderBusy("the process that reads recordings is busy with another one")
         try:
             yield
         finally:

@@ -1,11 +1,4 @@
-"""A recording as an `Episode` again.
-
-The ``.json`` says what the episode is, the ``.rrd`` holds what there is to see (meshes, poses, pictures, curves), and the ``.h5``
-what there is to compute with (env states, observations, actions). Each is read for what it holds best, and a file that is missing or broken takes
-only its own with it: a lone ``.rrd`` that somebody was sent can be looked at, though nobody can step into it.
-
-Pictures stay in the file until one is asked for.
-"""
+"""Reads an episode from the three files of a recording, and finds the recordings in a folder."""
 
 from __future__ import annotations
 
@@ -53,20 +46,23 @@ from workbench.recording.rerun.read import RerunTable, rows_at
 
 MOST_STATES = 10_000_000
 MOST_COLUMN_BYTES = 1 << 29
-"""Of one column, as the recording describes it: the rows that say nothing new are not in the file, so its size says little."""
+"""Size of one column as described: the file leaves out repeated rows, so its own size is no bound."""
 
 
 def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
-    """The episode of our own files; `path` is its .rrd, .h5 or .json, and the others are found beside it.
+    """The episode of a workbench recording.
 
-    With `shapes`, meshes are those of other recordings that were read with it, where they look the same.
+    The ``.json`` describes it, the ``.rrd`` holds meshes, poses, pictures and curves, the ``.h5`` env states, observations
+    and actions. The content of a missing file is empty: without the .rrd no geometry, poses and pictures, without the
+    .h5 no env states. The same for a broken one, listed in `Episode.broken_files`; so a lone ``.rrd`` can be viewed. The
+    geometry is that of this env alone, as env 0 of 1. Pictures stay in the file until they are accessed.
 
-    What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
-    states. The same for one that is broken, named in `Episode.broken_files`. The geometry is that of this env alone, as
-    env 0 of 1.
+    Args:
+        path: its .rrd, .h5 or .json.
+        shapes: shares equal meshes with other recordings.
 
     Raises:
-        UnreadableRecording: what is there is no recording of ours, or all of it is broken; the message says which.
+        UnreadableRecording: it is not a workbench recording, or all files are broken.
     """
     episode, source_path = read_without_task(path, shapes)
     found = task_file(source_path, episode.info.task, Path(path).parent)
@@ -76,7 +72,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
 
 
 def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
-    """As `read_episode`, from these files alone: the task's own file is not looked for, and where it may be is said beside.
+    """`read_episode` without searching the task's file, whose recorded path is returned too.
 
     Raises as `read_episode`.
     """
@@ -130,7 +126,7 @@ def _unread(file: Path, error: Exception, lost: str) -> BrokenFile:
 
 
 def _read_description(file: Path | None) -> tuple[Description | None, Exception | None]:
-    """What the .json says; nothing where it is none of ours, and why where it is no JSON."""
+    """Description in the .json, None if it is not ours; and the error if it is not JSON."""
     if file is None:
         return None, None
     try:
@@ -148,7 +144,7 @@ def _read_description(file: Path | None) -> tuple[Description | None, Exception 
 def _description(
     file: Path | None, not_json: Exception | None, table: RerunTable | None, path: Path
 ) -> Description:
-    """What the recording says of itself where there is no .json of ours."""
+    """Description of a recording without a .json of ours."""
     if file is not None and table is None:
         if not_json is not None:
             raise UnreadableRecording(f"{file.name} {not_json}.") from not_json
@@ -215,7 +211,7 @@ def _columns(
 
 
 def _column(table: RerunTable | None, entity: str, kind: ColumnType, first: int, states: int) -> NDArray:
-    """States `first` to the last of the numbers of `entity`, as `kind` say they were."""
+    """States `first` to the last of the numbers of `entity`, with dtype and shape of `kind`."""
     dtype, shape = np.dtype(kind[0]), (states - first, *kind[1])
     _check_room(entity, shape, dtype)
     out = np.full(shape, np.nan if dtype.kind == "f" else 0, dtype=dtype)
@@ -233,11 +229,11 @@ def _column(table: RerunTable | None, entity: str, kind: ColumnType, first: int,
 
 
 def _check_room(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
-    """Before it is allocated: what a recording says of itself may be anything. Raises ValueError."""
+    """Check a described size before allocating it. Raises ValueError."""
     if dtype.kind not in "biuf":
-        raise ValueError(f"{what} is said to be of type {dtype}, which is no plain number")
+        raise ValueError(f"{what} claims the type {dtype}, which is not a plain number")
     if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize > MOST_COLUMN_BYTES:
-        raise ValueError(f"{what} is said to be {shape} numbers")
+        raise ValueError(f"{what} claims {shape} numbers")
 
 
 def _cameras(cameras: Sequence[CameraJson], table: RerunTable, states: int) -> Iterator[CameraTrack]:
@@ -274,7 +270,7 @@ _FLAGS = ("success", "fail")
 
 
 def _read_states(path: Path) -> dict[str, Any]:
-    """What the .h5 holds; where the .rrd holds it too, this is what ManiSkill reads."""
+    """Content of the .h5, preferred to the same columns of the .rrd: ManiSkill reads it."""
     with open_h5(path) as file:
         group = file.group(TRAJECTORY)
         if group is None:
@@ -294,24 +290,23 @@ def _add_states(episode: Episode, held: dict[str, Any]) -> None:
                 episode.evaluate[name] = np.concatenate([[False], held[name]])
 
 
-# --- Which recordings a file is, or a folder holds, told by looking into them -----------------
-
+# --- the recordings in a file or folder ------------------------------------------------------------
 
 _OURS = (".rrd", ".h5", ".json")
 
 
 def sources_in(path: Path) -> Iterator[Source]:
-    """In a folder by name, with the folders below it. Raises OSError where a folder cannot be looked into."""
+    """The recordings in a file, or in a folder and below, by name. Raises OSError if a folder cannot be listed."""
     if not path.is_dir():
         yield from _in_file(path) if path.suffix in _OURS else ()
     elif is_lerobot(path):
         yield from _in_dataset(path)
     else:
-        # What is hidden is under way, an index, or thrown away.
+        # Hidden folders are journals, indices or the trash.
         there = sorted(inside for inside in path.iterdir() if not inside.name.startswith("."))
         stems = {inside.with_suffix(""): inside for inside in there if inside.suffix in _OURS}
         for inside in sorted([*stems.values(), *(inside for inside in there if inside.is_dir())]):
-            # A link may lead round in a circle.
+            # A link may form a cycle.
             if not (inside.is_dir() and os.path.islink(inside)):
                 yield from sources_in(inside)
 
@@ -335,7 +330,7 @@ def _in_dataset(folder: Path) -> Iterator[Source]:
     try:
         numbers = [facts.trajectory for facts in lerobot_rows(folder)]
     except UnreadableRecording:
-        numbers = ["0"]  # whoever reads it is told why
+        numbers = ["0"]  # reading it reports the problem
     for number in numbers:
         yield Source(folder, number, f"{folder.resolve()}#{number}", f"{folder.name}#{number}")
 

@@ -1,12 +1,4 @@
-"""From the files of one name to rows: what is read, and what is said of files that cannot be.
-
-The ``.json`` is enough for all but the sum of rewards and the pictures of ManiSkill's trajectories, which are in the ``.h5``. A bare
-``.rrd``, as they were written before there was a ``.json``, has to be read through, which takes a tenth of a second and
-more: one reason for an index.
-
-A broken file is a row as well: a person who looks for a recording should find it, with what is wrong with it, rather
-than find nothing. A ``.json`` that is something else (a folder of recordings may be a folder of much) is none.
-"""
+"""Makes library rows from the files of one name."""
 
 from __future__ import annotations
 
@@ -47,20 +39,25 @@ from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, broken
 
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
-"""A thumbnail as it was recorded is taken as it is up to here, and made smaller beyond."""
+"""Recorded thumbnails up to this size are used unchanged."""
 MOST_EPISODES = 20_000
-"""Of one file that are listed."""
+"""Episodes of one file that are listed."""
 
 _LARGEST_PICTURE = 4096
-"""Pixels of a side of a picture that a thumbnail is made of."""
+"""Pixels of the longer side of a picture that a thumbnail is made of."""
 
 
 def read_found(folder: Path, found: Found) -> list[LibraryEntry]:
-    """The recordings in these files: none, one, or one a trajectory. Whatever is wrong is said in a row."""
+    """The recordings in these files: none, one, or one per trajectory.
+
+    A broken file becomes a row that states the problem, so that it is found. A ``.json`` that is something else gives
+    none. The ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``; a
+    lone ``.rrd`` must be read through, which takes a tenth of a second or more.
+    """
     try:
         entries = _read(folder, found)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
-        # Files of strangers: what they can be wrong in has no end, and one of them must not hide the others.
+        # Untrusted files can fail in any way, and one must not hide the others.
         entries = [_broken(found, f"cannot be read ({error})")]
     if NOTES in found.sizes:
         notes = read_notes(found.path(folder, NOTES))
@@ -113,7 +110,7 @@ def _workbench_entry(found: Found, document: Document) -> LibraryEntry:
     except WrongDocument as error:
         written, problem = {}, problem or clean_text(f"{name}.json {error}.", 500)
     for suffix, size in found.sizes.items():
-        # What only the bytes tell is told when it is opened: a list of thousands reads none of them.
+        # Checksums are compared when it is opened: listing thousands reads no contents.
         if problem is None and (why := wrong_size(written, suffix, size)) is not None:
             problem = f"{name}{suffix} was cut short or changed: {why}."
     described = document.data["workbench"]
@@ -122,7 +119,7 @@ def _workbench_entry(found: Found, document: Document) -> LibraryEntry:
 
 
 def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Facts:
-    """Of an episode of ours: its ``.json`` and its ``.rrd`` say the same under the same names."""
+    """Facts of a workbench episode; its ``.json`` and ``.rrd`` use the same names."""
     seed = integer(data.get("seed"))
     return Facts(
         kind,
@@ -146,7 +143,7 @@ def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Fa
 
 
 def _acted_by(data: object) -> str:
-    """A list in a ``.json``, words already in a ``.rrd``."""
+    """A list in a ``.json``, a text in a ``.rrd``."""
     if not isinstance(data, list):
         return clean_text(data)
     try:
@@ -156,7 +153,7 @@ def _acted_by(data: object) -> str:
 
 
 def _thumbnail(encoded: object) -> bytes | None:
-    """A small jpeg of the base64 in a description; None for what is no picture."""
+    """A small JPEG from the base64 in a description; None if it is not a picture."""
     if not isinstance(encoded, str):
         return None
     try:
@@ -171,7 +168,7 @@ def _thumbnail(encoded: object) -> bytes | None:
 
 
 def _maniskill_entries(folder: Path, found: Found, document: Document) -> list[LibraryEntry]:
-    """One row an episode of ManiSkill's ``RecordEpisode`` and of its demonstrations: they have the same form."""
+    """One row per episode of ManiSkill's ``RecordEpisode``, which made its demonstrations too."""
     name = Path(found.key).name
     written = found.newest / 1e9
     count = len(document.data["episodes"])
@@ -181,7 +178,7 @@ def _maniskill_entries(folder: Path, found: Found, document: Document) -> list[L
         task, problem = "", clean_text(f"{name}.json {error}.", 500)
     if ".h5" not in found.sizes:
         if not task:
-            return []  # a .json of something else that has episodes
+            return []  # another program's .json with "episodes"
         lost = f"{name}.h5, which {name}.json describes, is missing."
         return [(Facts("maniskill", task=task, written=written, problem=lost), None)]
     data = [_episode_or_problem(document, number) for number in range(min(count, MOST_EPISODES))]
@@ -227,8 +224,8 @@ def _episode_or_problem(document: Document, number: int) -> EpisodeJson | str:
 
 
 def _lerobot_entries(folder: Path, found: Found) -> list[LibraryEntry]:
-    """One row an episode of a LeRobot dataset, which is known by its ``meta/info.json``."""
-    # Arrow's threads must not be there when a reader is forked, and most libraries hold no dataset.
+    """One row per episode of a LeRobot dataset; its key is ``meta/info``."""
+    # Imported late: Arrow starts threads, which must not exist when a reader is forked.
     from workbench.recording.lerobot.read import lerobot_rows
 
     written = found.newest / 1e9
@@ -242,8 +239,7 @@ def _lerobot_entries(folder: Path, found: Found) -> list[LibraryEntry]:
 def _read_h5(
     path: Path, trajectories: list[str]
 ) -> tuple[dict[str, float | None], dict[str, bytes], str | None]:
-    """Of each trajectory that is in the ``.h5`` the sum of rewards (None where they were not recorded) and a thumbnail, where
-    it holds what a camera saw; and what is wrong with the file."""
+    """Sums of rewards (None if not recorded) and thumbnails of the trajectories in the ``.h5``, and the file's problem."""
     totals: dict[str, float | None] = {}
     pictures: dict[str, bytes] = {}
     try:
@@ -268,7 +264,7 @@ def _read_h5(
 
 
 def _last_picture(group: H5Group) -> bytes | None:
-    """A small jpeg of what the first camera saw last, in colour; None where no picture was recorded."""
+    """A small JPEG of the first camera's last colour picture; None if there is none."""
     cameras = group.group("obs/sensor_data")
     for name in cameras or ():
         camera = None if cameras is None else cameras.group(name)
@@ -280,7 +276,7 @@ def _last_picture(group: H5Group) -> bytes | None:
 
 
 def _rrd_only(folder: Path, found: Found) -> LibraryEntry:
-    # It takes rerun along, which is half a second that a library without such files has no need of.
+    # Imported late: rerun takes half a second.
     from workbench.recording.rerun.read import read_properties
 
     path = found.path(folder, ".rrd")

@@ -1,9 +1,4 @@
-"""Recordings are read, and mended, in processes of their own, which may do that with their folder and nothing else (`reader`).
-
-What a page shows and what is exported may come from anybody, and it is read by HDF5, Arrow, rerun, ffmpeg and Pillow:
-millions of lines in C, C++ and Rust. So none of them opens a recording in the process that serves the page. Whatever
-ends the process that does, or takes it too long, is a sentence about that one recording.
-"""
+"""Reads and recovers recordings in confined processes."""
 
 from __future__ import annotations
 
@@ -51,15 +46,15 @@ from workbench.recording.writing.publish import RecordingError
 ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0
 PICTURE_SECONDS = 70.0
-"""A film is taken apart when its first frame is looked at."""
+"""A film is decoded when its first frame is read."""
 RECOVERY_SECONDS = 1800.0
 """An hour with four cameras takes some minutes."""
 PICTURE_PATIENCE = 0.2
-"""Seconds that a picture waits for another recording to be opened."""
+"""Seconds that a picture waits while another recording is being opened."""
 MOST_READERS = 4
 LARGEST_THUMBNAIL = 64 << 10
 _AT_ONCE = 8
-"""Rows that are asked for together: the reader goes on while the last ones are put into the table."""
+"""Rows per batch of requests: the reader works on while the last batch goes into the table."""
 _JPEG = b"\xff\xd8\xff"
 T = TypeVar("T")
 
@@ -69,12 +64,12 @@ _shapes = KnownShapes()
 
 
 def start_reading() -> None:
-    """Begin to start what reads recordings, before one is wanted. Returns at once; raises OSError."""
+    """Start the fork server ahead of use. Does not wait; raises OSError."""
     fork_server.start()
 
 
 def stop_reading() -> None:
-    """End all processes that read recordings; who wants one read has them started again."""
+    """End all reader processes; they start again on use."""
     with _lock:
         readers = list(_readers.values())
         _readers.clear()
@@ -84,10 +79,10 @@ def stop_reading() -> None:
 
 
 def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[LibraryEntry]]]:
-    """The recordings in these files of a library's folder, with a thumbnail each. Whatever is wrong is said in a row.
+    """The recordings in these files of a library's folder, each with its thumbnail; problems become rows.
 
     Raises:
-        OSError: no process can be started to read them.
+        OSError: no reader can be started.
     """
     wanted = list(wanted)
     reader = _reader(folder, episodes=False)
@@ -107,16 +102,20 @@ def read_recording(
     shapes: SharedShapes | None = None,
     folder: Path | None = None,
 ) -> Episode:
-    """An episode. Its pictures are read one by one when they are looked at.
+    """An episode; its pictures are read on access.
+
+    Recordings may come from anybody, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++
+    and Rust. So a confined process with limits on memory and time opens them, never the server; if it ends or hangs,
+    only this recording fails.
 
     Args:
-        part: which one of the file or dataset; empty for a recording of ours.
-        shapes: of other recordings, to be shared.
-        folder: below which the process that reads it may read; by default that of the file.
+        part: which one of the file or dataset; empty for a workbench recording.
+        shapes: shapes to share with other recordings.
+        folder: what the process may read; by default the file's folder.
 
     Raises:
         UnreadableRecording: it cannot be read; the message says what is wrong.
-        OSError: its files cannot be got at.
+        OSError: the system refuses its files.
     """
     path = Path(path).absolute()
     folder = folder or (path if kind == "lerobot" else path.parent)
@@ -140,17 +139,17 @@ def read_recording(
 
 
 def find_sources(path: Path) -> list[Source]:
-    """The recordings that a file is or a folder holds. Raises as `read_recording`."""
+    """The recordings in a file or folder. Raises as `read_recording`."""
     return _found(path, trajectories=False)
 
 
 def find_trajectories(path: Path) -> list[str]:
-    """Names of the episodes in an ``.h5`` of ManiSkill's, in the order of their numbers. Raises as `read_recording`."""
+    """Names of the episodes in an ``.h5`` of ManiSkill's, by number. Raises as `read_recording`."""
     return [source.part for source in _found(path, trajectories=True) if source.part is not None]
 
 
 def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
-    """What rerun calls the recording in an ``.rrd``, and the blueprint in it. Raises as `read_recording`."""
+    """Rerun's id and the blueprint of the recording in an ``.rrd``. Raises as `read_recording`."""
     path = Path(path).absolute()
     reader = _reader(path.parent, episodes=True)
     reader.allow(_link_targets([path]))
@@ -159,13 +158,13 @@ def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
 
 
 def recover_confined(folder: Path) -> tuple[Path, ...]:
-    """Make what dead writers left in `folder` episodes; returns the .rrd of each.
+    """Make recordings of the journals that dead writers left in `folder`; returns the .rrd of each.
 
-    A folder that came from elsewhere may bring journals along. So it is done by a process that may write below that folder
-    alone, and has a limit on memory and time; it is started only where something was left.
+    A folder from elsewhere may contain journals. So a process that may only write below that folder does it, with limits
+    on memory and time; it starts only if there are journals.
 
     Raises:
-        RecordingError: files cannot be written, or the folder not read, or it was given up; the journals stay.
+        RecordingError: files cannot be written, the folder cannot be read, or the process failed; the journals stay.
     """
     from workbench.recording.writing.journal import FOLDER  # with Arrow, which a server need not wait for
 
@@ -185,7 +184,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
     finally:
         reader.close()
     if isinstance(answer, Recovered):
-        # Names alone: the process that says them has read what came from elsewhere.
+        # Only names: the process that returned them has read untrusted files.
         return tuple(folder / Path(name).name for name in answer.made)
     why = (
         answer
@@ -196,7 +195,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
 
 
 def recovered_text(paths: Sequence[str]) -> str:
-    """Of what a session that was killed left half written, and this one mended; empty for nothing."""
+    """A message on recovered episodes; empty if there are none."""
     if not paths:
         return ""
     one = len(paths) == 1
@@ -228,12 +227,12 @@ def _reader(folder: Path, episodes: bool) -> Reader:
             _, gone = _readers.popitem(last=False)
         reader = _readers[key]
     if gone is not None:
-        gone.close()  # one that somebody still has pictures of is started again when they ask
+        gone.close()  # starts again when a picture of its episodes is read
     return reader
 
 
 def _link_targets(paths: Iterable[Path]) -> list[Path]:
-    """Where links lead that stand in place of files: out of the folder, perhaps."""
+    """Targets of those paths that are links, which may be outside the folder."""
     return [Path(os.path.realpath(path)) for path in paths if os.path.islink(path)]
 
 
@@ -241,26 +240,26 @@ def _entries(found: Found, answered: Answered | ReaderEnded) -> list[LibraryEntr
     answer = answered.answer if isinstance(answered, Answered) else answered
     if isinstance(answer, RowsRead):
         return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
-    why = "gave something that is no row"
+    why = "gave an invalid row"
     if isinstance(answer, ReadFailed):
         why = answer.message
     elif isinstance(answer, ReaderEnded):
-        # It is read again when it has changed, or by who opens it.
+        # It is read again when it changes or is opened.
         why = f"{answer}, and is left alone until it changes"
-    # Which of them it was, nobody knows any more.
+    # Any of the files may be the cause.
     suffixes = ", ".join(suffix for suffix in found.sizes if suffix != NOTES)
     return [broken(found, f"{Path(found.key).name} ({suffixes}) {why}.")]
 
 
 def _thumbnail(jpeg: bytes | None) -> bytes | None:
-    """It goes to the browser as it is."""
+    """`jpeg` if it may be sent to the browser."""
     return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= LARGEST_THUMBNAIL else None
 
 
 def _request(
     reader: Reader, request: OpenEpisode | FindSources | ReadRerunInfo, kind: type[T], name: str
 ) -> tuple[T, int]:
-    """The answer, and the number of the process that gave it."""
+    """The answer, and the number of the process that answered."""
     try:
         answered = reader.ask(request, OPEN_SECONDS)
     except ReaderEnded as error:
@@ -276,7 +275,7 @@ def _request(
 
 
 class _OpenEpisode:
-    """An episode that is open in a reader for as long as somebody may look at its pictures."""
+    """An episode that is open in a reader while its pictures may be read."""
 
     def __init__(self, reader: Reader, wanted: OpenEpisode, process: int, opened: int, name: str) -> None:
         self._reader, self._wanted, self._name = reader, wanted, name
@@ -292,7 +291,7 @@ class _OpenEpisode:
             try:
                 answer = self._ask(camera, modality, index, encoded).answer
             except ReaderEnded as error:
-                # It would end the next one too, thirty times a second.
+                # It would end every new reader too, thirty times a second.
                 self._failed = OSError(f"{self._name} {error}")
                 raise self._failed from error
         if isinstance(answer, PictureRead):
@@ -305,7 +304,7 @@ class _OpenEpisode:
             try:
                 return self._reader.ask(wanted, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
             except WrongProcess:
-                # Something else has ended the process since.
+                # Another request has ended the process.
                 read, process = _request(self._reader, self._wanted, EpisodeRead, self._name)
                 self._is_open_in(process, read.opened)
         raise ReaderEnded("ended the process that reads recordings")
@@ -315,7 +314,7 @@ class _OpenEpisode:
         weakref.finalize(self, self._reader.forget, process, opened).atexit = False
 
 
-# --- Which recordings are meant by naming files, folders or rows of the library; and each of them read ---
+# --- recordings by path ------------------------------------------------------------------------------
 
 
 def read_source(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
@@ -324,11 +323,11 @@ def read_source(source: Source, shapes: SharedShapes | None = None, folder: Path
 
 
 def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
-    """The recordings that these files are, or that lie in these folders and the folders below them, by name, each once.
+    """The recordings in these files and folders, with the folders below them, each once.
 
     Raises:
-        FileNotFoundError: there is nothing at one of them.
-        UnreadableRecording: a file is, or all folders together hold, no recording; the message says what is looked for.
+        FileNotFoundError: a path does not exist.
+        UnreadableRecording: a file is not a recording, or the folders hold none; the message says what is looked for.
     """
     found: dict[str, Source] = {}
     for path in paths:

@@ -1,4 +1,4 @@
-"""What a reader is asked for, and what it answers; and what the nursery that makes readers is asked for."""
+"""Messages to readers and to the fork server, and their answers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from workbench.recording.episode.row import LibraryEntry, Source, SourceKind
 
 
 class NewReader(msgspec.Struct, tag=True):
-    """Fork one that reads below these paths; its socket comes along. Answered by its process id."""
+    """Fork a reader for these paths; sent with its socket. Answered by its process id."""
 
     paths: list[Path]
     episodes: bool
-    """It will read whole episodes: import what that needs at once."""
+    """It will read whole episodes: import their readers at once."""
     writes: Path | None = None
-    """Below which it may write too."""
+    """Folder that it may write to."""
 
 
 class Ended(msgspec.Struct, tag=True):
-    """That reader was ended, or has ended. Answered by its exit status as `os.waitstatus_to_exitcode` gives it."""
+    """A reader was killed or has ended. Answered by its exit code (`os.waitstatus_to_exitcode`)."""
 
     pid: int
 
@@ -36,54 +36,54 @@ class ReadRows(msgspec.Struct, frozen=True):
 
     folder: Path
     key: bytes
-    """As the system has it, which need not be text; with `sizes` and `times` a `library_scan.Found`."""
+    """Bytes, since it may be invalid UTF-8; with `sizes` and `times` a `scan.Found`."""
     sizes: dict[str, int]
     times: dict[str, int]
 
 
 class OpenEpisode(msgspec.Struct, frozen=True):
-    """An episode; answered by `EpisodeRead`. Its files stay open until `CloseEpisodes`."""
+    """Open an episode; answered by `EpisodeRead`. Its files stay open until `CloseEpisodes`."""
 
     kind: SourceKind
     path: Path
     part: str
     sharing: int
-    """Episodes that are asked for with the same number share their shapes: each is sent once."""
+    """Episodes with the same number share shapes: each shape is sent once."""
 
 
 class ReadPicture(msgspec.Struct, frozen=True):
-    """A picture of an episode that is open; answered by `PictureRead`."""
+    """A picture of an open episode; answered by `PictureRead`."""
 
     opened: int
     camera: int
     modality: Modality
     index: int
     encoded: bool
-    """As it is kept, not decoded."""
+    """Return it encoded."""
 
 
 class CloseEpisodes(msgspec.Struct, frozen=True):
-    """Episodes that are of no use any more. Not answered."""
+    """Close episodes. Not answered."""
 
     opened: list[int]
 
 
 class FindSources(msgspec.Struct, frozen=True):
-    """Which recordings a file is, or a folder holds; answered by `SourcesFound`."""
+    """The recordings in a file or folder; answered by `SourcesFound`."""
 
     path: Path
     trajectories: bool = False
-    """It is an ``.h5`` and is read as ManiSkill's, whatever lies beside it."""
+    """Read the ``.h5`` as ManiSkill's, without looking at its ``.json``."""
 
 
 class ReadRerunInfo(msgspec.Struct, frozen=True):
-    """What rerun's viewer is told of an ``.rrd``; answered by `ToldRerun`."""
+    """Id and blueprint of an ``.rrd``, for rerun's viewer; answered by `RerunInfo`."""
 
     path: Path
 
 
 class Recover(msgspec.Struct, frozen=True):
-    """Make episodes of what dead writers left in a folder (`recover`); answered by `Recovered`."""
+    """Run `writing.finish.recover` on a folder; answered by `Recovered`."""
 
     folder: Path
 
@@ -100,11 +100,11 @@ class CameraRead(msgspec.Struct, frozen=True):
     frame: NDArray
     pose: NDArray
     pictures: dict[Modality, int]
-    """How many of each there are."""
+    """Number of pictures by modality."""
 
 
 class ShapeRead(msgspec.Struct, frozen=True):
-    """A mesh and a material that were not sent before."""
+    """A mesh and a material, sent once."""
 
     number: int
     mesh: Mesh
@@ -120,9 +120,9 @@ class VisualRead(msgspec.Struct, frozen=True):
 class EpisodeRead(msgspec.Struct, frozen=True):
     opened: int
     source_path: str | None
-    """Where the task's own file may be, as the recording says."""
+    """Recorded path of the task's file."""
     episode: Episode
-    """Without its cameras, and without the visuals of its scene."""
+    """Without cameras, and without the visuals of its scene."""
     cameras: list[CameraRead]
     shapes: list[ShapeRead]
     visuals: list[VisualRead]
@@ -139,7 +139,7 @@ class SourcesFound(msgspec.Struct, frozen=True):
 
 class RerunInfo(msgspec.Struct, frozen=True):
     store: str | None
-    """What it calls the recording."""
+    """Rerun's id of the recording."""
     blueprint: bytes | None
 
 
@@ -149,10 +149,10 @@ class Recovered(msgspec.Struct, frozen=True):
 
 
 class ReadFailed(msgspec.Struct, frozen=True):
-    """It cannot be had."""
+    """The request failed."""
 
     why: Literal["unreadable", "system", "gone"]
-    """The content is broken; the file cannot be got at; that episode is not open (any more)."""
+    """The content is broken; the system refuses the file; the episode is not open."""
     message: str
 
 

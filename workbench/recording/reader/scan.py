@@ -1,13 +1,4 @@
-"""Which recordings lie below a folder, by names, sizes and times alone: nothing is opened.
-
-A recording is a handful of files with one name and different endings, so files are put together by that name. By sizes
-and times of all of them the index knows whether it has read them as they are.
-
-A folder's own time changes when a name in it comes, goes or is given to another file, which is how every recording of
-ours is written. So between two full looks it is enough to ask a few folders for their time (`Scan.is_unchanged`).
-That time moves in ticks, and a file that came within the tick of the last look would never be seen: as long as a
-folder's time is this fresh, it is looked into again.
-"""
+"""Lists the recordings below a folder by names, sizes and times, without opening files."""
 
 from __future__ import annotations
 
@@ -19,21 +10,21 @@ from pathlib import Path
 from workbench.recording.episode.row import Facts, LibraryEntry, clean_text
 
 SUFFIXES = (".json", ".h5", ".rrd")
-"""In the order in which a recording is opened by them."""
+"""In the order of preference for opening a recording."""
 NOTES = ".notes"
-"""Ending of the file with tags and notes of recordings that are not ours to write into: JSON, but a ``.json`` would be
-taken for a recording's by whoever looks for those."""
+"""Suffix of the JSON file with tags and notes of other programs' recordings; a ``.json`` would be taken for a
+recording's."""
 DATASET_KEY = ["meta", "info"]
 """How the key of a LeRobot dataset ends."""
 SETTLES = 3.0
-"""Seconds in which a folder may change again within one tick of its time, and files of one recording come one by one."""
+"""Seconds in which a folder may change again within one tick of its time, or a recording get its other files."""
 MOST_ENTRIES = 500_000
-"""Names looked at: somebody will give a home folder for the library."""
+"""Names that are listed: the folder may be a home folder."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """The files of one name; another when any of them was written to, came or went."""
+    """The files of one name; unequal after any of them was written, added or removed."""
 
     key: str
     """Path of the name below the library's folder, with ``/``."""
@@ -44,7 +35,7 @@ class Found:
 
     @property
     def newest(self) -> int:
-        """When the recording was last written to, in nanoseconds. Notes are not the recording."""
+        """Time of the last change, in nanoseconds, notes excluded."""
         return max(at for suffix, at in self.times.items() if suffix != NOTES)
 
     def path(self, folder: Path, suffix: str) -> Path:
@@ -55,29 +46,36 @@ class Found:
 
 
 def broken(found: Found, problem: str) -> LibraryEntry:
-    """The row of files of which nothing else is known."""
+    """The row of files that cannot be read."""
     kind = "rrd only" if found.sizes.keys() <= {".rrd", NOTES} else "maniskill"
     return Facts(kind, written=found.newest / 1e9, problem=clean_text(problem, 500)), None
 
 
 def key_of(path: str) -> str:
-    """Of a file, by its path below the library's folder."""
+    """Key of a file from its path below the library's folder."""
     return os.path.splitext(path)[0]
 
 
 @dataclass(frozen=True)
 class Scan:
+    """Result of `scan_folder`.
+
+    A folder's time changes when a name in it is added, removed or replaced, which is how recordings are written. So
+    `is_unchanged` only checks the times of folders. These advance in ticks, and a file within the tick of the last scan
+    would be missed: a folder with a recent time counts as changed (`fresh`).
+    """
+
     found: dict[str, Found] = field(default_factory=dict)
     """By key."""
     folders: dict[str, int] = field(default_factory=dict)
-    """Every folder that was looked into, and its time in nanoseconds."""
+    """Every scanned folder, and its time in nanoseconds."""
     fresh: bool = False
-    """Whether something was written so lately that it must be looked at again."""
+    """Something was written so recently that it must be scanned again."""
     problem: str | None = None
-    """A sentence, where not everything could be looked at."""
+    """A sentence, if the scan is incomplete."""
 
     def is_unchanged(self) -> bool:
-        """Whether nothing came or went since; cheap."""
+        """Whether no file was added or removed since; cheap."""
         if self.fresh or self.problem is not None:
             return False
         try:
@@ -87,8 +85,8 @@ class Scan:
 
 
 def scan_folder(folder: Path) -> Scan:
-    """Look for recordings in `folder` and the folders below it. Names that begin with a dot are passed over, and so
-    are links to folders, which may lead round in a circle."""
+    """The recordings in `folder` and the folders below it, without names that begin with a dot and without links to
+    folders, which may form a cycle."""
     names: dict[str, dict[str, os.stat_result]] = {}
     folders: dict[str, int] = {}
     problem: str | None = None
@@ -97,7 +95,7 @@ def scan_folder(folder: Path) -> Scan:
     while pending:
         path, below = pending.pop()
         try:
-            # Its time first: what comes while its names are read makes it differ, not look the same.
+            # Its time first, so that a file added during the listing counts as a change.
             at = os.stat(path).st_mtime_ns
             with os.scandir(path) as listed:
                 folders[path] = at
@@ -123,7 +121,7 @@ def scan_folder(folder: Path) -> Scan:
         if group is None:
             continue
         if ".json" not in group.sizes and ".h5" in group.sizes and now - group.newest < SETTLES * 1e9:
-            waits = True  # being given its names just now
+            waits = True  # its .json may be published next
             continue
         found[key] = group
     fresh = waits or any(now - at < SETTLES * 1e9 for at in folders.values())
@@ -135,13 +133,13 @@ def _add(names: dict[str, dict[str, os.stat_result]], below: str, entry: os.DirE
     try:
         found = entry.stat()
     except OSError:
-        return  # gone since, or a link to nowhere: not a recording
+        return  # removed meanwhile, or a dangling link
     names.setdefault(below + entry.name[: -len(suffix)], {})[suffix] = found
 
 
 def _group(key: str, stats: dict[str, os.stat_result]) -> Found | None:
     if not any(suffix in stats for suffix in SUFFIXES):
-        return None  # notes of files that were taken away
+        return None  # notes of removed files
     order = [suffix for suffix in (*SUFFIXES, NOTES) if suffix in stats]
     return Found(
         key,
@@ -151,5 +149,5 @@ def _group(key: str, stats: dict[str, os.stat_result]) -> Found | None:
 
 
 def _printable(path: str | Path) -> str:
-    """A path as text that can be sent to a page."""
+    """A path as valid UTF-8, for the page."""
     return os.fsencode(path).decode(errors="replace")
