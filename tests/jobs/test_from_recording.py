@@ -20,7 +20,7 @@ from workbench.jobs.from_recording import (
     options_of,
     recorded_source,
     reference_of,
-    why_not_into,
+    why_not_enter,
 )
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
@@ -233,5 +233,5 @@ def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
 def test_another_task_than_the_open_one_is_named(live: Session) -> None:
     task = live.view().task
     assert task is not None
-    assert why_not_into(task, info(None)) == ""
-    assert "PickCube-v1" in why_not_into(task, info(None, "PickCube-v1"))
+    assert why_not_enter(task, info(None)) == ""
+    assert "PickCube-v1" in why_not_enter(task, info(None, "PickCube-v1"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.drive.episodes import made, write
-from workbench.jobs.actions import read_given
+from workbench.jobs.actions import read_actions
 
 
 def npy(shape: tuple[int, ...], content: bytes, dtype: str = "<f8") -> bytes:
@@ -25,8 +25,8 @@ def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: str) -> None:
     one = np.asarray(np.arange(12.0).reshape(4, 3), order=order)  # type: ignore[call-overload]
     np.save(tmp_path / "a.npy", one)
     np.savez_compressed(tmp_path / "b.npz", one, 2 * one)
-    assert read_given(tmp_path / "a.npy")[0][0].action.tolist() == one.tolist()
-    assert [run.action.tolist() for run in read_given(tmp_path / "b.npz")[0]] == [
+    assert read_actions(tmp_path / "a.npy")[0][0].action.tolist() == one.tolist()
+    assert [run.action.tolist() for run in read_actions(tmp_path / "b.npz")[0]] == [
         one.tolist(),
         (2 * one).tolist(),
     ]
@@ -35,7 +35,7 @@ def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: str) -> None:
 def test_an_episode_of_each_array_begins_where_the_env_likes(tmp_path: Path) -> None:
     three = np.arange(24.0).reshape(2, 4, 3)
     np.save(tmp_path / "a.npy", three)
-    runs, asked = read_given(tmp_path / "a.npy")
+    runs, asked = read_actions(tmp_path / "a.npy")
     assert [run.name for run in runs] == ["file a.npy, its array 0", "file a.npy, its array 1"]
     assert [run.action.tolist() for run in runs] == three.tolist() and asked == {}
     assert [(run.seed, dict(run.env_states)) for run in runs] == 2 * [(-1, {})]
@@ -45,20 +45,20 @@ def test_an_episode_of_each_array_begins_where_the_env_likes(tmp_path: Path) -> 
 def test_what_are_no_actions_is_refused_by_its_shape_and_kind(tmp_path: Path, array: np.ndarray) -> None:
     np.savez(tmp_path / "a.npz", np.zeros((2, 3)), array)
     with pytest.raises(ValueError, match=r"actions are numbers of shape \(steps, dimensions\)"):
-        read_given(tmp_path / "a.npz")
+        read_actions(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_no_robot_can_do_is_refused(tmp_path: Path, value: float) -> None:
     np.save(tmp_path / "a.npy", np.array([[0.0, value]]))
     with pytest.raises(ValueError, match="NaN or infinite"):
-        read_given(tmp_path / "a.npy")
+        read_actions(tmp_path / "a.npy")
 
 
 def test_an_archive_without_an_array_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz")
     with pytest.raises(ValueError, match="holds no array"):
-        read_given(tmp_path / "a.npz")
+        read_actions(tmp_path / "a.npz")
 
 
 def test_a_recording_is_done_again_from_its_seed_and_one_without_actions_is_refused(
@@ -66,9 +66,9 @@ def test_a_recording_is_done_again_from_its_seed_and_one_without_actions_is_refu
 ) -> None:
     h5py.File(tmp_path / "empty.h5", "w").close()
     with pytest.raises(ValueError, match="holds no trajectory with actions"):
-        read_given(tmp_path / "empty.h5")
+        read_actions(tmp_path / "empty.h5")
     recording = write(tmp_path, made(4, seed=8), pictures=False)
-    ((run,), asked) = read_given(recording.with_suffix(".h5"))
+    ((run,), asked) = read_actions(recording.with_suffix(".h5"))
     assert run.seed == 8 and run.action.tolist() == [[0.5, 0.5]] * 4
     assert asked == {"control_mode": "pd_joint_delta_pos"}
 
@@ -88,7 +88,7 @@ def test_what_claims_more_than_it_has_is_refused_in_a_sentence(
 ) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=says):
-        read_given(tmp_path / name)
+        read_actions(tmp_path / name)
 
 
 def test_an_archive_that_unpacks_to_more_than_any_is_refused(
@@ -97,7 +97,7 @@ def test_an_archive_that_unpacks_to_more_than_any_is_refused(
     monkeypatch.setattr("workbench.jobs.actions.MOST_BYTES", 2**20)
     np.savez_compressed(tmp_path / "a.npz", *[np.zeros((2**13, 8))] * 3)
     with pytest.raises(ValueError, match="larger than any file of actions"):
-        read_given(tmp_path / "a.npz")
+        read_actions(tmp_path / "a.npz")
 
 
 def test_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
@@ -105,4 +105,4 @@ def test_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
     (tmp_path / "b.npz").symlink_to("/dev/zero")
     for name in ("a.npy", "b.npz"):
         with pytest.raises(FileNotFoundError):
-            read_given(tmp_path / name)
+            read_actions(tmp_path / name)

@@ -20,7 +20,7 @@ from tests.session.recorded_runs import opened
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.from_recording import run_of
-from workbench.jobs.replay import arrive
+from workbench.jobs.replay import replay_to
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
@@ -145,7 +145,7 @@ def test_what_is_not_per_env_is_no_difference_when_it_is_rescored(recordings: Pa
 def test_a_state_is_gone_into(recordings: Path, file: Path) -> None:
     task = opened(str(file), 2, reward_mode="dense", obs_mode="state")
     run = run_of(read_episode(sorted(recordings.glob("*.json"))[1]), 3)
-    step, replay_result = arrive(task, run, 3, [1])
+    step, replay_result = replay_to(task, run, 3, [1])
     assert (replay_result.metres, replay_result.missed) == (0, {})
     assert "progress" in step.others
     task.env.close()

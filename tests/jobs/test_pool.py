@@ -14,7 +14,7 @@ from tests.drive.waiting import until
 from tests.jobs import work
 from tests.jobs.work import PROBLEM, Setup, Squared, square
 from workbench.authoring.problem import TaskError
-from workbench.jobs.pool import Deal, Executor, Here, PoolError, Processes, Share, Work, shares
+from workbench.jobs.pool import Deal, Executor, PoolError, Processes, Share, ThisProcess, Work, shares
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -36,7 +36,7 @@ class Run:
         run: Callable[[Setup, Share], None] = square,
     ) -> None:
         self.results: dict[int, Squared] = {}
-        self.news: list[str] = []
+        self.updates: list[str] = []
         self.steps = 0
         self._on_result = on_result
         self.deal: Deal[Squared, str | int] = Deal(numbers, self.over, self.hear, stop)
@@ -47,11 +47,11 @@ class Run:
         self.results[number] = result
         self._on_result(self, number)
 
-    def hear(self, news: str | int) -> None:
-        if isinstance(news, int):
-            self.steps += news
+    def hear(self, update: str | int) -> None:
+        if isinstance(update, int):
+            self.steps += update
         else:
-            self.news.append(news)
+            self.updates.append(update)
 
     def by(self, executor: Executor) -> Run:
         executor.run(self.work, self.deal)
@@ -65,7 +65,7 @@ class Run:
 def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
     processes: int, chunk: int, tmp_path: Path
 ) -> None:
-    executor = Processes(chunk) if processes else Here()
+    executor = Processes(chunk) if processes else ThisProcess()
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     folder.mkdir()
     numbers = [*range(10), 12, 20]
@@ -73,7 +73,7 @@ def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
     assert sorted(done.results) == numbers and done.steps == len(numbers)
     assert done.results[3] == Squared(3, 9, folder / "3", done.results[3].pid)
     # Each keeps what it has opened.
-    assert len(done.news) == max(1, processes)
+    assert len(done.updates) == max(1, processes)
     pids = {result.pid for result in done.results.values()}
     assert pids == {os.getpid()} if processes == 0 else os.getpid() not in pids
     assert not any(map(psutil.pid_exists, pids - {os.getpid()}))
@@ -83,14 +83,14 @@ def test_cores_and_envs_are_shared_out(tmp_path: Path) -> None:
     cores = sorted(os.sched_getaffinity(0))
     given = [
         line.rpartition(" ")[2].split(",")
-        for line in Run([Setup(folder=tmp_path)] * 2, range(4)).by(Processes()).news
+        for line in Run([Setup(folder=tmp_path)] * 2, range(4)).by(Processes()).updates
     ]
     together = sorted(int(core) for one in given for core in one)
     assert together == (cores if len(cores) > 1 else 2 * cores)
     assert [shares(5, 2), shares(2, 3), shares(6, 3)] == [[3, 2], [1, 1], [2, 2, 2]]
 
 
-@pytest.mark.parametrize("executor", [Here(), Processes(), Processes(3)])
+@pytest.mark.parametrize("executor", [ThisProcess(), Processes(), Processes(3)])
 def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
     executor: Executor, tmp_path: Path
 ) -> None:
@@ -98,7 +98,7 @@ def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
         if number == 5:
             run.deal.lower(8)
 
-    setups = [Setup(folder=tmp_path)] if isinstance(executor, Here) else [Setup(folder=tmp_path)] * 2
+    setups = [Setup(folder=tmp_path)] if isinstance(executor, ThisProcess) else [Setup(folder=tmp_path)] * 2
     done = Run(setups, range(10**6), on_result=enough).by(executor)
     assert set(range(8)) <= set(done.results)
     # One that was begun meanwhile may come.
@@ -115,7 +115,7 @@ def test_an_item_that_waits_for_others_is_dropped_when_it_is_not_wanted(tmp_path
     assert set(range(4)) <= set(done.results)
 
 
-@pytest.mark.parametrize("executor", [Here(), Processes(2)])
+@pytest.mark.parametrize("executor", [ThisProcess(), Processes(2)])
 def test_what_was_stopped_is_resumed_with_what_is_left(executor: Executor, tmp_path: Path) -> None:
     asked = False
 
@@ -123,7 +123,7 @@ def test_what_was_stopped_is_resumed_with_what_is_left(executor: Executor, tmp_p
         nonlocal asked
         asked = len(run.results) >= 5
 
-    setups = [Setup(folder=tmp_path)] if isinstance(executor, Here) else [Setup(folder=tmp_path)] * 2
+    setups = [Setup(folder=tmp_path)] if isinstance(executor, ThisProcess) else [Setup(folder=tmp_path)] * 2
     first = Run(setups, range(400), stop=lambda: asked, on_result=now).by(executor)
     assert 5 <= len(first.results) < 400
     rest = Run(setups, [number for number in range(400) if number not in first.results]).by(executor)
@@ -187,7 +187,7 @@ def test_who_does_not_want_to_wait_ends_processes_that_hang(tmp_path: Path) -> N
     run = Run([Setup("hangs", 3, folder=tmp_path)] * 2, range(10**6), stop=twice)
     with pytest.raises(KeyboardInterrupt):
         run.by(Processes())
-    pids = {int(line.split()[2]) for line in run.news}
+    pids = {int(line.split()[2]) for line in run.updates}
     assert len(pids) >= 1
     until(lambda: not any(map(psutil.pid_exists, pids)), "their end")
 

@@ -132,9 +132,9 @@ class InAnyOrder:
             if self.good[number] or what.successes is None:
                 for suffix in (".rrd", ".h5", ".json"):
                     path.with_suffix(suffix).touch()
-                deal.tell(number, Written(number, path, number, 1, 0.0, self.good[number]))
+                deal.send_result(number, Written(number, path, number, 1, 0.0, self.good[number]))
             else:
-                deal.tell(number, None)
+                deal.send_result(number, None)
 
 
 @given(
@@ -227,7 +227,7 @@ def test_demonstrations_are_replayed_from_their_own_seeds(
     )
     done = record(what)
     (replayed,) = read_all(done)
-    assert done.put_right == 0
+    assert done.start_corrected == 0
     assert_same(replayed, read_all(recorded)[1])
     assert replayed.info.acted_by == ((0, f"file {demonstration.name}, traj_0"),)
 

@@ -15,7 +15,7 @@ from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_state import read_states, state_distance, state_mismatches
 from workbench.jobs.open_task import OpenedTask
-from workbench.jobs.replay import arrive
+from workbench.jobs.replay import replay_to
 
 pytestmark = pytest.mark.thorough
 
@@ -50,7 +50,7 @@ def test_what_follows_a_state_that_was_gone_into_is_what_was_recorded_to_the_las
     task: OpenedTask, recorded: Recorded, state: int
 ) -> None:
     run, env = recorded.run(1), 1
-    step, replay_result = arrive(task, run, state, [env])
+    step, replay_result = replay_to(task, run, state, [env])
     assert (replay_result.way, replay_result.metres, replay_result.radians) == ("re-simulated", 0, 0)
     assert replay_result.missed == {} and not replay_result.start_differs
     assert step.elapsed_steps[env] == state and task.env.episode_seeds[env] == 7
@@ -65,7 +65,7 @@ def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, r
         rng, states = np.random.default_rng(3), []
         record(task, 25, [1, 2, 3], reaching(25, N))
         if disturb:
-            arrive(task, recorded.run(1), 20, [1])
+            replay_to(task, recorded.run(1), 20, [1])
         for _ in range(steps):
             task.env.step(rng.uniform(-0.4, 0.4, (N, 8)).astype(np.float32))
             states.append(read_states(task.env.env))
@@ -79,7 +79,7 @@ def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, r
 
 
 def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recorded: Recorded) -> None:
-    _, replay_result = arrive(task, recorded.run(2), 30, range(N))
+    _, replay_result = replay_to(task, recorded.run(2), 30, range(N))
     assert replay_result.metres == 0
     for t in range(30, STEPS):
         action = np.broadcast_to(recorded.steps[t + 1].action[2], (N, 8)).astype(np.float32)
@@ -93,7 +93,7 @@ def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recor
 def test_an_episode_of_a_reset_of_all_envs_begins_where_it_began(task: OpenedTask) -> None:
     # Its seed alone does not say: numbers were drawn for all three at once.
     recorded = record(task, STEPS, None, reaching(STEPS, N))
-    _, replay_result = arrive(task, recorded.run(2), 20, [0])
+    _, replay_result = replay_to(task, recorded.run(2), 20, [0])
     assert replay_result.start_differs and replay_result.metres == 0 and replay_result.way == "re-simulated"
 
 
@@ -101,7 +101,7 @@ def test_states_that_part_from_the_record_are_put_back_on_it(task: OpenedTask, r
     run = recorded.run(1)
     states = {name: rows.copy() for name, rows in run.env_states.items()}
     states["actors/cube"][12:, 0] += 0.05  # as if somebody had pushed it
-    step, replay_result = arrive(task, replace(run, env_states=states), 20, [1])
+    step, replay_result = replay_to(task, replace(run, env_states=states), 20, [1])
     assert replay_result.way == "corrected" and 1 <= replay_result.corrected <= 8
     assert replay_result.metres is not None and replay_result.metres < 1e-4
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
@@ -112,7 +112,7 @@ def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
     task: OpenedTask, recorded: Recorded
 ) -> None:
     run = recorded.run(1)
-    step, replay_result = arrive(task, replace(run, action=run.action[:, :5]), 25, [1])
+    step, replay_result = replay_to(task, replace(run, action=run.action[:, :5]), 25, [1])
     assert replay_result.way == "put there" and "5 numbers" in replay_result.missed["the way there"]
     assert replay_result.metres is not None and replay_result.metres < 1e-6
     assert step.elapsed_steps[1] == 25
@@ -137,9 +137,9 @@ def test_what_has_another_name_or_shape_is_told(task: OpenedTask, recorded: Reco
 
 def test_an_env_or_a_state_that_is_not_there_is_refused(task: OpenedTask, recorded: Recorded) -> None:
     with pytest.raises(IndexError, match="states 0 to 44"):
-        arrive(task, recorded.run(0), 45, [0])
+        replay_to(task, recorded.run(0), 45, [0])
     with pytest.raises(IndexError, match="out of range"):
-        arrive(task, recorded.run(0), 1, [3])
+        replay_to(task, recorded.run(0), 1, [3])
 
 
 def test_a_seed_begins_the_same_episode_in_every_env_of_a_batch(task: OpenedTask) -> None:
@@ -169,6 +169,6 @@ def test_what_the_task_raises_on_the_way_is_its_own_line(tmp_path: Path) -> None
     )
     task = opened(str(file), 2)
     with pytest.raises(TaskError) as raised:
-        arrive(task, run, 6, [0])
+        replay_to(task, run, 6, [0])
     assert raised.value.problem.file == str(file) and "ZeroDivisionError" in raised.value.problem.message
     task.env.close()

@@ -24,10 +24,10 @@ from workbench.cli.main import main
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.share import export_in_terminal
 from workbench.core.capture.recorded_state import read_states, state_distance
-from workbench.jobs.actions import read_given
+from workbench.jobs.actions import read_actions
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.record import RecordOptions, record
-from workbench.jobs.replay import arrive
+from workbench.jobs.replay import replay_to
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
@@ -100,7 +100,7 @@ def test_no_recording_is_opened_in_this_process(
     for module in ("maniskill.read", "reader.read_episode"):
         monkeypatch.setattr(f"workbench.recording.{module}.open_h5", refuse)
     assert len(rescore_all(RescoreOptions((foreign, author / "recordings")))[0]) == 5
-    assert [run.length for run in read_given(foreign)[0]] == [STEPS, STEPS]
+    assert [run.length for run in read_actions(foreign)[0]] == [STEPS, STEPS]
 
 
 def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:
@@ -149,7 +149,7 @@ def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: P
 def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
     run = run_of(read_maniskill(foreign, "traj_1"))
     task = opened("PickCube-v1", 2, reward_mode="dense")
-    step, replay_result = arrive(task, run, 8, [1])
+    step, replay_result = replay_to(task, run, 8, [1])
     assert (
         replay_result.way == "re-simulated"
         and replay_result.metres is not None
@@ -165,7 +165,7 @@ def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
     run = run_of(read_episode(sorted((author / "recordings").glob("*.json"))[2]))
     task = opened(str(author / "push_cube.py"), 2)
     for state in (0, 5, STEPS):
-        _, replay_result = arrive(task, run, state, [0])
+        _, replay_result = replay_to(task, run, state, [0])
         assert (replay_result.way, replay_result.metres, replay_result.missed) == ("re-simulated", 0, {})
     task.env.close()
 

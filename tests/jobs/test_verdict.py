@@ -13,10 +13,10 @@ from workbench.jobs.verdict import (
     DOUBTFUL_RADIANS,
     Scores,
     Verdict,
+    by_change,
     compare,
     gap,
-    in_order,
-    single_numbers,
+    scalar_entries,
 )
 from workbench.session.rescore import verdict_text
 
@@ -185,9 +185,9 @@ def test_what_changed_most_comes_first_and_what_was_not_judged_last() -> None:
         Verdict("more", first_difference=1, returns=(1.0, -9.0)),
     ]
     order = ["both", "succeeds", "fails", "lost", "more", "less", "same", "skipped"]
-    assert [verdict.of for verdict in in_order(given)] == order
+    assert [verdict.of for verdict in by_change(given)] == order
     never = replace(given[3], returns=(float("nan"), float("nan")))
-    assert [verdict.of for verdict in in_order([never, given[2]])] == ["less", "lost"]
+    assert [verdict.of for verdict in by_change([never, given[2]])] == ["less", "lost"]
 
 
 def test_entries_of_one_number_an_env_are_compared_and_no_others() -> None:
@@ -198,5 +198,5 @@ def test_entries_of_one_number_an_env_are_compared_and_no_others() -> None:
         "odd": np.array(["a", "b"]),
         "reward": np.array([1.0, 2.0]),
     }
-    found = single_numbers(evaluate)
+    found = scalar_entries(evaluate)
     assert list(found) == ["flag", "column", "evaluate/reward"] and found["column"].tolist() == [1, 2]

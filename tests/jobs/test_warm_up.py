@@ -13,10 +13,10 @@ from workbench.jobs.task import TaskOptions
 def test_it_draws_where_the_task_does(kwargs: dict[str, object], pictures: int) -> None:
     asked: list[bool] = []
 
-    def goes_on() -> bool:
+    def keep_going() -> bool:
         """Asked before each picture; one question is enough to know."""
         asked.append(True)
         return False
 
-    warm_up(TaskOptions(1, "cpu", 0, {"obs_mode": "rgb", "of_the_task": 3} | kwargs), goes_on)
+    warm_up(TaskOptions(1, "cpu", 0, {"obs_mode": "rgb", "of_the_task": 3} | kwargs), keep_going)
     assert len(asked) == pictures

@@ -35,7 +35,7 @@ def square(setup: Setup, share: Share) -> None:
     """Two items at a time, as an env that has two places."""
     if setup.how == "cannot be loaded":
         raise TaskError(PROBLEM)
-    share.say(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
+    share.send_update(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
     running: list[int] = []
     while True:
         running = [number for number in running if number < share.limit()]
@@ -47,8 +47,8 @@ def square(setup: Setup, share: Share) -> None:
         number = running.pop(0)
         if number == setup.at:
             go_wrong(setup, share)
-        share.say(1)
-        share.tell(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
+        share.send_update(1)
+        share.send_result(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
 
 
 def go_wrong(setup: Setup, share: Share) -> None:
@@ -69,11 +69,11 @@ def go_wrong(setup: Setup, share: Share) -> None:
     elif setup.how == "endless":
         os.write(int(sys.argv[2]), b"\x7f\xff\xff\xff")
     elif setup.how == "another type":
-        share.tell(setup.at, "a text")
+        share.send_result(setup.at, "a text")
     elif setup.how == "no path":
-        share.tell(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
+        share.send_result(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
     elif setup.how == "another's":
-        share.tell(10**6, Squared(0, 0, Path(), 0))
+        share.send_result(10**6, Squared(0, 0, Path(), 0))
     elif setup.how in ("hangs", "half a message"):
         if setup.how != "hangs":
             os.write(int(sys.argv[2]), b"\x00\x00\x00\x10hel")

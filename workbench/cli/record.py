@@ -108,8 +108,8 @@ def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
     kept = len(recorded.written)
     if requested.successes is not None:
         print_text(f"{kept} of {recorded.tried} episodes succeeded and were kept.")
-    if recorded.put_right:
-        count = _episodes(recorded.put_right)
+    if recorded.start_corrected:
+        count = _episodes(recorded.start_corrected)
         print_text(
             f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
         )

@@ -1,15 +1,4 @@
-"""What the envs do next: the source of the actions, and the random numbers, of a page and of a recording.
-
-The page draws its random actions and the seeds of new episodes from one generator, for the whole batch at once, so that
-a reset with the session's seed repeats everything that follows it; what env 3 does hangs on how many envs there are. A
-recording is to hold the same episodes on any number of envs and processes. So there each episode draws from a generator
-of its own, begun with its seed; and where actions are given by a file, each has its place in its own.
-
-A file of actions is a program for the robot, so it is done to its end: an episode of it does not stop at success or at
-the time limit, as ManiSkill's ``replay_trajectory`` does not. A demonstration also says how its episode began (its
-seed) and how it went (its env states), which is how a replay is put right where the same actions lead elsewhere:
-another machine, another version, a batch that was seeded as one on a GPU.
-"""
+"""Chooses actions: random, zero, hold, sliders, a policy, or a file."""
 
 from __future__ import annotations
 
@@ -30,54 +19,58 @@ from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env import actions
 from workbench.core.env.task_env import TaskEnv
 from workbench.jobs.from_recording import run_of
-from workbench.jobs.policy import Policy, load_policy, problem_of
+from workbench.jobs.policy import Policy, load_policy, policy_problem
 from workbench.jobs.task import ActionSource
 from workbench.machine.files import open_regular_file
 from workbench.machine.processes.current_folder import CurrentFolder
 from workbench.recording.reader.reading import find_trajectories, read_recording
 
 
-class Acting:
-    """Chooses the action of every control step."""
+class ActionChooser:
+    """Chooses the action of every control step for the page's batch.
+
+    Random actions and the seeds of new episodes come from one generator for the whole batch, so that a reset with the
+    session's seed repeats everything after it. What env 3 does then depends on the number of envs.
+    """
 
     def __init__(self, folder: CurrentFolder) -> None:
         """
         Args:
-            folder: from which a relative policy is meant.
+            folder: relative policies are found from here.
         """
         self._folder = folder
         self._source: ActionSource = "random"
         self._policy: Policy | None = None
         self._policy_name = ""
-        self._beside: Path | None = None
+        self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
         self.sliders: tuple[float, ...] = ()
-        """(A,) what every env is given while the source is ``sliders``; another length is no action."""
+        """(A,) the action of every env while the source is ``sliders``; with another length the envs hold still."""
 
     @property
     def name(self) -> str:
-        """What chooses, as a recording says it."""
+        """The source's name in a recording."""
         return {"hold": "hold still", "policy": f"policy {self._policy_name}"}.get(self._source, self._source)
 
     def seed(self, seed: int) -> None:
-        """Begin the random numbers anew."""
+        """Restart the random numbers."""
         self._rng = np.random.default_rng(seed)
 
     def fresh_seeds(self, count: int) -> list[int]:
-        # Each episode has a seed of its own, or a recording of it could not say how to start it again.
+        # A seed for each episode, or its recording could not say how to start it again.
         return [int(seed) for seed in self._rng.integers(2**31, size=count)]
 
-    def use(self, source: ActionSource, policy: str | None, beside: Path | None = None) -> None:
-        """Take the actions from there.
+    def use(self, source: ActionSource, policy: str | None, task_folder: Path | None = None) -> None:
+        """Set the source of the actions.
 
         Args:
-            policy: as for `load_policy`; with none named yet, nothing is wrong until an action is asked for.
-            beside: as for `load_policy`.
+            policy: as for `load_policy`; None or empty fails only at the next action.
+            task_folder: as for `load_policy`.
 
         Raises:
-            TaskError: the policy cannot be imported; so will `next_action`, which tries again.
+            TaskError: the policy cannot be imported. `next_action` tries again.
         """
-        self._source, self._policy_name, self._beside = source, policy or "", beside
+        self._source, self._policy_name, self._task_folder = source, policy or "", task_folder
         self._policy = None
         if source != "policy" or not self._policy_name:
             return
@@ -85,16 +78,15 @@ class Acting:
             pass
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A), within the bounds but for a policy's.
+        """(N, A), within the bounds unless a policy gives it.
 
         Raises:
-            TaskError: the policy raised, gave no action, or cannot be imported. Its file is read anew the next
-                time: it may be mended by then.
+            TaskError: the policy raised, returned no action, or cannot be imported. The next call imports it again.
         """
         if self._source == "random":
             return actions.random_action(task.parts, task.num_envs, self._rng)
         if self._source == "policy":
-            # Never another action in its place: the page says that the policy acts.
+            # Never another action instead: the page says that the policy acts.
             with self._imported() as policy:
                 whose = f"what {self._policy_name} returned"
                 return actions.to_flat_action(task.env, task.parts, policy(task.obs), whose)
@@ -107,59 +99,63 @@ class Acting:
 
     @contextmanager
     def _imported(self) -> Iterator[Policy]:
-        """The policy; what is raised within is its fault, and it is imported anew the next time."""
+        """The policy. An exception within this becomes its TaskError, and it is imported again the next time."""
         try:
             if self._policy is None:
                 with self._folder.again():
-                    self._policy = load_policy(self._policy_name, self._beside)
+                    self._policy = load_policy(self._policy_name, self._task_folder)
             yield self._policy
         except BaseException as error:
             if is_ctrl_c(error):
                 raise
             policy, self._policy = self._policy, None
-            raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error
+            raise TaskError(policy_problem(error, self._policy_name, self._task_folder, policy)) from error
 
 
 def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
     return np.broadcast_to(action, (task.num_envs, len(action))).astype(np.float32)
 
 
-class RecordActing:
-    """Chooses the actions of every control step of a recording; an env without an episode holds still."""
+class RecordActionChooser:
+    """Chooses the actions of a headless recording; an env without an episode holds still.
 
-    def __init__(self, acting: Acting | None) -> None:
+    Each episode has a generator of its own with its seed, so that a recording holds the same episodes on any number of
+    envs and processes.
+    """
+
+    def __init__(self, chooser: ActionChooser | None) -> None:
         """
         Args:
-            acting: asked for whatever is neither random nor given; None for those.
+            acting: chooses actions that are neither random nor from a file; None for those two.
         """
-        self._acting = acting
+        self._chooser = chooser
         self._rng: dict[int, np.random.Generator] = {}
         self._given: dict[int, RecordedRun] = {}
 
     def begin(self, env: int, seed: int, given: RecordedRun | None) -> str:
-        """An episode begins in this env; returns what will choose its actions, as its recording says it."""
+        """Begin an episode in this env; returns the name of its source of actions for the recording."""
         self._rng[env] = np.random.default_rng(seed)
         self._given.pop(env, None)
         if given is not None:
             self._given[env] = given
             return given.name
-        return "random" if self._acting is None else self._acting.name
+        return "random" if self._chooser is None else self._chooser.name
 
     def end(self, env: int) -> None:
-        """Nothing is to be done in this env any more."""
+        """End the episode of this env."""
         self._rng.pop(env, None)
 
     def next_action(self, task: TaskEnv, steps: Mapping[int, int]) -> NDArray[np.float32]:
-        """(N, A); `steps` says how many were made, of each env with an episode.
+        """(N, A); `steps` has the number of steps so far for each env with an episode.
 
         Raises:
-            TaskError: the policy raised, or gave no action.
-            ValueError: actions of another size were given.
+            TaskError: the policy raised, or returned no action.
+            ValueError: the file's actions have another size.
         """
         action = actions.hold_action(task.parts, task.num_envs)
-        if self._acting is not None:
-            # Asked for the whole batch, as a policy is written for.
-            chosen = self._acting.next_action(task)
+        if self._chooser is not None:
+            # For the whole batch: that is what a policy expects.
+            chosen = self._chooser.next_action(task)
             for env in steps:
                 action[env] = chosen[env]
             return action
@@ -177,24 +173,26 @@ class RecordActing:
         return action
 
 
-# --- Actions that are known before: from a NumPy file, or demonstrations in ManiSkill's own ``.h5`` ---
+# --- actions from a file: NumPy arrays, or demonstrations in ManiSkill's ``.h5`` -----------------------
 
 
 MOST_BYTES = 2**30
-"""Of a NumPy file, also unpacked: 20 million steps of a Panda."""
+"""Limit of a NumPy file, also unpacked: 20 million steps of a Panda."""
 SUFFIXES = (".npy", ".npz", ".h5")
 
 
-def read_given(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
-    """Read a file of actions: what each episode is to do, begun as its run did where that is known; and what of the env's
-    keywords the file asks for, such as the control mode that its actions are of.
+def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    """Read a file of actions: a run for each episode, and the env's keywords that it needs, such as its control mode.
 
     ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
-    trajectories of ManiSkill, or a recording of the workbench.
+    trajectories of ManiSkill, or a recording of the workbench; their runs have a seed and env states too, with which a
+    replay is corrected where the same actions lead to another state (another machine or version, a batch that was
+    seeded as one on a GPU). An episode of a file does not stop at success or at the time limit, as in ManiSkill's
+    ``replay_trajectory``.
 
     Raises:
-        FileNotFoundError: it is not there.
-        ValueError: it does not hold such; the message says what it holds.
+        FileNotFoundError: there is no such file.
+        ValueError: it holds no actions; the message says what it holds.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
@@ -221,7 +219,7 @@ def read_given(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
 
 
 def _arrays(path: Path) -> list[NDArray]:
-    """What a NumPy file holds. `np.load` would allocate what a header claims, before it looks whether it is there."""
+    """The arrays of a NumPy file. `np.load` would allocate what a header claims before it checks the file's size."""
     with open_regular_file(path, MOST_BYTES) as file:
         if path.suffix == ".npy":
             return [_array(file, path.stat().st_size)]

@@ -1,15 +1,4 @@
-"""From an episode that was read to what an env needs to stand in it: the run, the task, the options.
-
-A recording names its task by id and by file, and holds the text that it was made with. Which of these is opened
-is a choice: today's code of it, that a person is about to try on an old situation; or the recorded text, to see again
-what happened. The text is written into a folder of its own, which goes when whoever opened it is done; so it can be
-looked at, even edited, and nobody's file is touched. What lay beside the file and is no Python (meshes, say) is
-not in a recording, but named there: where it still lies beside the task it is linked into that folder, as it is today.
-
-Whoever goes live from a recording, or has it judged again, wants to know what of the task is another now, by name:
-``CUBE_HALF_SIZE, evaluate``. Lines would say too much (comments, layout, what was moved); so both texts are compared
-symbol by symbol, as a save is, and what changed is named as its author calls it.
-"""
+"""The task, options, source and run of a recorded episode, and what changed in its source since."""
 
 from __future__ import annotations
 
@@ -36,19 +25,19 @@ from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.side_files import folder_of, side_file_path
 
 
-class NoText(ValueError):
-    """The text of the task's own file is not among them."""
+class NoRecordedSource(ValueError):
+    """The source of the task's own file is missing."""
 
 
-def below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The name of the task's own file, and all texts by name. None of the names leads out of the folder: a recording is
-    somebody else's file.
+def relative_sources(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The name of the task's own file, and all texts by relative name. No name leads out of the folder, since a recording
+    may come from anybody.
 
     Raises:
         NoText
     """
     names = {path: PurePath(path) for path in source}
-    # As it was recorded every path is absolute; as it is read, as seen from the main file's folder.
+    # Absolute when recorded; relative to the main file's folder when read.
     folder = PurePath(main).parent
     found: dict[str, str] = {}
     chosen = ""
@@ -60,28 +49,30 @@ def below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[st
         if path == main or (pure.name == PurePath(main).name and not chosen):
             chosen = str(relative)
     if not chosen:
-        raise NoText("this recording does not hold the text of its task's own file")
+        raise NoRecordedSource("this recording does not hold the text of its task's own file")
     return chosen, found
 
 
-def version_of(info: EpisodeInfo) -> str:
-    """`source_hash` of the text that a recording holds, and not what it says of it; empty where it holds none."""
+def recorded_version(info: EpisodeInfo) -> str:
+    """`source_hash` computed from the recorded text, not the recorded hash; empty if there is no text."""
     try:
-        _, texts = below_one_folder(info.source_file or "", info.source)
-    except NoText:
+        _, texts = relative_sources(info.source_file or "", info.source)
+    except NoRecordedSource:
         return ""
     return source_hash(texts, Path())
 
 
 MOST_NAMED = 4
 LOOK_EVERY = 2.0
-"""Seconds between two looks at the files."""
+"""Seconds between two reads of the files."""
 
 
 def changed_since(
     then_file: str | None, then: Mapping[str, str], now_file: str | None, now: Mapping[str, str]
 ) -> str:
-    """The symbols that differ; empty where none does, or where that cannot be said.
+    """Names of the symbols that differ, as ``CUBE_HALF_SIZE, evaluate``; empty if none does, or if a text is missing.
+
+    Compares symbol by symbol, as a save does: lines would also report comments, layout and moved code.
 
     Args:
         then_file, now_file: of the task.
@@ -90,10 +81,10 @@ def changed_since(
     if then_file is None or now_file is None:
         return ""
     try:
-        (old_main, old), (new_main, new) = below_one_folder(then_file, then), below_one_folder(now_file, now)
-    except NoText:
+        (old_main, old), (new_main, new) = relative_sources(then_file, then), relative_sources(now_file, now)
+    except NoRecordedSource:
         return ""
-    # It may be called otherwise now, a copy say; it is the task all the same.
+    # The file may have another name now, as a copy has.
     old = {new_main if name == old_main else name: text for name, text in old.items()}
     if old == new:
         return ""
@@ -101,19 +92,19 @@ def changed_since(
         changed = TwoVersions(old, new).changed
     except (SyntaxError, ValueError, RecursionError):
         return ""
-    names = list(dict.fromkeys(_called(path, name, new_main) for path, name in changed))
+    names = list(dict.fromkeys(_symbol_text(path, name, new_main) for path, name in changed))
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return ", ".join(names[:MOST_NAMED]) + more
 
 
 def changed_on_disk(info: EpisodeInfo) -> str:
-    """The same of the file that a recording names, as it is now, and of those beside it that it was recorded with."""
+    """`changed_since` for the recording's file and modules as they are on disk now."""
     file = None if info.source_file is None else Path(info.source_file)
     if file is None or not file.is_absolute() or not file.is_file():
         return ""
     try:
-        _, then = below_one_folder(info.source_file or "", info.source)
-    except NoText:
+        _, then = relative_sources(info.source_file or "", info.source)
+    except NoRecordedSource:
         return ""
     now = {}
     for name in then:
@@ -127,7 +118,7 @@ def changed_on_disk(info: EpisodeInfo) -> str:
 
 
 class ChangesOnDisk:
-    """`changed_on_disk` for who asks many times a second."""
+    """`changed_on_disk`, cached for callers that ask many times a second."""
 
     def __init__(self, look_every: float = LOOK_EVERY) -> None:
         self._look_every = look_every
@@ -140,30 +131,30 @@ class ChangesOnDisk:
         return self._known[2]
 
 
-def _called(path: str, name: str, main: str) -> str:
+def _symbol_text(path: str, name: str, main: str) -> str:
     short = name.rpartition(".")[2].strip("()")
     return short if path == main else f"{short} of {PurePath(path).name}"
 
 
 _IMPORTED = (".py", ".pyc", ".pyo", ".so", ".pyd", ".pth", ".zip", ".egg")
-"""Ends of the names of files that Python imports or reads at an import."""
+"""Suffixes of files that Python imports or reads at an import."""
 
 
 class CannotEnterRecording(ValueError):
-    """The recording cannot be gone into; the message says why, and what to do."""
+    """A recording cannot be entered; the message says why, and what to do."""
 
 
 def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
-    """What of an episode is lived through again, up to `state`; to its end if None.
+    """The part of an episode to replay, up to `state`; all of it if None.
 
     Raises:
-        CannotStepIn: it has no such state.
+        CannotEnterRecording: it has no such state.
     """
     if state is not None and not 0 <= state <= episode.length:
         raise CannotEnterRecording(f"this episode has states 0 to {episode.length}, and not {state}")
     info = episode.info
     run = RecordedRun(
-        name=name_of(info),
+        name=episode_name(info),
         seed=info.seed,
         reset_options=dict(info.reset_options),
         action=np.asarray(episode.action, np.float32),
@@ -174,23 +165,22 @@ def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
     return run if state is None else run.until(state)
 
 
-def name_of(info: EpisodeInfo) -> str:
-    """What a person calls the episode."""
+def episode_name(info: EpisodeInfo) -> str:
+    """The episode's name on the page."""
     return f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
 
 
-def why_not_into(task: TaskDescription, info: EpisodeInfo) -> str:
-    """Why an episode cannot be gone into with the task that is open; empty where it can."""
+def why_not_enter(task: TaskDescription, info: EpisodeInfo) -> str:
+    """Why an episode cannot be entered with the open task; empty if it can."""
     if task.env_id == info.task:
         return ""
     return f"it is an episode of {info.task}, and {task.env_id} is open"
 
 
 def reference_of(info: EpisodeInfo) -> RecordedTask:
-    """Today's code of a recording's task. What of it may be opened is for `Clearances` to say.
+    """Today's code of a recording's task; `Clearances` decides whether it may be opened.
 
-    Its file where that is still there, with the class where the file has several; else the id, which may be one of
-    ManiSkill's own.
+    Its file if that still exists, with the class; else the id, which may be one of ManiSkill's own.
     """
     file = None if info.source_file is None else Path(info.source_file)
     if (
@@ -208,7 +198,7 @@ def reference_of(info: EpisodeInfo) -> RecordedTask:
 
 
 def class_in(file: Path, env_id: str) -> str | None:
-    """What would be opened for this task of this file; None if the file has no such task, or cannot be read."""
+    """``file.py:Class`` of this task in a file; None if the file has no such task, or cannot be read."""
     try:
         name = _class_of(read_text(file), env_id)
     except CannotRead:
@@ -217,7 +207,7 @@ def class_in(file: Path, env_id: str) -> str | None:
 
 
 def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
-    """How the recording's task is made: with its own robot, modes and control."""
+    """Options of the recording's task: its own robot, modes and control."""
     kwargs = dict(info.env_kwargs)
     if info.control_mode is not None:
         kwargs.setdefault("control_mode", info.control_mode)
@@ -229,10 +219,10 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
 
 @contextmanager
 def recorded_source(info: EpisodeInfo) -> Iterator[str]:
-    """The task as it was recorded, in a folder that is removed at the end; what is to be opened.
+    """The recorded source in a folder that is removed at the end; gives the reference to open.
 
     Raises:
-        CannotStepIn: the recording holds no text, or the folder cannot be written.
+        CannotEnterRecording: the recording holds no text, or the folder cannot be written.
     """
     folder, reference = write_source(info)
     try:
@@ -242,16 +232,19 @@ def recorded_source(info: EpisodeInfo) -> Iterator[str]:
 
 
 def write_source(info: EpisodeInfo) -> tuple[Path, str]:
-    """A fresh folder with the recorded text, to be removed by the caller, and what is to be opened of it.
+    """A new folder with the recorded text, which the caller removes, and the reference to open.
+
+    Other files of the task's folder (meshes, say) are not in a recording but named there; those that still exist are
+    linked into the new folder as they are today.
 
     Raises:
-        CannotStepIn: as of `recorded_source`.
+        CannotEnterRecording: as for `recorded_source`.
     """
     if not info.source or info.source_file is None:
         raise CannotEnterRecording("this recording does not hold the text of its task")
     try:
-        main, texts = below_one_folder(info.source_file, info.source)
-    except NoText as error:
+        main, texts = relative_sources(info.source_file, info.source)
+    except NoRecordedSource as error:
         raise CannotEnterRecording(str(error)) from error
     folder = Path(tempfile.mkdtemp(prefix="workbench-recorded-"))
     try:
@@ -268,10 +261,10 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
 
 
 def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
-    """Those that are there; that one is not, or is another now, is said where the recorded text is offered."""
+    """Link the side files that exist. The page warns of missing and changed ones where it offers the recorded text."""
     for name in info.side_files:
         if name.endswith(_IMPORTED):
-            continue  # it could be imported, and is none of the texts that were agreed to
+            continue  # importable, and none of the texts that the person has trusted
         there, here = side_file_path(folder_of(info.source_file), name), side_file_path(folder, name)
         if there is not None and here is not None and there.is_file() and not here.exists():
             here.parent.mkdir(parents=True, exist_ok=True)
@@ -279,13 +272,13 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
 
 
 def _class_of(text: str, env_id: str) -> str | None:
-    """The class that is registered under, or has, this name; None if there is none."""
+    """The class that is registered under this id, or has it as its name; None if there is none."""
     try:
         tree = ast.parse(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return None
-    for cls, _, said in registrations_in(tree):
-        if isinstance(said, ast.Constant) and said.value == env_id:
+    for cls, _, id_node in registrations_in(tree):
+        if isinstance(id_node, ast.Constant) and id_node.value == env_id:
             return cls.name
     return (
         env_id if any(isinstance(node, ast.ClassDef) and node.name == env_id for node in tree.body) else None
@@ -293,7 +286,7 @@ def _class_of(text: str, env_id: str) -> str | None:
 
 
 def _is_installed(file: Path) -> bool:
-    """Whether it is a file of ManiSkill, or of another installed package: that is opened by its id."""
+    """Whether it is a file of ManiSkill or another installed package, which is opened by its id."""
     if {"site-packages", "dist-packages"} & set(file.parts):
         return True
     spec = find_spec("mani_skill")  # does not import it

@@ -1,14 +1,4 @@
-"""From the stream of steps of a batch to episodes, one env at a time.
-
-The page's Record button, ``workbench record`` and `workbench.Recorder` gather the same way: an env's episode begins
-with a reset and ends when it terminates, is truncated, or is reset. What comes is a step of all envs; what is written
-is a file an env. So each env has a writer of its own, which gets that env's row of every step; whoever gathers gets
-the writer when the episode is over, and says whether it becomes files (`EpisodeWriter.finish` takes a fraction of a
-second, and may be done on another thread) or is forgotten.
-
-It is also the place where a broken stream is noticed. `elapsed_steps` of a real episode counts 0, 1, 2 ...; a step that
-was lost, or a reset that went by unseen, would otherwise become a file that looks right and is not.
-"""
+"""Gathers the episodes of each env from the steps of a batch, and writes their files."""
 
 from __future__ import annotations
 
@@ -40,20 +30,20 @@ _PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk"
 
 @dataclass
 class GatheredEpisode:
-    """An episode that is over, and not on the disk yet but for its journal."""
+    """An episode with its writer; on disk there is only its journal so far."""
 
     writer: EpisodeWriter
     env: int
     seed: int
-    """Below 0 where it is not known."""
+    """Below 0 if unknown."""
     steps: int = 0
     total_reward: float = 0.0
     success: bool | None = None
-    """At its last state; None for a task that says nothing of it."""
+    """At its last state; None for a task without ``success``."""
     state_names: frozenset[str] = frozenset()
-    """Of the env states that its first row has."""
+    """Names of the env states in its first row."""
     acted_by: str = ""
-    """What chose its last action."""
+    """The source of its last action."""
     begun: bool = False
     """Whether it has its first state."""
 
@@ -67,7 +57,7 @@ class GatheredEpisode:
         reset_options: Mapping[str, Any] | None = None,
         acted_by: str = "",
     ) -> GatheredEpisode:
-        """One that begins, with a writer of its own into `folder`. Raises RecordingError."""
+        """A new episode with a writer into `folder`. Raises RecordingError."""
         writer = EpisodeWriter(
             folder,
             episode_info(task, env, seed, reset_options, acted_by),
@@ -78,8 +68,8 @@ class GatheredEpisode:
         )
         return cls(writer, env, seed, acted_by=acted_by)
 
-    def acts(self, what: str) -> None:
-        """What chooses the next action; empty for no news. Raises RecordingError."""
+    def set_source(self, what: str) -> None:
+        """Set the source of the next action; empty for no change. Raises RecordingError."""
         if what and what != self.acted_by:
             self.writer.acted_by(what)
             self.acted_by = what
@@ -92,7 +82,8 @@ class GatheredEpisode:
         columns: Mapping[str, NDArray],
         pictures: Sequence[Picture],
     ) -> None:
-        """Its next state, row `row` of a batch; the first is that after a reset. Raises as `EpisodeWriter.append`."""
+        """Append row `row` of a batch as the next state; the first is that after a reset. Raises as
+        `EpisodeWriter.append`."""
         if not self.begun:
             self.state_names = frozenset(states_of(columns, row))
             count = len(step.reward)
@@ -108,7 +99,14 @@ class GatheredEpisode:
 
 
 class EpisodeGatherer:
-    """Gathers the episodes of some envs of one task."""
+    """Gathers the episodes of some envs of one task, for the page, ``workbench record`` and `workbench.Recorder`.
+
+    An episode begins with a reset and ends when its env terminates, is truncated or is reset. `on_episode` then decides
+    whether it becomes files (`EpisodeWriter.finish` takes a fraction of a second, and may run on another thread).
+
+    It also checks the stream: `elapsed_steps` counts 0, 1, 2 ...; with a lost step or an unseen reset the file would look
+    right and be wrong.
+    """
 
     def __init__(
         self,
@@ -123,17 +121,17 @@ class EpisodeGatherer:
     ) -> None:
         """
         Args:
-            on_episode: gets each episode when it is over, and its writer with it.
-            ends: ``over`` ends an episode also where it terminates or is truncated, ``reset`` only where its env is
-                reset: for who goes on after that.
+            on_episode: called with each episode that is over, and its writer.
+            ends: ``over`` ends an episode also where it terminates or is truncated; ``reset`` only where its env is
+                reset, for callers that continue after that.
             one_each: only the next episode of each env.
         """
         self._task, self._folder, self._on_episode = task, folder, on_episode
         self._ends, self._one_each = ends, one_each
         self.reset_options: Mapping[str, Any] = reset_options or {}
-        """Of the resets that come next."""
+        """Options of the next resets."""
         self.acted_by = ""
-        """What chooses the actions of the episodes that begin next, where the steps do not say it."""
+        """The source of actions of the next episodes, where the steps do not name it."""
         self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
         self._packer = BatchPacker()
 
@@ -148,12 +146,12 @@ class EpisodeGatherer:
         return tuple(episode for episode in list(self._episodes.values()) if episode is not None)
 
     def take(self, stepped: Stepped) -> None:
-        """The next reset or step of the batch.
+        """Append the next reset or step of the batch.
 
         Raises:
-            ValueError: it does not follow from the one before, or holds what no file can; what came before can still
-                be finished.
-            RecordingError: the disk does not take it.
+            ValueError: it does not follow from the one before, or holds values that no file can; what came before can
+                still be finished.
+            RecordingError: it cannot be written.
         """
         step = stepped.step
         reset = stepped.reset_mask.tolist()
@@ -163,17 +161,17 @@ class EpisodeGatherer:
                 self._append([e for e in going_on if e.state_names == names], names, stepped)
         for env in [env for env in self._episodes if reset[env]]:
             self.end(env)
-            # Somebody may have gone back into an episode: no seed starts one there.
+            # Not after a jump into the middle of an episode: no seed starts one there.
             if env in self._episodes and step.elapsed_steps[env] == 0:
                 self._begin(env, stepped)
 
     def finish(self) -> None:
-        """End the episodes under way where they are."""
+        """End all episodes under way."""
         for env in list(self._episodes):
             self.end(env)
 
     def end(self, env: int) -> None:
-        """End the episode of `env` where it is; it must have a step to be kept."""
+        """End the episode of `env`; without a step it is dropped."""
         episode = self._episodes.get(env)
         if episode is None:
             return
@@ -186,7 +184,7 @@ class EpisodeGatherer:
         self._on_episode(episode)
 
     def drop(self, env: int) -> None:
-        """Forget the episode of `env`, if it has one."""
+        """Drop the episode of `env`, if it has one."""
         episode = self._episodes.get(env)
         if episode is not None:
             self._episodes[env] = None
@@ -203,7 +201,7 @@ class EpisodeGatherer:
         self._episodes[env] = begun
 
     def _append(self, episodes: list[GatheredEpisode], state_names: frozenset[str], stepped: Stepped) -> None:
-        """The rows of envs that have the same states."""
+        """Append the rows of envs with the same state names."""
         step = stepped.step
         elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
         over = (step.terminated | step.truncated).tolist()
@@ -217,9 +215,9 @@ class EpisodeGatherer:
         for episode in episodes:
             env = episode.env
             if elapsed[env] != episode.steps + 1:
-                raise _lost(env, episode.steps + 1, elapsed[env])
+                raise _lost_step(env, episode.steps + 1, elapsed[env])
             if acted_by != episode.acted_by:
-                episode.acts(acted_by)
+                episode.set_source(acted_by)
             episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
             episode.steps += 1
             episode.total_reward += reward[env]
@@ -228,7 +226,7 @@ class EpisodeGatherer:
                 self.end(env)
 
 
-def _lost(env: int, expected: int, came: int) -> ValueError:
+def _lost_step(env: int, expected: int, came: int) -> ValueError:
     return ValueError(
         f"env {env}: step {expected} was expected and step {came} came; a step was lost or the env was reset unseen"
     )
@@ -237,7 +235,7 @@ def _lost(env: int, expected: int, came: int) -> ValueError:
 def batch_columns(
     step: StepResult, columns: Mapping[str, NDArray], state_names: frozenset[str]
 ) -> list[tuple[str, NDArray]]:
-    """A control step of the batch, as `BatchPacker` takes it."""
+    """A control step of the batch as columns for `BatchPacker`."""
     assert step.action is not None
     count = len(step.reward)
     rows = [
@@ -277,7 +275,7 @@ def episode_info(
     reset_options: Mapping[str, Any] | None = None,
     acted_by: str = "",
 ) -> EpisodeInfo:
-    """What is needed to make an episode of this task again."""
+    """The description that is needed to repeat an episode of this task."""
     return EpisodeInfo(
         task=task.env_id,
         env_index=env,
@@ -299,7 +297,7 @@ def episode_info(
 
 @cache
 def package_versions() -> Mapping[str, str]:
-    """Versions of what an episode depends on, for its properties: of what this process has, for as long as it lives."""
+    """Versions of the packages that an episode depends on, as this process has them."""
     found = {}
     for name in _PACKAGES:
         try:
@@ -311,25 +309,25 @@ def package_versions() -> Mapping[str, str]:
 
 @dataclass(frozen=True)
 class Finished:
-    """What came of them so far."""
+    """Episodes written so far."""
 
     count: int = 0
     bytes_written: int = 0
     last: EpisodeFiles | None = None
     problem: str | None = None
-    """Why the last one that failed did."""
+    """Why the last failed one failed."""
 
 
 class EpisodeFinisher:
-    """Makes the files of episodes that are over, one after the other on a thread of its own. Thread-safe."""
+    """Writes the files of finished episodes one by one on a thread. Thread-safe."""
 
     def __init__(
         self, on_change: Callable[[], None] = lambda: None, first: Callable[[], None] | None = None
     ) -> None:
         """
         Args:
-            on_change: called on the thread when an episode has its files, or cannot have them.
-            first: called on the thread before all else.
+            on_change: called on the thread when an episode's files are written, or have failed.
+            first: called first on the thread.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
@@ -346,18 +344,18 @@ class EpisodeFinisher:
 
     @property
     def waiting(self) -> int:
-        """Episodes whose files are not there yet."""
+        """Episodes whose files are not written yet."""
         with self._lock:
             return self._waiting
 
     def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
-        """Make its files; the result says why where that failed. `finished` does too, until another one succeeds."""
+        """Write the files; the result is the reason if that failed. `finished` has it too, until another one succeeds."""
         with self._lock:
             self._waiting += 1
         return self._pool.submit(self._finish, episode)
 
     def close(self) -> None:
-        """Wait for what is under way."""
+        """Wait for the files under way."""
         self._pool.shutdown(wait=True)
 
     def _finish(self, episode: GatheredEpisode) -> EpisodeFiles | str:
@@ -367,7 +365,7 @@ class EpisodeFinisher:
             made = episode.writer.finish()
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
         except Exception as error:
-            # Its journal stays, and the next start tries again.
+            # The journal stays; the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
                 report_failure(f"An episode of env {episode.env} could not be written", error)
             made = f"an episode of env {episode.env} could not be written: {error}"

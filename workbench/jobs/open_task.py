@@ -1,10 +1,4 @@
-"""From a file or an env id to a running, tried-out task with everything a page must know of it.
-
-A task that imports and builds can still fail at its first step, in its reward or in a partial reset.
-Whoever opens a task wants to hear that before the version that works is thrown away; so opening
-includes a rehearsal: one reset, one step, one partial reset, each with the returns checked. Only what
-passes is handed over. The page, ``workbench record`` and the benchmarks open tasks through here.
-"""
+"""Opens a task: imports, builds, rehearses and describes it."""
 
 from __future__ import annotations
 
@@ -52,11 +46,13 @@ from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
 
 @dataclass(frozen=True)
 class OpenedTask:
+    """A task that was built and rehearsed."""
+
     loaded: LoadedTask
     env: TaskEnv
     description: TaskDescription
     first: StepResult
-    """The state after the reset with the seed that was asked for."""
+    """After the reset with the requested seed."""
     milliseconds: dict[str, float]
     """Wall time of each part: import, build, reset, rehearse, geometry."""
 
@@ -76,12 +72,12 @@ class Clock:
 
 @dataclass(frozen=True)
 class Opening:
-    """How a task is opened."""
+    """Callbacks and switches of opening a task."""
 
     on_activity: Callable[[str], None] = lambda activity: None
-    """Called with what is done next."""
+    """Called with the next part of the work, for a status line."""
     on_finding: Callable[[Finding], None] = warn_of
-    """Called with each place where it breaks a rule that does not stop it, the first time."""
+    """Called once for each place that breaks a rule without being stopped."""
     begins_anew: bool = False
     """Whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that goes back."""
     clock: Clock = field(default_factory=Clock)
@@ -94,11 +90,11 @@ def with_advice(
     again: Callable[[], LoadedTask],
     knows_others: bool = False,
 ) -> TaskError:
-    """Of a task that could not be opened: also what would open in its place.
+    """The error of a task that failed to open, with advice: another task of the file, or one env.
 
     Args:
-        again: imports it once more; the failed one was taken back.
-        knows_others: the other tasks of the file need not be told of.
+        again: imports it again; the failed import was undone.
+        knows_others: give no advice about the other tasks of the file.
     """
     advice: list[str] = []
     if (
@@ -122,11 +118,11 @@ def with_advice(
 
 
 _NOT_OF_THE_BATCH = (Interrupted, BrokenRule, MissingAssets, BackendUnavailable)
-"""Causes that say already what to do, or that one env has as well."""
+"""Causes that already say what to do, or that do not depend on the number of envs."""
 
 
 def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
-    """Whether one env of the task passes what a batch failed in: it may be written for one."""
+    """Whether the task opens with one env: it may be written for one."""
     try:
         loaded = again()
     except TaskError:
@@ -149,10 +145,10 @@ def open_task(
     on_activity: Callable[[str], None] = lambda activity: None,
     on_finding: Callable[[Finding], None] = warn_of,
 ) -> OpenedTask:
-    """Import, build, rehearse and reset a task, to be run without a page.
+    """Import, build, rehearse and reset a task, without a page.
 
     Raises:
-        TaskError: with the author's file and line; nothing of the task stays behind.
+        TaskError: with the author's file and line; the import is undone.
     """
     opening = Opening(on_activity, on_finding)
     loaded = import_task(reference, options, None, opening)
@@ -169,7 +165,7 @@ def open_task(
 def import_task(
     reference: TaskName, options: TaskOptions, source: dict[str, str] | None, opening: Opening
 ) -> LoadedTask:
-    """The class of a task, with `source` in place of what is on disk if it is given. Raises TaskError."""
+    """Import a task's class, with `source` in place of the files on disk if given. Raises TaskError."""
     opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
     import_modules(options.imports)
     loaded = load_task(reference, source=source)
@@ -178,7 +174,7 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset what was imported; taking back `loaded` where that raises TaskError is the caller's."""
+    """Build, rehearse and reset an imported task. On TaskError the caller undoes the import (`take_back`)."""
     on_activity, clock = opening.on_activity, opening.clock
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with blamed("build", loaded):
@@ -220,7 +216,13 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
 
 
 def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
-    """One reset, one step and one partial reset; raises TaskError where the task fails in one."""
+    """Do one reset, one step and one partial reset, and check the returns.
+
+    A task that imports and builds can still fail in these; that must be known before the running version is replaced.
+
+    Raises:
+        TaskError: the task fails in one.
+    """
     with blamed("reset", loaded, task):
         task.reset(seed)
     with blamed("step", loaded, task):
@@ -233,7 +235,7 @@ def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
 def describe(
     loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any], max_episode_steps: int | None
 ) -> TaskDescription:
-    """What the page must know of the task, as plain data; `given` are the keywords that it was made with."""
+    """The task as plain data; `given` are the keywords that it was made with."""
     env = task.env
     dimensions = [
         ActionDimension(name, float(low), float(high))
@@ -273,13 +275,13 @@ def describe(
 
 
 def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
-    """What whoever opens it should know although it works, in sentences."""
+    """Notices about a task that works, as sentences."""
     gpu = unused_gpu_text(options.backend)
     return (*(loaded.notices if loaded.followed else ()), *(() if gpu is None else (gpu,)))
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
-    """What `TaskEnv` calls with what ``evaluate`` and the reward returned: raises TaskError for wrong shapes."""
+    """The check that `TaskEnv` calls with the returns of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
 
     def check(evaluate: Mapping[str, Any], reward: Any) -> None:
         problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
@@ -290,14 +292,14 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
 
 
 def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:
-    """An installed task is not its reader's to mend: unless it is asked for, it is told of and never stopped."""
+    """The degree of the rules. An installed task cannot be edited by its user: by default it gets warnings only."""
     if options.rules is None and not loaded.followed and class_is_installed(loaded.cls):
         return "warn"
     return options.rules
 
 
 class blamed:
-    """Turns what the author's code raises into a TaskError that names their line."""
+    """A context that turns an exception of the author's code into a TaskError with their line."""
 
     def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
         self._stage, self._loaded, self._task = stage, loaded, task
@@ -307,17 +309,17 @@ class blamed:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Interrupted):
-            # Nothing more of the author's is called to find out what is wrong: it may be what does not end.
+            # Call no more of the author's code to explain the error: it may be what does not end.
             files, cls = self._loaded.source_files, self._loaded.cls
             raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
-        # SystemExit as well, and what an author derives from BaseException: neither must take the worker along.
-        # Here and not further up: there the version before may have been put back, with its texts.
+        # Also SystemExit and an author's BaseException, which must not end the worker. Here and not in a caller: the
+        # previous version and its texts may be restored by then.
         if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
             return
         raise TaskError(self._problem(error)) from error
 
     def _is_closed(self, error: BaseException) -> bool:
-        """Whether a generator of ours is closed in the middle; not where the author's code raised that."""
+        """Whether one of our generators is being closed, and not the author's code raised GeneratorExit."""
         if not isinstance(error, GeneratorExit):
             return False
         files = {str(file) for file in self._loaded.source_files}
@@ -332,13 +334,12 @@ class blamed:
             return _problem_at_its_place(error, self._stage, loaded)
         known = _raised_in(error, loaded.source_files)
         if env is not None and not known:
-            # Raised in ManiSkill's own code, most often over what evaluate() returned; the last line of
-            # the author's on the traceback is then only their call of super().__init__().
+            # Raised in ManiSkill's own code, most often because of what evaluate() returned; the author's last line on
+            # the traceback is then only their call of super().__init__().
             try:
                 returned = env.evaluate()
             except Exception:
-                # It cannot be asked, as where an unknown keyword ended the constructor and no scene is there:
-                # telling that would hide what happened.
+                # evaluate() fails too, as without a scene after an unknown keyword: that would hide the first error.
                 return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
             blamed = check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
             if blamed is not None:
@@ -347,7 +348,7 @@ class blamed:
 
 
 def _problem_at_its_place(error: BrokenRule | ForgottenInit, stage: str, loaded: LoadedTask) -> Problem:
-    """At the line that is at fault, also where that was over before it showed, and is on no traceback."""
+    """The problem at the line at fault, which may have ended earlier and be on no traceback."""
     problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
     if error.place is None or Path(error.place[0]) not in loaded.source_files:
         return problem
@@ -371,23 +372,23 @@ def _env_on_traceback(error: BaseException, cls: type) -> Any:
     return None
 
 
-# --- before any ----------------------------------------------------------------------------------------
+# --- warming up a process ------------------------------------------------------------------------------
 
 _SMALL_TASK = "PickCube-v1"
 """Needs no download, has a sensor and a human camera, and the robot that most tasks have."""
 
 
-def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
-    """What a process does once and takes long over, done before somebody waits for it: make a small env, draw it, and
-    throw it away; ends early when `goes_on` says no.
+def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
+    """Do the slow first things of a process: make a small env, draw it, and close it. Ends early when `keep_going` returns
+    False.
 
-    To make the first env of a process and read its shapes takes 1.2 s with N = 4 on two cores, the second 0.12, and the
-    first picture of each kind of camera has its shaders compiled: the robot's files, the render system and the shaders
-    are the same, whatever the author's task is.
+    The first env of a process and its shapes take 1.2 s with N = 4 on two cores, the second 0.12 s, and the first picture
+    of each kind of camera compiles its shaders. The robot's files, the render system and the shaders are the same for
+    any task.
 
-    It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
+    It fails only where the author's own load would fail (no renderer, no GPU), which reports it better.
     """
-    # Of the author's own arguments the one that says whether there is anything to draw with.
+    # The only one of the author's arguments that decides whether drawing is possible.
     renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
     try:
         opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))
@@ -395,7 +396,7 @@ def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
         return
     try:
         for camera in recorded_pictures(opened.description.cameras):
-            if not goes_on():
+            if not keep_going():
                 return
             take_pictures(opened.env.env, 0, [camera])
     finally:

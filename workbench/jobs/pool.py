@@ -1,10 +1,4 @@
-"""Work cut into numbered items, done in this process or by several, each of which keeps its env from item to item.
-
-`Work.run` is the same function everywhere. It asks its `Share` for items, and tells what came of each. Items are dealt
-in ascending order to whoever asks. From the limit on none is wanted any more: a caller that has enough lowers it, and
-stopping is a limit of 0. So what is done does not depend on how many processes do it, and a job that was stopped is
-resumed by dealing what is left.
-"""
+"""Runs a job's numbered items in this process or in several, each with an env of its own."""
 
 from __future__ import annotations
 
@@ -29,17 +23,17 @@ from workbench.machine.text import guard_terminal
 
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0
-"""In which a process that was told to stop must have finished what is over."""
+"""In which a stopped process must finish the items that are over."""
 _EXIT_SECONDS = 10.0
 _NO_LIMIT = sys.maxsize
 
 Setup = TypeVar("Setup")
 Result = TypeVar("Result")
-News = TypeVar("News")
+Update = TypeVar("Update")
 
 
 class PoolError(RuntimeError):
-    """A process died or failed; what the others had under way was finished."""
+    """A process died or failed; the others finished their items."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ class Progress:
     done: int
     total: int
     part: bytes = b""
-    """What is known of the answer since the last one, packed; see `wire.Question.part`."""
+    """The new part of the answer since the last one, packed; see `wire.Question.part`."""
 
 
 @dataclass(frozen=True)
@@ -59,58 +53,63 @@ class Answer:
 
     number: int
     value: bytes = b""
-    """Packed: only who asked knows of what kind it is to be."""
+    """Packed: only the caller knows its type."""
     why: str = ""
-    """Why there is no value, for the reader; empty where there is one."""
+    """Why there is no value, for the page; empty if there is one."""
     problem: Problem | None = None
-    """What the author's code raised, if that is why."""
+    """What the author's code raised, if that is the reason."""
 
 
 class CannotAnswer(Exception):
-    """In a worker: a question has no answer here; a sentence."""
+    """Raised in a worker that has no answer; the text is a sentence for the page."""
 
 
 class Share(Protocol):
     """The items of one process. Used on one thread."""
 
     def next(self) -> int | None:
-        """The next item to begin; None when there is none any more."""
+        """The next item to begin; None if there is none."""
         ...
 
     def limit(self) -> int:
-        """Items from this number on are not wanted any more, also if they are under way. It only falls."""
+        """Items from this number on are not needed, also if they are under way. It only falls."""
         ...
 
-    def tell(self, number: int, result: Any) -> None:
-        """What came of an item."""
+    def send_result(self, number: int, result: Any) -> None:
+        """Send the result of an item."""
         ...
 
-    def say(self, news: Any) -> None:
-        """How it goes meanwhile."""
+    def send_update(self, update: Any) -> None:
+        """Send progress."""
         ...
 
 
-class Deal(Generic[Result, News]):
-    """The items of a job, and who hears what comes of them. Used on one thread."""
+class Deal(Generic[Result, Update]):
+    """The items of a job, and the callbacks for their results. Used on one thread.
+
+    Items are dealt in ascending order. From the limit on none is needed: a caller that has enough lowers it, and stopping
+    is a limit of 0. So the result does not depend on the number of processes, and a stopped job continues by dealing
+    the rest.
+    """
 
     def __init__(
         self,
         numbers: Iterable[int],
         on_result: Callable[[int, Result], None],
-        on_news: Callable[[News], None] = lambda news: None,
+        on_update: Callable[[Update], None] = lambda update: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """
         Args:
             numbers: ascending, from 0 on.
-            stop: asked often; after a yes nothing more is wanted.
+            stop: called often; after True nothing more is needed.
         """
         self._numbers = iter(numbers)
-        self._on_result, self._on_news, self._stop = on_result, on_news, stop
+        self._on_result, self._on_update, self._stop = on_result, on_update, stop
         self._limit = _NO_LIMIT
 
     def lower(self, limit: int) -> None:
-        """Items from `limit` on are not wanted any more."""
+        """Lower the limit: items from `limit` on are not needed."""
         self._limit = min(limit, self._limit)
 
     def limit(self) -> int:
@@ -122,36 +121,36 @@ class Deal(Generic[Result, News]):
         number = next(self._numbers, _NO_LIMIT)
         return number if number < self.limit() else None
 
-    def tell(self, number: int, result: Result) -> None:
+    def send_result(self, number: int, result: Result) -> None:
         self._on_result(number, result)
 
-    def say(self, news: News) -> None:
-        self._on_news(news)
+    def send_update(self, update: Update) -> None:
+        self._on_update(update)
 
 
 @dataclass(frozen=True)
-class Work(Generic[Setup, Result, News]):
+class Work(Generic[Setup, Result, Update]):
     """What each process does."""
 
     run: Callable[[Setup, Share], None]
     """A function that can be imported by its name. It returns when its share has no next item and none is under way.
 
-    A TaskError, OSError, ValueError or RuntimeError that it raises ends the job.
+    A TaskError, OSError, ValueError or RuntimeError from it ends the job.
     """
     setups: Sequence[Setup]
-    """Its first argument, one for each process; can be pickled."""
+    """The first argument of `run` for each process; can be pickled."""
     result: Any
-    news: Any
-    """Types of what it tells and says, as `wire` packs it. Another process's words are held against them."""
+    update: Any
+    """Types of results and progress, against which `wire` checks messages of other processes."""
     name: str
     """As in "a process *that records* was killed by SIGKILL"."""
 
 
 class Executor(Protocol):
-    """Who does the work."""
+    """Does the work of a job."""
 
-    def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
-        """Deal until nothing is left or wanted, and everything under way is finished.
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        """Deal until no item is left or needed, and all items under way are finished.
 
         Raises:
             TaskError, PoolError: a share failed, or its process died; the others were stopped before.
@@ -159,25 +158,25 @@ class Executor(Protocol):
         ...
 
 
-class Here:
-    """This process does all of it; what `Work.run` raises is raised as it is."""
+class ThisProcess:
+    """Runs the work in this process; exceptions of `Work.run` pass through."""
 
-    def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
         (setup,) = work.setups
         work.run(setup, deal)
 
 
 class Processes:
-    """Spawned processes, each with its share of the cores."""
+    """Runs the work in spawned processes, each on its share of the cores."""
 
     def __init__(self, chunk: int = 1) -> None:
         """
         Args:
-            chunk: items that a process is given at once: more than one where an item takes milliseconds.
+            chunk: items per request of a process: more than one where an item takes milliseconds.
         """
         self._chunk = chunk
 
-    def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
         pool = _WorkerPool(work, deal, self._chunk)
         try:
             pool.start()
@@ -187,32 +186,32 @@ class Processes:
 
 
 def shares(count: int, processes: int) -> list[int]:
-    """`count` envs, or whatever else there is, cut for so many processes; no process without one."""
+    """`count` envs divided among so many processes; fewer processes where some would get none."""
     processes = min(processes, count)
     return [count // processes + (i < count % processes) for i in range(processes)]
 
 
-# --- what is said between the processes ----------------------------------------------------------------
+# --- messages between the processes --------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Next:
-    """More items, please."""
+    """A request for more items."""
 
 
 _ALL = -1
-"""The number of the last answer: nothing is under way any more, and nothing comes after this. Those before are of items;
-news are the parts of a progress."""
+"""The number of the last answer: nothing is under way, and no message follows. Other answers are of items; progress is
+sent as `Progress.part`."""
 
 
 @dataclass(eq=False)
 class _Process:
-    """As the one that started it sees it."""
+    """A process of the pool, in the process that started it."""
 
     line: MessageSocket
     keeper: subprocess.Popen[bytes]
     begun: set[int] = field(default_factory=set)
-    """The items that it has and has told nothing of."""
+    """Items that it has and did not report yet."""
 
 
 class _WorkerPool:
@@ -234,7 +233,7 @@ class _WorkerPool:
                     python_command("-m", "workbench.machine.processes.family", str(os.getpid()), *module),
                     stdin=subprocess.DEVNULL,
                     pass_fds=[theirs.fileno()],
-                    start_new_session=True,  # Ctrl-C in the terminal is for this process, which tells them
+                    start_new_session=True,  # Ctrl-C in the terminal reaches only this process, which stops them
                     env=child_environment(),
                 )
             process = _Process(MessageSocket(ours, (_Next, Answer, Progress)), keeper)
@@ -244,11 +243,11 @@ class _WorkerPool:
             self._send(process, (self._work.run, setup))
 
     def serve(self) -> None:
-        told, stopped = self._deal.limit(), 0.0
+        sent_limit, stopped = self._deal.limit(), 0.0
         failure: TaskError | PoolError | None = None
         while self._busy:
-            if (limit := self._deal.limit()) != told:
-                told = limit
+            if (limit := self._deal.limit()) != sent_limit:
+                sent_limit = limit
                 for process in self._busy:
                     self._send(process, limit)
             if limit == 0:
@@ -259,7 +258,7 @@ class _WorkerPool:
             for end in wait(by_end, _LOOK_SECONDS):
                 process = by_end[end]
                 try:
-                    self._hear(process)
+                    self._receive(process)
                 except (TaskError, PoolError) as error:
                     self._busy.remove(process)
                     end_family(process.keeper)
@@ -269,43 +268,43 @@ class _WorkerPool:
             raise failure
 
     def end(self) -> None:
-        """Wait for those that are done; those that are not, as after a second Ctrl-C, may be where nothing reaches them."""
+        """Wait for the processes that are done, and end the others, as after a second Ctrl-C: they may not respond."""
         for process in self._processes:
             if process not in self._busy:
                 self._exit_code(process, _EXIT_SECONDS)
             end_family(process.keeper)
             process.line.end.close()
 
-    def _hear(self, process: _Process) -> None:
-        """What it has said whole. The author's code runs at the other end: it may write into any descriptor.
+    def _receive(self, process: _Process) -> None:
+        """Handle its complete messages. The author's code runs at the other end, and may write into any descriptor.
 
         Raises:
             TaskError, PoolError: it failed.
         """
         try:
-            while process in self._busy and (said := process.line.receive(0)) is not None:
-                self._take(process, said)
+            while process in self._busy and (message := process.line.receive(0)) is not None:
+                self._take(process, message)
         except Unreadable as error:
             raise PoolError(f"a process {self._work.name} sent what cannot be read ({error})") from error
         except EOFError:
             words = describe_exit(self._exit_code(process, 2.0))
             raise PoolError(f"a process {self._work.name} {words}") from None
 
-    def _take(self, process: _Process, said: _Next | Answer | Progress) -> None:
-        if isinstance(said, _Next):
+    def _take(self, process: _Process, message: _Next | Answer | Progress) -> None:
+        if isinstance(message, _Next):
             numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
             process.begun.update(numbers)
             self._send(process, numbers)
-        elif isinstance(said, Progress):
-            self._deal.say(self._unpack(said.part, self._work.news))
-        elif said.number != _ALL:
-            result = self._unpack(said.value, self._work.result)
-            if said.number not in process.begun:
+        elif isinstance(message, Progress):
+            self._deal.send_update(self._unpack(message.part, self._work.update))
+        elif message.number != _ALL:
+            result = self._unpack(message.value, self._work.result)
+            if message.number not in process.begun:
                 raise PoolError(f"a process {self._work.name} told of an item that it does not have")
-            process.begun.remove(said.number)
-            self._deal.tell(said.number, result)
-        elif said.why:
-            raise PoolError(said.why) if said.problem is None else TaskError(said.problem)
+            process.begun.remove(message.number)
+            self._deal.send_result(message.number, result)
+        elif message.why:
+            raise PoolError(message.why) if message.problem is None else TaskError(message.problem)
         elif min(process.begun, default=_NO_LIMIT) < self._deal.limit():
             raise PoolError(f"a process {self._work.name} ended before it was done")
         else:
@@ -321,14 +320,14 @@ class _WorkerPool:
         try:
             process.line.send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
-            pass  # it is gone, and `_hear` says so
+            pass  # it is gone; `_receive` reports it
 
 
 # --- a process of the pool -----------------------------------------------------------------------------
 
 
-class _FarShare:
-    """Asks the process that started this one."""
+class _RemoteShare:
+    """The share of a process of the pool: asks the process that started it."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -339,9 +338,9 @@ class _FarShare:
     def next(self) -> int | None:
         if not self._mine and not self._none_left:
             self.send(_Next())
-            while not isinstance(heard := self._take(), list):
+            while not isinstance(message := self._take(), list):
                 pass
-            self._none_left = not heard
+            self._none_left = not message
         if not self._mine or self._mine[0] >= self._limit:
             return None
         return self._mine.popleft()
@@ -351,33 +350,33 @@ class _FarShare:
             self._take()
         return self._limit
 
-    def tell(self, number: int, result: Any) -> None:
+    def send_result(self, number: int, result: Any) -> None:
         self.send(Answer(number, pack(result)))
 
-    def say(self, news: Any) -> None:
-        self.send(Progress(0, 0, 0, pack(news)))
+    def send_update(self, update: Any) -> None:
+        self.send(Progress(0, 0, 0, pack(update)))
 
     def _take(self) -> list[int] | int:
-        heard: list[int] | int = self._connection.recv()
-        if isinstance(heard, list):
-            self._mine.extend(heard)
+        message: list[int] | int = self._connection.recv()
+        if isinstance(message, list):
+            self._mine.extend(message)
         else:
-            self._limit = heard
-        return heard
+            self._limit = message
+        return message
 
-    def send(self, said: object) -> None:
-        self._connection.send_bytes(pack_message(said))
+    def send(self, message: object) -> None:
+        self._connection.send_bytes(pack_message(message))
 
 
 def main(socket_fd: str) -> None:
-    """Entry of a process, which `machine.processes.family` has started."""
+    """Entry of a process of the pool, started through `machine.processes.family`."""
     guard_terminal()
     refuse_breakpoints(ONE_PROCESS)
     treat_ctrl_c_as_error()
     connection = Connection(int(socket_fd))
-    share = _FarShare(connection)
+    share = _RemoteShare(connection)
     try:
-        # PhysX and the software renderer take a thread for each core that the process may use.
+        # PhysX and the software renderer start a thread for each core that the process may use.
         os.sched_setaffinity(0, connection.recv())
         with quick_imports():
             run, setup = connection.recv()

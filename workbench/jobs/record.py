@@ -1,9 +1,4 @@
-"""Record episodes without a page: as many envs at once as asked for, in one process or several.
-
-Each episode is started by a reset of its env alone with a seed of its own, so that episode k of a recording is the one
-that ``gym.make(...).reset(seed=seed + k)`` starts, whatever the number of envs and processes; and its actions are its
-own too (`acting.RecordActing`).
-"""
+"""Records episodes without a page, on a batch of envs in one process or several."""
 
 from __future__ import annotations
 
@@ -24,13 +19,13 @@ from workbench.core.capture.recorded_state import state_distance
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
-from workbench.jobs.actions import SUFFIXES, Acting, RecordActing, read_given
+from workbench.jobs.actions import SUFFIXES, ActionChooser, RecordActionChooser, read_actions
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.open_task import OpenedTask, blamed, open_task
 from workbench.jobs.policy import find_policy
-from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
+from workbench.jobs.pool import Deal, Executor, Processes, Share, ThisProcess, Work, shares
 from workbench.jobs.record_options import RecordArguments
-from workbench.jobs.replay import put_there
+from workbench.jobs.replay import restore_recorded
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.processes.current_folder import CurrentFolder
 from workbench.recording.writing.episode_writer import EpisodeFiles
@@ -38,71 +33,73 @@ from workbench.recording.writing.publish import RecordingError
 
 _STEPS_WITHOUT_LIMIT = 200
 _TRIES = 100
-"""For each success that is wanted."""
+"""For each requested success."""
 _KINDS = ("random", "zero", "hold")
-_ELSEWHERE = 1e-4
-"""Metres, or radians: a start that is further from the demonstration's is another start."""
+_SAME_START = 1e-4
+"""Metres or radians: a start further from the demonstration's is a different one."""
 
 
 @dataclass(frozen=True)
 class RecordOptions(RecordArguments):
-    """What to record, and how its task is made."""
+    """What to record, and the options of its task."""
 
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
 
 
 @dataclass(frozen=True)
 class Written:
-    """An episode that is on the disk."""
+    """An episode on disk."""
 
     index: int
-    """Which of the recording it is."""
+    """Its number in the recording."""
     path: Path
-    """Its .rrd; the .h5 and .json lie beside it."""
+    """Its .rrd; the .h5 and .json have the same name."""
     seed: int
     steps: int
     total_reward: float
     success: bool | None
-    put_right: bool = False
-    """Its seed gives another start than the demonstration's, and it was put to its first state."""
+    start_corrected: bool = False
+    """Its seed gave another start than the demonstration's, and the demonstration's first state was restored."""
 
 
 @dataclass(frozen=True)
 class RecordProgress:
+    """How far a recording is."""
+
     kept: int
-    """Episodes that are kept so far."""
+    """Episodes kept so far."""
     steps: int
-    """Control steps made so far, over all envs with an episode."""
+    """Control steps so far, over all envs with an episode."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What came of it."""
+    """The result of a recording."""
 
     written: tuple[Written, ...]
-    """In the order of their numbers."""
+    """By number."""
     tried: int
-    """Episodes that it took."""
+    """Episodes that were run."""
     stopped: bool
-    """Somebody ended it before."""
-    put_right: int = 0
-    """Episodes that were."""
+    """It was stopped early."""
+    start_corrected: int = 0
+    """Episodes with `Written.start_corrected`."""
 
 
 def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[RecordedRun]]:
-    """What is asked for, with what the file of actions says of it: how many episodes, the control mode. And its runs, one
-    for each episode or one for all; none where the actions are not in a file.
+    """The options, completed from the file of actions (number of episodes, control mode), and the file's runs: one for
+    each episode or one for all; empty without a file.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_given`; or the numbers asked for make no sense.
+        FileNotFoundError, ValueError: as `read_actions`; or the requested numbers are invalid.
     """
     given: Sequence[RecordedRun] = ()
     if Path(what.actions).suffix in SUFFIXES:
-        given, env_kwargs = read_given(Path(what.actions))
+        given, env_kwargs = read_actions(Path(what.actions))
         options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
         what = replace(what, options=options)
     elif what.actions not in _KINDS:
-        find_policy(what.actions, _beside(what))
+        find_policy(what.actions, _task_folder(what))
     if what.use_env_states and not (given and all(run.env_states for run in given)):
         raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")
     if what.episodes is not None and what.successes is not None:
@@ -136,16 +133,20 @@ def record(
 ) -> Recorded:
     """Record into ``what.out``.
 
+    Each episode starts with a reset of its env alone with a seed of its own, and has actions of its own
+    (`RecordActionChooser`): episode k is the one that ``gym.make(...).reset(seed=seed + k)`` starts, for any number of envs and
+    processes.
+
     Args:
-        on_finding: called with each place where the task breaks a rule that does not stop it, once.
-        stop: asked between steps; when it says yes, what is over is kept, the rest is not, and that is it.
-        executor: None for this process, or, with several workers, for processes of their own.
+        on_finding: called once for each place where the task breaks a rule without being stopped.
+        stop: called between steps; after True the finished episodes are kept, and the others dropped.
+        executor: None for this process, or for spawned processes with several workers.
 
     Raises:
         TaskError: the task cannot be opened, or fails while it runs.
         RecordingError: a file cannot be written.
         PoolError: a process that records failed or died.
-        FileNotFoundError, ValueError: what is asked for makes no sense.
+        FileNotFoundError, ValueError: the request is invalid.
     """
     what, given = with_given_actions(what)
     envs = shares(what.options.num_envs, what.workers)
@@ -153,17 +154,17 @@ def record(
     recording = _RecordRun(what, on_activity, on_progress, stop, on_finding)
     run = _record_share
     if executor is None and len(setups) == 1:
-        executor, run = Here(), partial(_record_share, given=given)
-    work = Work(run, setups, result=Written | None, news=str | int | Finding, name="that records")
+        executor, run = ThisProcess(), partial(_record_share, given=given)
+    work = Work(run, setups, result=Written | None, update=str | int | Finding, name="that records")
     (executor or Processes()).run(work, recording.deal)
     return recording.so_far(stop())
 
 
 class _RecordRun:
-    """What is heard of the episodes, whoever makes them.
+    """Collects the results of all processes.
 
-    Who wants K successes gets those with the lowest numbers, and that is where order matters: with many envs, or several
-    processes, a later episode may succeed before an earlier one has ended. Its files go again when K others are before it.
+    Of the successes the K with the lowest numbers are kept. With many envs or processes a later episode may succeed before
+    an earlier one has ended; its files are removed when K others come before it.
     """
 
     def __init__(
@@ -179,16 +180,18 @@ class _RecordRun:
         self._kept: dict[int, Written] = {}
         self._ended = self._steps = 0
         self._found: set[object] = set()
-        """Each process finds the same, and it is told once."""
+        """Findings of all processes, to report each once."""
         most = what.episodes if what.successes is None else what.tries
         assert most is not None
-        self.deal: Deal[Written | None, str | int | Finding] = Deal(range(most), self._over, self._news, stop)
+        self.deal: Deal[Written | None, str | int | Finding] = Deal(
+            range(most), self._over, self._on_update, stop
+        )
 
     def so_far(self, stopped: bool) -> Recorded:
         enough = self._wanted is not None and len(self._kept) == self._wanted
         written = tuple(self._kept[number] for number in sorted(self._kept))
-        put_right = sum(episode.put_right for episode in written)
-        return Recorded(written, written[-1].index + 1 if enough else self._ended, stopped, put_right)
+        start_corrected = sum(episode.start_corrected for episode in written)
+        return Recorded(written, written[-1].index + 1 if enough else self._ended, stopped, start_corrected)
 
     def _over(self, number: int, written: Written | None) -> None:
         self._ended += 1
@@ -201,34 +204,36 @@ class _RecordRun:
                 self._remove(self._kept.pop(surplus))
         self._on_progress(RecordProgress(len(self._kept), self._steps))
 
-    def _news(self, news: str | int | Finding) -> None:
-        if isinstance(news, str):
-            self._on_activity(news)
-        elif isinstance(news, int):
-            self._steps += news
+    def _on_update(self, update: str | int | Finding) -> None:
+        if isinstance(update, str):
+            self._on_activity(update)
+        elif isinstance(update, int):
+            self._steps += update
             self._on_progress(RecordProgress(len(self._kept), self._steps))
-        elif news.key not in self._found:
-            self._found.add(news.key)
-            self._on_finding(news)
+        elif update.key not in self._found:
+            self._found.add(update.key)
+            self._on_finding(update)
 
     def _remove(self, episode: Written) -> None:
-        for suffix in (".json", ".h5", ".rrd"):  # what has no .json is not there
+        for suffix in (".json", ".h5", ".rrd"):  # the .json first: without it there is no episode
             (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)
 
 
 def _record_share(what: RecordOptions, share: Share, given: Sequence[RecordedRun] | None = None) -> None:
-    """What one process does. Raises as `record`.
+    """Record the share of one process. Raises as `record`.
 
     Args:
-        given: as `with_given_actions`, if that was read already.
+        given: as of `with_given_actions`, if it was read already.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     if given is None:
         what, given = with_given_actions(what)
-    here = CurrentFolder()  # the task may go to another
+    here = CurrentFolder()  # the task may change it
     with here.again():
         folder = what.out.absolute()
-        opened = open_task(what.task, what.options, on_activity=share.say, on_finding=share.say)
+        opened = open_task(
+            what.task, what.options, on_activity=share.send_update, on_finding=share.send_update
+        )
         try:
             _Episodes(opened, what, here, folder, given, share).run()
         finally:
@@ -236,7 +241,7 @@ def _record_share(what: RecordOptions, share: Share, given: Sequence[RecordedRun
 
 
 class _Episodes:
-    """The episodes that one process makes: envs that are free take the next one, and all make a step."""
+    """The episodes of one process: a free env takes the next one, and all step together."""
 
     def __init__(
         self,
@@ -252,17 +257,17 @@ class _Episodes:
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
         plain = not given and what.actions != "random"
-        self._acting = RecordActing(_acting(what, here) if plain else None)
+        self._chooser = RecordActionChooser(_chooser(what, here) if plain else None)
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
         self._running: dict[int, int] = {}
         """Number of the episode in each env that has one."""
         self._steps: dict[int, int] = {}
-        self._put_right: set[int] = set()
-        """Episodes whose seed gives another start than the demonstration's."""
+        self._start_corrected: set[int] = set()
+        """Numbers of the episodes with `Written.start_corrected`."""
         self._made: dict[int, tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = {}
 
     def run(self) -> None:
-        """Until there is nothing more to make; what is under way after a failure is not kept."""
+        """Run until no episode is left; after a failure those under way are dropped."""
         try:
             while self._begin_free():
                 self._step()
@@ -273,7 +278,7 @@ class _Episodes:
             self._collect()
 
     def _begin_free(self) -> bool:
-        """Whether any env has an episode."""
+        """Begin episodes in free envs. Returns whether any env has one."""
         self._drop_from(self._share.limit())
         for env in self._envs:
             if env not in self._running and (index := self._share.next()) is not None:
@@ -287,13 +292,13 @@ class _Episodes:
 
     def _free(self, env: int) -> None:
         del self._running[env]
-        self._acting.end(env)
+        self._chooser.end(env)
 
     def _collect(self) -> None:
-        """Tell of the episodes whose files are there.
+        """Report the episodes whose files are written.
 
         Raises:
-            RecordingError: those of one cannot be written.
+            RecordingError: the files of one cannot be written.
         """
         for index in [index for index, (_, future) in self._made.items() if future.done()]:
             episode, future = self._made.pop(index)
@@ -301,8 +306,8 @@ class _Episodes:
             if isinstance(files, str):
                 raise RecordingError(files)
             shown = self._what.out / files.rrd.name  # as the person named the folder
-            put_right = index in self._put_right
-            self._share.tell(
+            start_corrected = index in self._start_corrected
+            self._share.send_result(
                 index,
                 Written(
                     index,
@@ -311,7 +316,7 @@ class _Episodes:
                     episode.steps,
                     episode.total_reward,
                     episode.success,
-                    put_right,
+                    start_corrected,
                 ),
             )
 
@@ -329,23 +334,23 @@ class _Episodes:
             step = task.reset(seed, [env])
         self._running[env], self._steps[env] = index, 0
         if given is not None and given.env_states:
-            step = self._put_right_start(env, given, step)
-        self._gatherer.acted_by = self._acting.begin(env, seed, given)
+            step = self._correct_start(env, given, step)
+        self._gatherer.acted_by = self._chooser.begin(env, seed, given)
         mask = np.zeros(task.num_envs, bool)
         mask[env] = True
         self._gatherer.take(self._stepped(step, mask, [env]))
 
-    def _put_right_start(self, env: int, given: RecordedRun, step: StepResult) -> StepResult:
+    def _correct_start(self, env: int, given: RecordedRun, step: StepResult) -> StepResult:
         first, task = given.state(0), self._opened.env
-        if max(state_distance(states_of(read_state_columns(task), env), first)) <= _ELSEWHERE:
+        if max(state_distance(states_of(read_state_columns(task), env), first)) <= _SAME_START:
             return step
-        self._put_right.add(self._running[env])
-        return put_there(self._opened, {env: first})
+        self._start_corrected.add(self._running[env])
+        return restore_recorded(self._opened, {env: first})
 
     def _step(self) -> None:
-        """A control step of all envs, and the end of the episodes that are over with it."""
+        """Make a control step of all envs, and end the episodes that are over."""
         task, loaded = self._opened.env, self._opened.loaded
-        action = self._acting.next_action(task, {env: self._steps[env] for env in self._running})
+        action = self._chooser.next_action(task, {env: self._steps[env] for env in self._running})
         with blamed("step", loaded, task):
             step = task.step(action)
         if self._what.use_env_states:
@@ -354,10 +359,10 @@ class _Episodes:
                 for env, index in self._running.items()
                 if (given := self._given_of(index)) is not None
             }
-            step = put_there(self._opened, states, action)
+            step = restore_recorded(self._opened, states, action)
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
-        self._share.say(len(self._running))
+        self._share.send_update(len(self._running))
         for env in list(self._running):
             self._steps[env] += 1
             if self._is_over(env, step):
@@ -382,24 +387,24 @@ class _Episodes:
         index = self._running[episode.env]
         if self._what.successes is not None and not episode.success:
             episode.writer.discard()
-            self._share.tell(index, None)
+            self._share.send_result(index, None)
         else:
             self._made[index] = episode, self._finisher.finish(episode)
 
 
-def _acting(what: RecordOptions, here: CurrentFolder) -> Acting:
-    acting = Acting(here)
-    acting.seed(what.options.seed)
+def _chooser(what: RecordOptions, here: CurrentFolder) -> ActionChooser:
+    chooser = ActionChooser(here)
+    chooser.seed(what.options.seed)
     if what.actions in ("hold", "zero"):
-        acting.use(what.actions, None)
+        chooser.use(what.actions, None)
     else:
         with here.again():
-            beside = _beside(what)
-        acting.use("policy", what.actions, beside)
-    return acting
+            task_folder = _task_folder(what)
+        chooser.use("policy", what.actions, task_folder)
+    return chooser
 
 
-def _beside(what: RecordOptions) -> Path | None:
-    """Where a policy may be too."""
+def _task_folder(what: RecordOptions) -> Path | None:
+    """The task's folder, where a policy may be too."""
     file = named_file(what.task)
     return None if file is None else file.parent

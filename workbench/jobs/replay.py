@@ -1,18 +1,4 @@
-"""A recorded episode lived through again by envs that run: to a chosen state of it, or to its end; and said how.
-
-Two ways lead to a recorded state. One can put it there (`core.capture.recorded_state`): then every body is where it was, and
-what is in no recording is not as it was (contacts, drive targets, what the task counted on itself). Or one can
-live up to it: the reset with the recorded seed, and the recorded actions. With the same code that gives everything,
-to the last bit; with another it gives another state. So both are done at once: the episode is lived through, after each
-step the bodies are compared with the record, and where they have parted by more than can be overlooked they
-are put back on it. How far they were and how often that was needed is told, never assumed.
-
-What a task draws at a reset hangs on more than the env's own seed where several envs were reset together: torch's
-numbers come in one piece for all of them. So the first state is compared as well, and put back where it is another.
-
-In a batch the envs that do not take part stand still (`step_only`), and what the task keeps for them is put
-back afterwards, so that nobody is disturbed.
-"""
+"""Replays a recorded episode in running envs, up to a chosen state."""
 
 from __future__ import annotations
 
@@ -40,7 +26,7 @@ from workbench.jobs.open_task import OpenedTask, blamed
 from workbench.machine.text import length
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
-"""From here on a state is another one than the recorded, and is put back to it."""
+"""A state further than this from the recorded one is corrected."""
 
 Way = Literal["re-simulated", "corrected", "put there"]
 
@@ -52,15 +38,15 @@ class ReplayResult:
     way: Way
     steps: int
     metres: float | None
-    """How far the body that is furthest is from the record; None where it holds no states to compare with."""
+    """Largest distance of a body from the recorded state; None if the recording has no states."""
     radians: float | None
-    """The same of turning: bodies and joints."""
+    """Largest rotation of a body or joint from the recorded state."""
     corrected: int = 0
-    """Steps after which it was put back on the record."""
+    """Steps after which the recorded state was restored."""
     start_differs: bool = False
-    """The reset with its seed gave another state than the recorded one, which was put in its place."""
+    """The reset with its seed gave another state, and the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
-    """What could not be put back, and why."""
+    """What could not be restored, with the reason."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +54,15 @@ class Beginning:
     """How an env came to the first state of a run."""
 
     differs: bool
-    """The reset gave another state, which the recorded one then took the place of."""
+    """The reset gave another state, and the recorded one was restored."""
     missed: dict[str, str]
-    """What could not be put back, and why."""
+    """What could not be restored, with the reason."""
 
 
-def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
-    """Let these envs stand at the first state of their runs.
+def begin_run(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
+    """Put these envs into the first state of their runs: reset with the seed, then restore the state where it differs.
+
+    It may differ: envs that were reset together shared torch's generator, so their numbers depend on more than the seed.
 
     Raises:
         TaskError: a reset raised.
@@ -90,7 +78,7 @@ def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int
         if run.seed < 0:
             missed[i]["the seed"] = "the recording does not know it: what the task drew at the reset is new"
         seed = [run.seed] if run.seed >= 0 else None
-        # One by one: numbers that are drawn for several envs together are others than each would get alone.
+        # One by one: envs that are reset together draw other numbers than each alone.
         with blamed("reset", opened.loaded, task):
             task.reset(seed, [i], options)
     now = read_states(env)
@@ -106,10 +94,10 @@ def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int
     return {i: Beginning(other[i], missed[i]) for i in runs}
 
 
-def put_there(
+def restore_recorded(
     opened: OpenedTask, states: Mapping[int, Mapping[str, NDArray]], action: NDArray[np.float32] | None = None
 ) -> StepResult:
-    """Put a recorded state into each of these envs, and let the task say what it is; as `TaskEnv.rescore`.
+    """Put a recorded state into each of these envs; returns the task's result for it, as `TaskEnv.rescore`.
 
     Raises:
         TaskError: the task's code raised.
@@ -119,20 +107,28 @@ def put_there(
         return opened.env.rescore(action)
 
 
-def arrive(
+def replay_to(
     opened: OpenedTask,
     run: RecordedRun,
     state: int,
     env_idx: Sequence[int],
     on_step: Callable[[int], None] = lambda done: None,
 ) -> tuple[StepResult, ReplayResult]:
-    """Let envs stand at one state of a recorded run, all of them at the same; the others are not disturbed.
+    """Put envs into one state of a recorded run, all into the same; the other envs are not disturbed.
+
+    A state that is only restored (`core.capture.recorded_state`) has all bodies in place, but not what no recording holds:
+    contacts, drive targets, the task's own counters. A replay from the recorded seed by the recorded actions gives all of
+    it to the last bit with the same code, and another state with other code. So the run is replayed, the bodies are
+    compared with the recording after each step, and where they are too far apart the recorded state is restored; the
+    result counts that.
+
+    The other envs stand still (`step_only`), and what the task keeps for them is restored afterwards.
 
     Args:
-        on_step: called with the number of steps that are lived through.
+        on_step: called with the number of replayed steps.
 
     Raises:
-        TaskError: the task's code raised on the way; then the envs stand somewhere on it.
+        TaskError: the task's code raised on the way; the envs are left there.
         IndexError: the run has no such state, or the task no such env.
     """
     task, env = opened.env, opened.env.env
@@ -142,12 +138,12 @@ def arrive(
     if not chosen or any(not 0 <= i < task.num_envs for i in chosen):
         raise IndexError(f"env_idx {chosen} is out of range for {task.num_envs} envs")
     others = [i for i in range(task.num_envs) if i not in chosen]
-    why_not = why_not_replayed(opened, run)
-    kept, reason = _kept(opened, others)
+    why_not = why_not_replayable(opened, run)
+    kept, reason = _snapshot_of(opened, others)
     why_not = why_not or reason
     corrected = 0
     with step_only(env, chosen, kept):
-        beginnings = begin_again(opened, dict.fromkeys(chosen, run))
+        beginnings = begin_run(opened, dict.fromkeys(chosen, run))
         missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:
             for t in range(state):
@@ -156,7 +152,7 @@ def arrive(
                 with blamed("step", opened.loaded, task):
                     task.step(actions.action_of(task.parts, task.num_envs, rows))
                 wanted = run.state(t + 1)
-                if wanted and _far(env, chosen, wanted):
+                if wanted and _is_off(env, chosen, wanted):
                     with blamed("restore", opened.loaded, task):
                         write_states(env, dict.fromkeys(chosen, wanted))
                     corrected += 1
@@ -182,8 +178,8 @@ def arrive(
     )
 
 
-def why_not_replayed(opened: OpenedTask, run: RecordedRun) -> str:
-    """Why the recorded actions cannot be made; empty where they can."""
+def why_not_replayable(opened: OpenedTask, run: RecordedRun) -> str:
+    """Why the recorded actions cannot be replayed; empty if they can."""
     width = actions.width(opened.env.parts)
     recorded = run.action.shape[1] if run.action.ndim == 2 else 0
     if not np.isfinite(run.action).all():
@@ -193,13 +189,13 @@ def why_not_replayed(opened: OpenedTask, run: RecordedRun) -> str:
     return f"the recorded actions have {recorded} numbers each, and this robot takes {width}: they were not made again"
 
 
-def _kept(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
-    """What the envs that do not take part are put back to; where that cannot be had, why no step may be made."""
+def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
+    """A snapshot of the envs that do not take part; if it cannot be made, why no step is allowed."""
     if not others:
         return None, ""
     try:
         return opened.env.snapshot(others), ""
-    except Exception as error:  # what a task keeps on itself is open
+    except Exception as error:  # a task may keep anything on itself
         return (
             None,
             f"the other envs cannot be put back after steps, since this task's state cannot be kept ({error})",
@@ -210,7 +206,7 @@ def _of(states: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
     return {name: rows[env] for name, rows in states.items()}
 
 
-def _far(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bool:
+def _is_off(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bool:
     metres, radians = _distance(env, chosen, wanted)
     return (metres or 0.0) > PARTED_METRES or (radians or 0.0) > PARTED_RADIANS
 
@@ -218,7 +214,7 @@ def _far(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bool:
 def _distance(
     env: object, chosen: list[int], wanted: Mapping[str, NDArray]
 ) -> tuple[float | None, float | None]:
-    """Of the env that is furthest; None where nothing was recorded."""
+    """Metres and radians of the env that is furthest; None if nothing was recorded."""
     if not wanted:
         return None, None
     now = read_states(env)
@@ -226,26 +222,24 @@ def _distance(
     return max(metres for metres, _ in found), max(radians for _, radians in found)
 
 
-def how(replay_result: ReplayResult) -> str:
-    """One sentence: the way, and how near it came."""
+def replay_text(replay_result: ReplayResult) -> str:
+    """One sentence: how the state was reached, and how close it is."""
     if replay_result.way == "put there":
-        words = (
-            "the recorded state was put in place; contacts, and what the task counts on itself, begin anew"
-        )
+        text = "the recorded state was put in place; contacts, and what the task counts on itself, begin anew"
     elif replay_result.way == "corrected":
-        words = (
+        text = (
             f"its actions were made again, and its state put back at {replay_result.corrected} of {replay_result.steps} steps, "
             "where they had parted"
         )
     elif replay_result.steps == 0:
-        words = "reset with its seed" + (", then its first state put in place" * replay_result.start_differs)
+        text = "reset with its seed" + (", then its first state put in place" * replay_result.start_differs)
     else:
-        words = "its actions were made again"
-        words += " from its first state" if replay_result.start_differs else " from its seed"
+        text = "its actions were made again"
+        text += " from its first state" if replay_result.start_differs else " from its seed"
     if replay_result.metres is None:
-        words += "; it holds no states to compare with"
+        text += "; it holds no states to compare with"
     elif replay_result.metres == 0 and not replay_result.radians:
-        words += "; every body is where it was, to the last bit"
+        text += "; every body is where it was, to the last bit"
     else:
-        words += f"; bodies are within {length(replay_result.metres)} of where they were"
-    return words + "."
+        text += f"; bodies are within {length(replay_result.metres)} of where they were"
+    return text + "."

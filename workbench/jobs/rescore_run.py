@@ -1,9 +1,4 @@
-"""Recorded episodes lived through again by a batch of envs, as many at once as there are envs.
-
-Each env takes an episode, begins it as it began (`relive.begin_again`), makes its actions, and takes the next when it
-is through, whatever the others are at. What the task says of every state is noted, and how far its bodies are from the
-record. Envs that have none left stand still.
-"""
+"""Rescores recorded episodes on a batch of envs, one episode per env at a time."""
 
 from __future__ import annotations
 
@@ -23,46 +18,46 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.snapshot import step_only
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.open_task import OpenedTask, blamed
-from workbench.jobs.replay import begin_again, put_there, why_not_replayed
-from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, single_numbers
+from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayable
+from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_source
 
-_TELL_EVERY = 0.2
+_PROGRESS_PERIOD = 0.2
 """Seconds."""
 
 
 @dataclass
-class _Seat:
-    """An episode that can be judged, and what is said of it in the env that lives through it."""
+class _Rescoring:
+    """An episode that is being rescored in an env, with its new scores."""
 
     file: Source
     task: str
     run: RecordedRun
     missed: dict[str, str]
-    """What of it cannot be read or be put into the env, and why."""
+    """What cannot be read or put into the env, with the reason."""
     start_differs: bool = False
     reward: list[float] = field(default_factory=list)
-    """(T,) What the task says of it now, as the following."""
+    """(T,) new rewards."""
     evaluate: dict[str, list[float]] = field(default_factory=dict)
-    """(T + 1,) each."""
+    """(T + 1,) each, new."""
     drift: list[tuple[float, float]] = field(default_factory=list)
-    """(T + 1,) metres and radians from the record, where it has states."""
+    """(T + 1,) metres and radians from the recorded state, if there is one."""
 
     @property
     def at(self) -> int:
-        """The state that it is in."""
+        """Number of the state that it is in."""
         return len(self.reward)
 
     def verdict(self) -> Verdict[Source]:
         run = self.run
-        # A recording of somebody else's that holds no rewards: there is nothing to compare with.
+        # A recording of other software without rewards: nothing to compare with.
         old = np.zeros(0) if np.isnan(run.reward).all() else run.reward
         now = {name: np.array(rows) for name, rows in self.evaluate.items()}
         return compare(
             self.file,
-            Scores(old, single_numbers(run.evaluate)),
+            Scores(old, scalar_entries(run.evaluate)),
             Scores(np.array(self.reward), now),
             np.array(self.drift) if run.env_states else None,
             task=self.task,
@@ -80,64 +75,69 @@ def rescore(
     on_steps: Callable[[int], None] = lambda steps: None,
     read: Callable[[Source], Episode] = read_source,
 ) -> Iterator[Verdict[Source]]:
-    """Judge these episodes with the code that is open; a verdict for each, in the order in which they end.
+    """Rescore these episodes with the open task's code; gives a verdict for each, in the order in which they end.
+
+    Each env begins an episode (`replay.begin_run`), makes its actions, and then takes the next one, independent of the
+    other envs. Envs without one stand still.
 
     Args:
-        use_env_states: put every recorded state in after its step, so that nothing drifts.
-        on_steps: called with the number of control steps of all episodes that were made so far.
-        read: gives the episode of a file; raises as `read_source`.
+        use_env_states: restore every recorded state after its step, so that nothing drifts.
+        on_steps: called with the number of control steps so far, over all episodes.
+        read: reads a file's episode; raises as `read_source`.
 
     Raises:
         TaskError: the task's code raised.
     """
     task = opened.env
     waiting = iter(files)
-    seats: dict[int, _Seat] = {}
+    rescorings: dict[int, _Rescoring] = {}
     steps = 0
     more = True
-    while more or seats:
-        begun: dict[int, _Seat] = {}
-        while more and len(seats) + len(begun) < task.num_envs:
+    while more or rescorings:
+        begun: dict[int, _Rescoring] = {}
+        while more and len(rescorings) + len(begun) < task.num_envs:
             file = next(waiting, None)
             if file is None:
                 more = False
                 break
-            told = _ready(opened, file, use_env_states, read)
-            if isinstance(told, Verdict):
-                yield told
+            reported = _open_episode(opened, file, use_env_states, read)
+            if isinstance(reported, Verdict):
+                yield reported
             else:
-                env = next(i for i in range(task.num_envs) if i not in seats and i not in begun)
-                begun[env] = told
+                env = next(i for i in range(task.num_envs) if i not in rescorings and i not in begun)
+                begun[env] = reported
         if begun:
             _begin(opened, begun)
-            seats |= begun
-        if not seats:
+            rescorings |= begun
+        if not rescorings:
             continue
-        _one_step(opened, seats, use_env_states)
-        steps += len(seats)
+        _one_step(opened, rescorings, use_env_states)
+        steps += len(rescorings)
         on_steps(steps)
-        for env in [env for env, seat in seats.items() if seat.at == seat.run.length]:
-            yield seats.pop(env).verdict()
+        for env in [env for env, rescoring in rescorings.items() if rescoring.at == rescoring.run.length]:
+            yield rescorings.pop(env).verdict()
 
 
-def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Rescored], None]) -> Rescored:
+def answer(
+    opened: OpenedTask, request: Rescore, on_progress: Callable[[int, int, Rescored], None]
+) -> Rescored:
     """Carry out `request` in a worker.
 
     Args:
-        tell: called a few times a second with the control steps so far and what is new.
+        on_progress: called a few times a second with the control steps so far, 0, and the new verdicts.
 
     Returns:
-        what is new since then.
+        the verdicts since the last call of `on_progress`.
     """
-    told, steps = time.monotonic(), 0
+    reported, steps = time.monotonic(), 0
     ready: list[Verdict[Source]] = []
 
     def on_steps(now: int) -> None:
-        nonlocal told, steps
+        nonlocal reported, steps
         steps = now
-        if time.monotonic() - told > _TELL_EVERY:
-            told = time.monotonic()
-            tell(steps, 0, Rescored(tuple(ready), steps))
+        if time.monotonic() - reported > _PROGRESS_PERIOD:
+            reported = time.monotonic()
+            on_progress(steps, 0, Rescored(tuple(ready), steps))
             ready.clear()
 
     try:
@@ -150,15 +150,15 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
     return Rescored(tuple(ready), steps)
 
 
-def _ready(
+def _open_episode(
     opened: OpenedTask, file: Source, use_env_states: bool, read: Callable[[Source], Episode]
-) -> _Seat | Verdict[Source]:
+) -> _Rescoring | Verdict[Source]:
     try:
         episode = read(file)
     except (UnreadableRecording, OSError) as error:
         return Verdict(file, why_not=str(error))
     run, info = run_of(episode), episode.info
-    why_not = why_not_replayed(opened, run)
+    why_not = why_not_replayable(opened, run)
     if run.length == 0:
         why_not = "it has no step"
     elif use_env_states and not run.env_states:
@@ -166,45 +166,51 @@ def _ready(
     if why_not:
         why_not = ". ".join((why_not, *(broken.sentence for broken in episode.broken_files)))
         return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
-    return _Seat(file, info.task, run, {broken.file: broken.what for broken in episode.broken_files})
+    return _Rescoring(file, info.task, run, {broken.file: broken.what for broken in episode.broken_files})
 
 
-def _begin(opened: OpenedTask, seats: dict[int, _Seat]) -> None:
+def _begin(opened: OpenedTask, rescorings: dict[int, _Rescoring]) -> None:
     task = opened.env
-    beginnings = begin_again(opened, {env: seat.run for env, seat in seats.items()})
+    beginnings = begin_run(opened, {env: rescoring.run for env, rescoring in rescorings.items()})
     with blamed("restore", opened.loaded, task):
         first = task.rescore()
     now = read_states(task.env)
-    for env, seat in seats.items():
-        seat.start_differs = beginnings[env].differs
-        seat.missed = beginnings[env].missed | seat.missed
-        _hear(seat, first, env, now)
+    for env, rescoring in rescorings.items():
+        rescoring.start_differs = beginnings[env].differs
+        rescoring.missed = beginnings[env].missed | rescoring.missed
+        _add_scores(rescoring, first, env, now)
 
 
-def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool) -> None:
+def _one_step(opened: OpenedTask, rescorings: dict[int, _Rescoring], use_env_states: bool) -> None:
     task = opened.env
-    rows = {env: seat.run.action[seat.at] for env, seat in seats.items()}
+    rows = {env: rescoring.run.action[rescoring.at] for env, rescoring in rescorings.items()}
     action = actions.action_of(task.parts, task.num_envs, rows)
-    others = step_only(task.env, [*seats], None) if len(seats) < task.num_envs else nullcontext()
+    others = step_only(task.env, [*rescorings], None) if len(rescorings) < task.num_envs else nullcontext()
     with others, blamed("step", opened.loaded, task):
         step = task.step(action)
     now = read_states(task.env)
     if use_env_states:
-        step = put_there(opened, {env: seat.run.state(seat.at + 1) for env, seat in seats.items()}, action)
+        step = restore_recorded(
+            opened,
+            {env: rescoring.run.state(rescoring.at + 1) for env, rescoring in rescorings.items()},
+            action,
+        )
         now = read_states(task.env)
-    for env, seat in seats.items():
-        seat.reward.append(float(step.reward[env]))
-        _hear(seat, step, env, now)
+    for env, rescoring in rescorings.items():
+        rescoring.reward.append(float(step.reward[env]))
+        _add_scores(rescoring, step, env, now)
 
 
-def _hear(seat: _Seat, step: StepResult, env: int, now: dict[str, NDArray[np.float32]]) -> None:
-    for name, values in single_numbers(step.evaluate).items():
-        rows = seat.evaluate.setdefault(name, [])
-        # The terms of a reward are there from the first step on.
-        rows += [np.nan] * (seat.at - len(rows))
+def _add_scores(
+    rescoring: _Rescoring, step: StepResult, env: int, now: dict[str, NDArray[np.float32]]
+) -> None:
+    for name, values in scalar_entries(step.evaluate).items():
+        rows = rescoring.evaluate.setdefault(name, [])
+        # The terms of a reward exist from the first step on.
+        rows += [np.nan] * (rescoring.at - len(rows))
         rows.append(float(values[env]))
-    recorded = seat.run.state(seat.at)
+    recorded = rescoring.run.state(rescoring.at)
     far = (
         state_distance({name: rows[env] for name, rows in now.items()}, recorded) if recorded else (0.0, 0.0)
     )
-    seat.drift.append(far)
+    rescoring.drift.append(far)

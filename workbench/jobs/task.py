@@ -1,4 +1,4 @@
-"""A task as plain data: how it is made, what it is, and what each step of its batch gives."""
+"""Options, description and step results of a task as plain data, without torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
 
 @dataclass(frozen=True)
 class TaskOptions:
-    """How a task is made; the same for the page, the recorder and the benchmarks."""
+    """Options of a task, for the page, recordings and benchmarks."""
 
     num_envs: int = 16
     backend: Backend = "auto"
@@ -30,7 +30,7 @@ class TaskOptions:
     rules: Degree | None = None
     """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
     imports: tuple[str, ...] = ()
-    """Modules that a person named on the command line, imported before the task is looked for: they register its id."""
+    """Modules to import before the task, as they may register its id."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ActionDimension:
 
 @dataclass(frozen=True)
 class TaskDescription:
-    """What the page must know of a task that was loaded."""
+    """A loaded task, for the page."""
 
     env_id: str
     """Registered id, or the class name of an unregistered task."""
@@ -53,7 +53,7 @@ class TaskDescription:
     file: str | None
     """Source file of the class."""
     source_files: tuple[str, ...]
-    """The task's file and the modules beside it that it imported: what the watcher follows."""
+    """The task's file and the modules that it imported from its folder: the watcher follows these."""
     source_hash: str
     """sha256 over `source_files`, 12 hex digits."""
     source: dict[str, str]
@@ -78,15 +78,15 @@ class TaskDescription:
     chosen: str = ""
     """Its name in the file: the class, or a robot that is shown in a scene."""
     others: tuple[str, ...] = ()
-    """What else can be chosen in the file."""
+    """The other tasks of the file."""
     in_place_of: str | None = None
-    """The class of the file that was tried first, and failed."""
+    """The class of the file that was tried first and failed."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
+    """Keywords of ``gym.make`` for such an env, as far as JSON can hold them."""
     objects: tuple[ObjectToSee, ...] = ()
-    """What a camera may be asked to see."""
+    """Objects that a camera can be measured on."""
     notices: tuple[str, ...] = ()
-    """What its author should know although it works, in sentences."""
+    """Notices about a task that works, as sentences."""
 
     def camera(self, key: CameraKey) -> CameraInfo | None:
         return next((camera for camera in self.cameras if camera.key == key), None)
@@ -98,23 +98,23 @@ NO_MOMENT = -1
 
 @dataclass(frozen=True)
 class Restored:
-    """What a `Restore` or a `EnterRecording` did."""
+    """The result of a `Restore` or an `EnterRecording`."""
 
     env_idx: tuple[int, ...]
     source: tuple[int, ...]
     origin: int
     undoes: int | None
     not_carried: dict[str, str]
-    """What could not be put back, and why; empty within one version of a task."""
+    """What could not be restored, with the reason; empty within one version of a task."""
     recording: str = ""
-    """Of a `EnterRecording`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
+    """Of an `EnterRecording`: text for the episode and the state. Its `origin` is `NO_MOMENT`."""
     how: str = ""
-    """How the state was come to, in a sentence; empty where it was put there."""
+    """How the state was reached, as a sentence; empty if it was restored."""
     number: int = 0
     """Of the `EnterRecording` that it answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()
-    """The envs that came there by the steps that led to it. For them it is no exact point, as a state that is put there
-    is, from which the same actions give the same bits."""
+    """The envs that were replayed up to it. For them it is no exact point (from which the same actions give the same
+    bits), as a restored state is."""
 
 
 @dataclass(frozen=True)
@@ -123,17 +123,17 @@ class Stepped:
 
     step: StepResult
     reset_mask: NDArray[np.bool_]
-    """(N,) True where this result does not follow from the one before: the first of a new episode, or a moment
-    of the past that was returned to (`restored`)."""
+    """(N,) True where this result does not follow from the one before: the first of a new episode, or a past moment
+    (`restored`)."""
     captured: tuple[Picture, ...] = ()
-    """Pictures that belong to exactly this step (only while capturing)."""
+    """Pictures of exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
-    """(N,) episode seed of each env, where a reset was part of this."""
+    """(N,) episode seed of each env, if this has a reset."""
     snapshot: bytes = b""
     """The body of the snapshot of the whole batch at this moment (see `core.snapshots.packing`): opaque to the
     server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
     part_keys: tuple[int, ...] | None = None
-    """The parts of the snapshot; None where they are those of the event before."""
+    """The parts of the snapshot; None if they are those of the previous event."""
     new_parts: dict[int, bytes] = field(default_factory=dict)
     """Parts that were not sent before."""
     number: int = 0
@@ -143,7 +143,7 @@ class Stepped:
     """(N, ...) each, as `core.capture.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
     acted_by: str = ""
-    """What chose the action of this step, as a recording is to say it; empty where it is known beforehand."""
+    """The source of this step's action, for a recording; empty if it is known before the episode."""
     resumed: bool = False
-    """The envs stand where the worker before this one left them: the result does not follow from one of this worker's,
-    but nothing was reset."""
+    """The envs have the state that the previous worker left: the result follows from none of this worker's, but nothing
+    was reset."""

@@ -1,9 +1,4 @@
-"""What is said of a run now, compared with what was said of it when it was recorded.
-
-A run is what one env lives through: T control steps and T + 1 states. It is compared as far as both were said, also where
-today's code would have ended it before. What is judged is the run anew and not the record, so how far it came from the
-record belongs to each verdict.
-"""
+"""Compares a run's recorded reward and evaluate with those of today's code."""
 
 from __future__ import annotations
 
@@ -19,9 +14,9 @@ from workbench.machine.processes.wire import Question
 from workbench.recording.episode.row import Source
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
-"""Numbers that differ by no more than this share of the largest recorded one, or by no more than this, are the same."""
+"""Numbers are equal within this share of the largest recorded one, or within this absolute difference."""
 DOUBTFUL_METRES, DOUBTFUL_RADIANS = 1e-3, 1e-2
-"""A body further than this from the record makes a comparison doubtful."""
+"""A body further than this from the recorded state makes a comparison doubtful."""
 FLAGS = ("success", "fail")
 _MAIN = ("reward", *FLAGS)
 Of = TypeVar("Of")
@@ -29,65 +24,69 @@ Of = TypeVar("Of")
 
 @dataclass(frozen=True)
 class Scores:
-    """What a task says of a run, as far as it is one number or flag."""
+    """Reward of a run, and the entries of evaluate that are one number or flag."""
 
     reward: NDArray
-    """(T,); empty where none was recorded."""
+    """(T,); empty if none was recorded."""
     evaluate: Mapping[str, NDArray]
     """(T + 1,) each; NaN in a state without it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Generic[Of]):
-    """One run as it was judged then, and as it is judged now."""
+    """The comparison of one run: T control steps and T + 1 states. It ends with the shorter of both scores, also where
+    today's code would have ended the episode earlier.
+
+    The run was replayed for it, so the verdict also has the distance from the recorded states.
+    """
 
     of: Of
-    """Where the run is."""
+    """The run: a recording, or an env's part of the history."""
     task: str = ""
     seed: int = -1
     length: int = 0
     """Control steps."""
     success: tuple[int | None, int | None] = (None, None)
-    """The first step of the episode after which it was true, then and now; None for never."""
+    """The first step of the episode after which it was true, then and now; None if never."""
     fail: tuple[int | None, int | None] = (None, None)
     has_success: bool = False
     returns: tuple[float, float] = (0.0, 0.0)
     largest: float = 0.0
     """The largest change of one reward."""
     first_difference: int | None = None
-    """The first step of which the reward, success or fail is another; None where all are as they were."""
+    """The first step whose reward, success or fail differs; None if all are equal."""
     look_at: int | None = None
-    """The step to look at: where success or fail is, or else where the reward differs most."""
+    """The step to show: where success or fail differs, else where the reward differs most."""
     differing: tuple[str, ...] = ()
-    """``reward``, and the entries of ``evaluate``, that are others somewhere."""
+    """``reward`` and the entries of ``evaluate`` that differ somewhere."""
     metres: float | None = None
-    """How far the body that was furthest from the record was; None where it holds no states to compare with."""
+    """Largest distance of a body from the recorded state; None if there are no states."""
     radians: float = 0.0
-    """How much the body or joint that was turned most was."""
+    """Largest rotation of a body or joint from the recorded state."""
     drift_at: int | None = None
     """The step after which the body was furthest."""
     start_differs: bool = False
-    """The reset with its seed gave another first state, and the recorded one was put in its place."""
+    """The reset with its seed gave another first state, and the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
-    """What of the record could not be put into the env, and why."""
+    """What could not be put into the env, with the reason."""
     why_not: str = ""
-    """Why it was not judged; all else is then empty."""
+    """Why it was not rescored; all else is then empty."""
     old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     @property
     def differs(self) -> bool:
-        """Whether reward, success or fail is another now."""
+        """Whether reward, success or fail differs."""
         return self.first_difference is not None
 
     @property
     def others(self) -> tuple[str, ...]:
-        """Those of `differing` that are neither reward, success nor fail."""
+        """`differing` without reward, success and fail."""
         return tuple(name for name in self.differing if name not in _MAIN)
 
     @property
     def drifted(self) -> bool:
-        """Whether what differs may come of other states and not of the code."""
+        """Whether a difference may come from other states and not from the code."""
         return self.metres is not None and not (
             self.metres <= DOUBTFUL_METRES and self.radians <= DOUBTFUL_RADIANS
         )
@@ -105,17 +104,17 @@ def compare(
     start_differs: bool = False,
     missed: Mapping[str, str] | None = None,
 ) -> Verdict[Of]:
-    """Compare what was recorded with what is said now.
+    """Compare recorded scores with new ones.
 
     Args:
         old: as long as `new`, or longer.
-        drift: (T + 1, 2) metres and radians that the furthest body is from the record in each state; None if not known.
-        begin: the steps of its episode that were made before the run.
+        drift: (T + 1, 2) metres and radians of the furthest body from each recorded state; None if unknown.
+        begin: steps of the episode before the run.
     """
     steps = len(new.reward)
     both = [n for n, values in new.evaluate.items() if len(old.evaluate.get(n, ())) >= len(values)]
     names = ("reward", *both)
-    # All numbers at once: there are some ten, of hundreds of runs, several times a second.
+    # In one array, since this runs for hundreds of runs several times a second.
     was, now = np.full((2, len(names), steps + 1), np.nan)
     if len(old.reward):
         was[0, 1:], now[0, 1:] = old.reward[:steps], new.reward
@@ -124,12 +123,12 @@ def compare(
         was[row, :length], now[row, :length] = old.evaluate[name][:length], new.evaluate[name]
     apart = gap(was, now)
     differs = _too_far(was, apart, axis=1)
-    # Many a file says nothing of the state that a run begins with.
+    # Many files have no values for a run's first state.
     differs[:, 0] &= ~np.isnan(was[:, 0])
     others = {name: differs[row].nonzero()[0] for row, name in enumerate(names)}
     turned: dict[str, tuple[int | None, int | None]] = {}
     for name in FLAGS:
-        flags = [_flag(said.evaluate.get(name), steps + 1) for said in (old, new)]
+        flags = [_flag(scores.evaluate.get(name), steps + 1) for scores in (old, new)]
         others[name] = (flags[0] != flags[1]).nonzero()[0]
         turned[name] = _first(flags[0], begin), _first(flags[1], begin)
     differing = tuple(name for name in dict.fromkeys((*_MAIN, *new.evaluate)) if len(others.get(name, ())))
@@ -168,8 +167,8 @@ def compare(
     )
 
 
-def in_order(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
-    """What changed most first: success, fail, then return; what is as it was, and what was not judged, last."""
+def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
+    """The largest change first: success, fail, then return; unchanged runs and those not rescored last."""
 
     def key(verdict: Verdict[Of]) -> tuple[bool, bool, int, float]:
         moved = 2 * (verdict.success[0] != verdict.success[1]) + (verdict.fail[0] != verdict.fail[1])
@@ -179,10 +178,10 @@ def in_order(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
     return sorted(verdicts, key=key)
 
 
-def single_numbers(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """The entries that are one number or flag in each row, (n,) of them; of `evaluate`, (n, ...) each."""
+def scalar_entries(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """The entries of `evaluate`, (n, ...) each, that are one number or flag in each row, as (n,)."""
     return {
-        # Nobody keeps an author from calling an entry so, and it is not the reward.
+        # An author's entry may be called "reward" too, and is not the reward.
         "evaluate/reward" if name == "reward" else name: values.reshape(len(values))
         for name, values in evaluate.items()
         if values.dtype.kind in "fiub" and values.shape in ((len(values),), (len(values), 1))
@@ -190,7 +189,7 @@ def single_numbers(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
 
 
 def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
-    """How far apart; infinite where one is not a number, zero where both are not or are the same infinity."""
+    """Absolute difference; infinite where one is NaN, zero where both are NaN or the same infinity."""
     a, b = np.asarray(old, np.float64), np.asarray(new, np.float64)
     with np.errstate(invalid="ignore"):
         apart = np.abs(b - a)
@@ -200,11 +199,11 @@ def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
     return apart
 
 
-def unlike(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np.bool_]:
-    """Where numbers are not the same.
+def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np.bool_]:
+    """True where numbers differ.
 
     Args:
-        least: what differs by no more is the same.
+        least: absolute difference that still counts as equal.
     """
     return _too_far(old, gap(old, new), least)
 
@@ -212,7 +211,7 @@ def unlike(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np
 def _too_far(
     old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
 ) -> NDArray[np.bool_]:
-    """Where new ones that are so far `apart` are not the same; with `axis` 1 each row is one of its own."""
+    """True where `apart` is too much, measured by the largest of `old`; with `axis` 1 by the largest of each row."""
     if not apart.any():
         return apart > 0
     scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)
@@ -224,31 +223,31 @@ def _first(flag: NDArray[np.bool_], begin: int) -> int | None:
 
 
 def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
-    """(states,) of an entry that is a flag: False where it is not said."""
+    """(states,) of an entry that is a flag; False where it is missing."""
     found = np.zeros(states, bool)
     if values is not None:
         found[: len(values)] = values[:states] > 0.5
     return found
 
 
-# --- recordings judged again -------------------------------------------------------------------------
+# --- the question to a worker ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Rescored:
-    """How far a `Rescore` is, or its end."""
+    """Progress or end of a `Rescore`."""
 
     verdicts: tuple[Verdict[Source], ...]
     """New ones."""
     steps: int
-    """Control steps of all its episodes so far."""
+    """Control steps so far, over all episodes."""
     problem: Problem | None = None
-    """What the task's code raised; then it goes no further."""
+    """What the task's code raised; it ends there."""
 
 
 @dataclass(frozen=True)
 class Rescore(Question[Rescored]):
-    """Have a worker with the task open read and judge these episodes; what is told meanwhile are `Rescored` too."""
+    """Read and rescore these episodes in a worker with the task open; progress is sent as `Rescored` too."""
 
     part: ClassVar[Any] = Rescored
     files: tuple[Source, ...]

@@ -12,7 +12,7 @@ from typing import Any
 from workbench.authoring.loading.reference import RecordedTask, TaskName, looks_like_file
 from workbench.authoring.loading.task_content import CannotRead, TaskContent, read_content
 from workbench.authoring.loading.trust import TrustStore
-from workbench.jobs.from_recording import NoText, below_one_folder
+from workbench.jobs.from_recording import NoRecordedSource, relative_sources
 from workbench.machine.text import short_line
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.made_here import MadeHere, made_here
@@ -251,7 +251,7 @@ class Clearances:
         if wanted.recorded_text:
             try:
                 content = recorded_content(wanted.info)
-            except NoText as error:
+            except NoRecordedSource as error:
                 return NotCleared(str(error))
             trusted = made is not MadeHere.NO
         else:
@@ -357,8 +357,8 @@ def recorded_content(info: EpisodeInfo) -> TaskContent:
         NoText: it has none.
     """
     if not info.source or info.source_file is None:
-        raise NoText("this recording does not hold the text of its task")
-    main, texts = below_one_folder(info.source_file, info.source)
+        raise NoRecordedSource("this recording does not hold the text of its task")
+    main, texts = relative_sources(info.source_file, info.source)
     return TaskContent(main, {main: texts[main], **texts})
 
 
@@ -372,7 +372,7 @@ def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
     """Whether a file has the recorded text: then the recording's seal covers it, in any folder."""
     try:
         return content.hash == recorded_content(info).hash
-    except NoText:
+    except NoRecordedSource:
         return False
 
 

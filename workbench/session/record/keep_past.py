@@ -185,7 +185,7 @@ class PastKeeper:
                 for row, episodes in rows.items():
                     for episode in episodes:
                         if (writer := writers.get(episode.env)) is not None:
-                            writer.acts(moment.acted_by)
+                            writer.set_source(moment.acted_by)
                         else:
                             seed = seeds[episode.env]
                             writer = GatheredEpisode.of(self._folder, what.task, episode.env, seed)

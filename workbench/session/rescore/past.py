@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
-from workbench.jobs.verdict import Scores, Verdict, compare, single_numbers
+from workbench.jobs.verdict import Scores, Verdict, compare, scalar_entries
 from workbench.session.history.history import History, Moment
 from workbench.session.process.askers import Background
 from workbench.session.process.job_lane import Job, JobFailed
@@ -206,7 +206,7 @@ class RescoredPast:
         return compare(PastRun(env, begin, serials), old, new, self._drift[rows, env], begin=begin)
 
     def _write(self, table: dict[str, NDArray[np.float32]], row: int, step: StepResult) -> None:
-        for name, value in (("reward", step.reward), *single_numbers(step.evaluate).items()):
+        for name, value in (("reward", step.reward), *scalar_entries(step.evaluate).items()):
             if name not in table:
                 if len(table) > MOST_ENTRIES:
                     continue

@@ -16,7 +16,7 @@ from workbench.authoring.loading.reference import TaskName, named_file
 from workbench.authoring.problem import TaskError
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
-    NoText,
+    NoRecordedSource,
     class_in,
     options_of,
     recorded_source,
@@ -85,7 +85,7 @@ def group_episodes(
             continue
         try:
             text = recorded_content(info).hash if recorded_source else ""
-        except NoText as error:
+        except NoRecordedSource as error:
             broken_files.append(Verdict(episode, task=info.task, why_not=str(error)))
             continue
         options, note = rescore_options(options_of(info, 1, base))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.capture.recorded_run import pose_distances
-from workbench.jobs.verdict import gap, unlike
+from workbench.jobs.verdict import gap, numbers_differ
 from workbench.machine.text import length, number_text
 from workbench.recording.episode.episode import Episode
 
@@ -189,7 +189,7 @@ def _first_difference(
         return FirstDifference(name, begin, f"shape {a.shape[1:]} → {b.shape[1:]}", "", totals)
     yes = a.dtype.kind == "b" and b.dtype.kind == "b"
     one, two = (np.asarray(x, np.float64).reshape(len(x), -1) for x in (a, b))
-    differs = unlike(one, two, _LEAST)
+    differs = numbers_differ(one, two, _LEAST)
     rows = np.flatnonzero(differs.any(axis=1))
     if not len(rows):
         return FirstDifference(name, None, "", "", totals)

@@ -21,7 +21,7 @@ from workbench.core.snapshots.snapshot import (
 )
 from workbench.jobs.from_recording import changed_since
 from workbench.jobs.open_task import OpenedTask, blamed
-from workbench.jobs.replay import arrive, how
+from workbench.jobs.replay import replay_text, replay_to
 from workbench.jobs.task import NO_MOMENT, Restored
 from workbench.session.protocol.messages import EnterRecording, Restore
 from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
@@ -176,16 +176,16 @@ def enter_recording(
         TaskError: the task's code raised on the way; the envs are left there.
     """
     run = request.run
-    step, replay_result = arrive(opened, run, run.length, request.env_idx, on_step)
+    step, replay_result = replay_to(opened, run, run.length, request.env_idx, on_step)
     source = request.env_idx
     where = f"{run.name}, step {run.length}"
     loaded = opened.loaded
     file = None if loaded.file is None else str(loaded.file)
     changed = changed_since(request.source_file, request.source, file, loaded.source)
     text = (
-        f"{where} (changed since: {changed}): {how(replay_result)}"
+        f"{where} (changed since: {changed}): {replay_text(replay_result)}"
         if changed
-        else f"{where}: {how(replay_result)}"
+        else f"{where}: {replay_text(replay_result)}"
     )
     return step, Restored(
         request.env_idx, source, NO_MOMENT, None, replay_result.missed, where, text, number=request.number

@@ -19,7 +19,7 @@ from workbench.core.capture.inspect_env import inspect_env
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
-from workbench.jobs.actions import Acting
+from workbench.jobs.actions import ActionChooser
 from workbench.jobs.open_task import OpenedTask, Opening, blamed, warm_up
 from workbench.jobs.pool import Answer, CannotAnswer, Progress
 from workbench.jobs.task import Restored
@@ -105,7 +105,7 @@ class Worker:
         self._playing = False
         self._start_folder = CurrentFolder()
         self._scene = SceneEnv()
-        self._acting = Acting(self._start_folder)
+        self._chooser = ActionChooser(self._start_folder)
         self._settings = Settings()
         self._pacer = Pacer(0.05)
         self._rate = Rate()
@@ -269,11 +269,11 @@ class Worker:
             return
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         if report is None or not report.carried:
-            self._acting.seed(request.options.seed)
+            self._chooser.seed(request.options.seed)
         self._rate.clear()
         # The sliders belong to the previous scene; the server clears them too.
         self._settings = replace(self._settings, sliders=())
-        self._acting.sliders = ()
+        self._chooser.sliders = ()
         self._cameras.update_watched()
         self._steps.new_scene()
         send(Loaded(opened.description, opened.first, opened.milliseconds, report))
@@ -309,16 +309,16 @@ class Worker:
     def _seeds(self, request: Reset) -> int | list[int] | None:
         # The random actions restart with the seed, or a reset with it would not repeat an episode.
         if request.seed is not None:
-            self._acting.seed(request.seed)
+            self._chooser.seed(request.seed)
         count = 0 if request.env_idx is None else len(request.env_idx)
-        return self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
+        return self._chooser.fresh_seeds(count) if request.seed is None and count else request.seed
 
     def _apply_settings(self, new: Settings) -> None:
         old, self._settings = self._settings, new
         if new.speed != old.speed:
             self._pacer.speed = new.speed
             self._pacer.start(time.monotonic())
-        self._acting.sliders = new.sliders
+        self._chooser.sliders = new.sliders
         self._cameras.watch(new.selected_env, new.cameras)
         if (new.action_source, new.policy, new.policy_folder) != (
             old.action_source,
@@ -332,7 +332,7 @@ class Worker:
         s = self._settings
         try:
             folder = None if s.policy_folder is None else Path(s.policy_folder)
-            self._acting.use(s.action_source, s.policy, folder)
+            self._chooser.use(s.action_source, s.policy, folder)
         except TaskError as error:
             self._held.drop_steps_if_interrupted(error)
             # Before a task is loaded it would look like a failed load; the first step reports it.
@@ -366,7 +366,7 @@ class Worker:
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
             self._cameras.settle()  # the observation is about to draw the same scene
-        action = self._acting.next_action(opened.env)
+        action = self._chooser.next_action(opened.env)
         with blamed("step", opened.loaded, opened.env):
             step = opened.env.step(action)
         self._rate.tick(time.monotonic())
@@ -375,7 +375,7 @@ class Worker:
         if len(ended) == 0:
             return
         if self._settings.episode_end == "reset":
-            self._reset_envs(opened, tuple(int(i) for i in ended), self._acting.fresh_seeds(len(ended)))
+            self._reset_envs(opened, tuple(int(i) for i in ended), self._chooser.fresh_seeds(len(ended)))
         elif self._settings.episode_end == "pause":
             self._pause()
 
@@ -445,7 +445,7 @@ class Worker:
         self._last = step
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
-        acted_by = "" if restored else self._acting.name
+        acted_by = "" if restored else self._chooser.name
         event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored, acted_by, resumed)
         self._cameras.scene_changed()
         self._line.send(event)

@@ -18,7 +18,7 @@ from workbench.jobs.from_recording import (
     options_of,
     reference_of,
     run_of,
-    why_not_into,
+    why_not_enter,
     write_source,
 )
 from workbench.jobs.task import TaskOptions
@@ -149,11 +149,11 @@ class GoLive:
             session = self._place.session
             if session is not None and (self._own is None or self._own[1] is None):
                 task = session.view().task
-                if task is None or not why_not_into(task, info):
+                if task is None or not why_not_enter(task, info):
                     return session
             known = self._first if self._first is not session else None
             task = None if known is None else known.view().task
-            return known if task is not None and not why_not_into(task, info) else None
+            return known if task is not None and not why_not_enter(task, info) else None
 
     def _clear_and_go(self, way: _Way, wanted: CodeToRun) -> None:
         folder: Path | None = None

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.jobs.verdict import Verdict, in_order
+from workbench.jobs.verdict import Verdict, by_change
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text
@@ -55,7 +55,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         self._draw_status(rescored, TITLE)
         if rescored.verdicts is not self._verdicts:
             self._verdicts = rescored.verdicts
-            self._listed = in_order([verdict for verdict in rescored.verdicts if verdict.differs])
+            self._listed = by_change([verdict for verdict in rescored.verdicts if verdict.differs])
         self._draw_list(self._listed)
         self._draw_curve(rescored, view)
 

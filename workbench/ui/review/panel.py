@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import viser
 
-from workbench.jobs.from_recording import ChangesOnDisk, version_of
+from workbench.jobs.from_recording import ChangesOnDisk, recorded_version
 from workbench.recording.episode.episode import acted_by_text
 from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review.view import Opened, ReviewView, outcome_text
@@ -165,7 +165,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
         "review_facts",
         of=chosen,
         info=info,
-        version=version_of(info) or info.source_hash,
+        version=recorded_version(info) or info.source_hash,
         changed=changed,
         acted_by=acted_by_text(info.acted_by),
         assignments=assignments,

@@ -11,8 +11,8 @@ import numpy as np
 import viser
 
 from workbench.authoring.loading.reference import RecordedTask, named_file
-from workbench.jobs.from_recording import class_in, reference_of, version_of
-from workbench.jobs.verdict import Verdict, in_order
+from workbench.jobs.from_recording import class_in, recorded_version, reference_of
+from workbench.jobs.verdict import Verdict, by_change
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
@@ -76,7 +76,7 @@ def _in_words(reference: RecordedTask) -> str:
 
 
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:
-    hashes = list(dict.fromkeys(version for info in infos if (version := version_of(info))))
+    hashes = list(dict.fromkeys(version for info in infos if (version := recorded_version(info))))
     version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
     return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."
 
@@ -192,7 +192,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         told = self._rescorer.rescoring.view
         self._begin.visible = bool(view.opened) and told.state not in RUNNING
         self._draw_status(told, idle=IDLE)
-        self._draw_list(in_order(told.verdicts))
+        self._draw_list(by_change(told.verdicts))
         self._draw_curve()
 
     def _draw_codes(self, view: ReviewView) -> None:

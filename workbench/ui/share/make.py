@@ -285,7 +285,7 @@ def _make(wanted: MakeRequest, share: Share) -> None:
         nonlocal said_at
         if time.monotonic() - said_at >= SAY_EVERY:
             said_at = time.monotonic()
-            share.say((done, doing))
+            share.send_update((done, doing))
 
     def look(number: int, frame: FrameType | None) -> None:
         if share.limit() == 0:
@@ -306,4 +306,4 @@ def _make(wanted: MakeRequest, share: Share) -> None:
         except (ValueError, OSError, RuntimeError) as error:
             made = str(error)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        share.tell(0, made)
+        share.send_result(0, made)
