@@ -34,7 +34,7 @@ def relative_sources(main: str, source: Mapping[str, str]) -> tuple[str, dict[st
     may come from anybody.
 
     Raises:
-        NoText
+        NoRecordedSource
     """
     names = {path: PurePath(path) for path in source}
     # Absolute when recorded; relative to the main file's folder when read.

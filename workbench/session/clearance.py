@@ -354,7 +354,7 @@ def recorded_content(info: EpisodeInfo) -> TaskContent:
     """The source text in a recording.
 
     Raises:
-        NoText: it has none.
+        NoRecordedSource: it has none.
     """
     if not info.source or info.source_file is None:
         raise NoRecordedSource("this recording does not hold the text of its task")
