@@ -412,8 +412,13 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
         ("x = 1\n\n1 / 0\n", "import", "ZeroDivisionError: division by zero", "1 / 0"),
         ("def f():\n    raise ValueError\nf()\n", "import", "ValueError", "raise ValueError"),
         ("assert 1 == 2\n", "import", "AssertionError: assert 1 == 2", "assert 1 == 2"),
-        ("import no_such_module_anywhere\n", "import", "neither beside", "import no_such_module_anywhere"),
-        ("import healper\n", "import", "there is helper.py beside", "import healper"),
+        (
+            "import no_such_module_anywhere\n",
+            "import",
+            "neither in the file's folder",
+            "import no_such_module_anywhere",
+        ),
+        ("import healper\n", "import", "there is helper.py in the file's folder", "import healper"),
         ("from helper import NOTHING\n", "import", "ImportError", "from helper import NOTHING"),
         ("exit()\n", "import", "__main__", "exit()"),
         (

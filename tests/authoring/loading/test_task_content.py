@@ -133,7 +133,7 @@ def test_what_was_agreed_to_is_what_runs(tmp_path: Path) -> None:
 def test_what_nobody_agreed_to_does_not_run_however_it_is_imported(tmp_path: Path) -> None:
     hidden = "get = globals()['__builtins__']; get = get if isinstance(get, dict) else vars(get)\nget['__imp' + 'ort__']('other')"
     file = lay(tmp_path, task=f"{TASK}{hidden}", other="")
-    with pytest.raises(TaskError, match="was not among what you were asked about"):
+    with pytest.raises(TaskError, match="not among the files that you approved"):
         load_task(recorded(file))
     # Also where an earlier task has put the folder on the path.
     sys.path.insert(0, str(tmp_path))

@@ -181,11 +181,11 @@ def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> Non
         ),
         (
             "X = iter((1.5, 2.5))\nnote(X.__next__)",
-            "where `X.__next__` gets its value cannot be read in the file",
+            "the assignment of `X.__next__` is not found in the file",
         ),
         (
             "for _ in range(2):\n    if _:\n        X = 1\n    else:\n        X = 1\n    note(X)",
-            "`X` is given the same values, and which of them holds cannot be told in lines 11 and 13",
+            "`X` gets the same value in lines 11 and 13, and it is unknown which of them ran",
         ),
     ],
 )
@@ -261,7 +261,7 @@ task.hook()
             "self.far = 4.5; note(self.far)",
             "`self.far` cannot be read in the file: it is set again at line 19",
         ),
-        ("vars(self)['x'] = 1; note(self.x)", "where `self.x` gets its value cannot be read in the file"),
+        ("vars(self)['x'] = 1; note(self.x)", "the assignment of `self.x` is not found in the file"),
     ],
 )
 def test_attributes_are_those_of_the_running_object(call: str, what: str) -> None:
@@ -303,7 +303,7 @@ assert len(made) == 1
         (
             "from places import X\nnote(X)",
             "X = 1\nX += 1",
-            "`X` is given other values than it has in lines 1 and 2",
+            "`X` gets other values than its current one in lines 1 and 2",
         ),
         (
             "from places import X\nnote(X)",
@@ -340,7 +340,7 @@ def test_of_several_lines_the_one_with_the_running_value_is_meant() -> None:
     text = "X = 1.5\ndef f():\n    note(X)\nif len('ab') > 1:\n    X = 2.5\nelse:\n    X = max(3, 4)\nf()"
     assert told(text) == "2.5 < X"
     text = text.removesuffix("f()") + "vars()['X'] = 7.5\nf()"
-    assert told(text) == "`X` is given other values than it has in lines 9 and 13 and 15"
+    assert told(text) == "`X` gets other values than its current one in lines 9 and 13 and 15"
 
 
 def test_values_within_a_function_are_those_of_its_frame() -> None:

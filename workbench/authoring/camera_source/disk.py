@@ -1,4 +1,4 @@
-"""Applies and reverts edits of the author's files, as a whole and only over the text they were planned on."""
+"""Applies and reverts edits of the author's files, only over the text they were planned on."""
 
 from __future__ import annotations
 

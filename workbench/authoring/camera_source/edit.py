@@ -1,4 +1,4 @@
-"""An edit of a camera while it is planned: finds the call to change, and verifies the new text by running it."""
+"""A planned edit of a camera, verified by running the new text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes a new camera pose in the author's own form (`look_at`, Euler angles, a quaternion) where that can express it."""
+"""Writes a new camera pose in the author's own form where that can express it."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
     """The text of the copy, and pairs of the original's and the copy's id.
 
     Only what depends on the file's place and ids changes: relative imports name their package, `__file__` becomes the
-    installed module's (assets lie beside it), and registered ids get another name. The rest is the same to the character.
+    installed module's (its assets are there), and registered ids get another name. The rest is the same to the character.
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.
@@ -106,7 +106,7 @@ def _absolute(file: SourceFile, node: ast.ImportFrom, package: list[str]) -> Rep
     where = f"line {node.lineno} imports {'.' * node.level}{node.module or ''}"
     if not package:
         raise CannotCopy(
-            f"{where}, which lies beside the file and not in a package: copy them together yourself"
+            f"{where}, a module of the same folder that is in no package: copy both files yourself"
         )
     # The last part is the module's own name, which a package's __init__ does not have.
     inside = package if file.name == "__init__.py" else package[:-1]

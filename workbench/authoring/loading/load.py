@@ -67,11 +67,11 @@ class LoadedTask:
     file: Path | None
     """Source file of the class."""
     source_files: tuple[Path, ...]
-    """The task's file first, then the modules beside it that it imported."""
+    """The task's file first, then the imported modules of its folder."""
     source: dict[str, str]
     """Path to the text that was executed, for each of `source_files`."""
     source_hash: str
-    """sha256 over `source`, 12 hex digits; the same wherever the files lie."""
+    """sha256 over `source` with relative paths, 12 hex digits."""
     max_episode_steps: int | None
     default_kwargs: dict[str, Any]
     """Constructor arguments from ``@register_env``."""
@@ -546,16 +546,16 @@ def _module_hint(name: str, finder: AuthorFinder) -> str:
     top = name.partition(".")[0]
     if Path(f"{top}.py").is_file() or Path(top, "__init__.py").is_file():
         return (
-            f"there is one in the folder where the command was started, which is not searched: move {top} beside the "
-            "file, or name its folder in PYTHONPATH"
+            f"there is one in the folder where the command was started, which is not searched: move {top} into the "
+            "file's folder, or add its folder to PYTHONPATH"
         )
-    beside = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
-    if finder.only_given and name.rpartition(".")[2] in beside:
+    siblings = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
+    if finder.only_given and name.rpartition(".")[2] in siblings:
         return (
-            f"{name} lies beside the file, but was not among what you were asked about; open {finder.file} by its name "
-            "to run it with all that lies beside it"
+            f"{name} is in the file's folder, but not among the files that you approved; open {finder.file} by its name "
+            "to run it with all files of its folder"
         )
-    close = difflib.get_close_matches(name, beside, n=1)
+    close = difflib.get_close_matches(name, siblings, n=1)
     if close:
-        return f"there is {close[0]}.py beside the file"
-    return f"neither beside the file nor installed for {sys.executable}"
+        return f"there is {close[0]}.py in the file's folder"
+    return f"neither in the file's folder nor installed for {sys.executable}"

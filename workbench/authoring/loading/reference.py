@@ -1,4 +1,4 @@
-"""Parses what names a task (a file, a class in a file or module, an id) without importing or running it."""
+"""Parses references to tasks (file, class, id) without importing or running them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chooses the class of a file to open: the named one, else the last registered task, else a robot in a scene."""
+"""Chooses the class of a file to open, or a robot in a scene if there is no task."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def choose_task(
     text: str,
     registrations: registry.Registrations,
 ) -> ChosenTask:
-    """The class `requested` of a module that was just executed, or the default one for None.
+    """The class `requested` of a module that was just executed, or the default: its last registered task, or a robot.
 
     Args:
         text: of the file.

@@ -114,7 +114,7 @@ class _Reader:
         if name in self._texts:
             return
         if len(self._texts) >= MOST_MODULES:
-            raise CannotRead(f"{self._file} has more than {MOST_MODULES} modules beside it.")
+            raise CannotRead(f"{self._file} has more than {MOST_MODULES} modules.")
         self._texts[name], self._sums[name] = _read(path)
         self._waiting.append(path)
 

@@ -1,1 +1,1 @@
-"""What a save changed, and the least that must be done about it."""
+"""Compares two versions of a task and decides how much of the env must be rebuilt."""

@@ -6,6 +6,7 @@ import ast
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 from types import CodeType, FunctionType
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from workbench.authoring.reload.kept_state import (
     root_name,
     written_attributes,
 )
-from workbench.authoring.reload.symbols import STATEMENTS, Key, file_name
+from workbench.authoring.reload.symbols import STATEMENTS, Key
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
 """same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets: the new class is
@@ -263,7 +264,7 @@ class _Comparison:
         for key, by in running.items():
             if by is not None and key not in family and self._versions.by_key[key][0].kind == "class":
                 raise _NeedsRebuild(
-                    f"{self._label(by)} uses the class {self._label(key)}, of which there may be objects"
+                    f"{self._label(by)} uses the class {self._label(key)}, which may have objects"
                 )
 
     def _refuse_memoized(self, affected: set[Key]) -> None:
@@ -310,10 +311,10 @@ class _Comparison:
         path, name = key
         if name.endswith(STATEMENTS):
             within = name.removesuffix(STATEMENTS).rstrip(".")
-            return f"a statement at the top of {within or file_name(path)}"
+            return f"a statement at the top of {within or PurePath(path).name}"
         if path == self._task[0]:
             return name.removeprefix(f"{self._task[1]}.")
-        return f"{name} of {file_name(path)}"
+        return f"{name} of {PurePath(path).name}"
 
 
 def _goes_on_after_super(nodes: Iterable[ast.AST]) -> bool:

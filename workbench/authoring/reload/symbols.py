@@ -6,7 +6,6 @@ import ast
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import PurePath
 from typing import Literal
 
 Kind = Literal["function", "value", "import", "class", "statements"]
@@ -242,10 +241,6 @@ def _walk_code(node: ast.AST) -> Iterator[ast.AST]:
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
                 yield from _walk_code(child)
-
-
-def file_name(path: str) -> str:
-    return PurePath(path).name
 
 
 def _remove_docstrings(tree: ast.Module) -> None:

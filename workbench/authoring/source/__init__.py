@@ -1,1 +1,1 @@
-"""Where values of a running call stand in the source, and edits of them."""
+"""Finds where the values of a running call are written in the source, and edits them."""

@@ -298,7 +298,7 @@ class ValueReader:
         return self._project.file(path) if path in self._project.texts else None
 
     def _follow(self, file: SourceFile, node: ast.expr) -> tuple[SourceFile, ast.expr, str | None]:
-        """File and expression that a name stands for, and another reader of it. Raises Unknown."""
+        """File and expression that defines a name, and another reader of it. Raises Unknown."""
         project = self._project
         if isinstance(node, ast.Subscript):
             return self._element(file, node)
@@ -307,9 +307,10 @@ class ValueReader:
         assert isinstance(node, ast.Attribute)
         owner = self._object(file, node.value)
         if isinstance(owner, ModuleType):
-            beside = project.file(owner.__file__ or "")
-            inside = project.bindings(beside, beside.module).get(node.attr, [])
-            return self._follow_bindings(file, node, inside)
+            module = project.file(owner.__file__ or "")
+            return self._follow_bindings(
+                file, node, project.bindings(module, module.module).get(node.attr, [])
+            )
         return self._follow_bindings(file, node, self._attribute_bindings(file, node))
 
     def _follow_bindings(
@@ -317,14 +318,14 @@ class ValueReader:
     ) -> tuple[SourceFile, ast.expr, str | None]:
         code = file.code(node)
         if not bindings:
-            raise Unknown(f"where `{code}` gets its value cannot be read in the file")
+            raise Unknown(f"the assignment of `{code}` is not found in the file")
         binding = bindings[0] if len(bindings) == 1 else self._binding_of_run(file, node, bindings)
         if binding.imported is not None:
-            beside = self._imported_file(binding) if binding.imported[1] else None
+            source = self._imported_file(binding) if binding.imported[1] else None
             inside = (
                 []
-                if beside is None
-                else self._project.bindings(beside, beside.module).get(binding.imported[1], [])
+                if source is None
+                else self._project.bindings(source, source.module).get(binding.imported[1], [])
             )
             if not inside:
                 raise Unknown(f"`{code}` comes from {binding.dotted}, which is not one of your files")
@@ -353,12 +354,12 @@ class ValueReader:
         if len(fitting) == 1:
             return fitting[0]
         lines = " and ".join(str(b.file.line(b.node)) for b in fitting or bindings)
-        why = (
-            "the same values, and which of them holds cannot be told"
-            if fitting
-            else "other values than it has"
-        )
-        raise Unknown(f"`{file.code(node)}` is given {why} in lines {lines}")
+        code = file.code(node)
+        if fitting:
+            raise Unknown(
+                f"`{code}` gets the same value in lines {lines}, and it is unknown which of them ran"
+            )
+        raise Unknown(f"`{code}` gets other values than its current one in lines {lines}")
 
     def _attribute_bindings(self, file: SourceFile, node: ast.Attribute) -> list[Binding]:
         """The bindings of ``self.NAME``, ``cls.NAME`` or ``Class.NAME``."""
@@ -482,7 +483,7 @@ class KnownFunction:
 
 @cache
 def known_functions() -> dict[Callable[..., Any], KnownFunction]:
-    """Known functions by identity, whatever name a file gives them."""
+    """Known functions by identity, so that a file may import them under any name."""
     maniskill_private.mark_camera_configs()  # wraps look_at; the original may have been imported before: both are known
     converts, number, look_at = (
         KnownFunction(converts=True),
