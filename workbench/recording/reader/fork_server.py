@@ -85,8 +85,6 @@ def _run_reader(end: socket.socket, wanted: NewReader, fork_server: int) -> None
     try:
         end_with_parent(fork_server)
         os.setpgid(0, 0)
-        if wanted.episodes:
-            import_episode_readers()
         if wanted.writes is None:
             confine(wanted.paths, MOST_MEMORY)
         else:
@@ -97,10 +95,6 @@ def _run_reader(end: socket.socket, wanted: NewReader, fork_server: int) -> None
 
 
 # --- a reader --------------------------------------------------------------------------------------
-
-
-def import_episode_readers() -> None:
-    """Import what reads an episode."""
 
 
 def serve(line: MessageSocket) -> None:

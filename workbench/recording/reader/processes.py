@@ -141,13 +141,12 @@ class Reader:
 
     _numbers = itertools.count(1)
 
-    def __init__(self, folder: Path, episodes: bool, writes: Path | None = None) -> None:
+    def __init__(self, folder: Path, writes: Path | None = None) -> None:
         """
         Args:
-            episodes: it reads whole episodes, not rows.
             writes: folder that it may write to.
         """
-        self._folder, self._episodes, self._writes = Path(folder), episodes, writes
+        self._folder, self._writes = Path(folder), writes
         self._allowed: set[Path] = set()
         """Further files: targets of links in the folder."""
         self._turns = _Turns()
@@ -243,7 +242,7 @@ class Reader:
         if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
         if self._line is None:
-            wanted = NewReader(list(paths), self._episodes, self._writes)
+            wanted = NewReader(list(paths), self._writes)
             self._pid, self._line = fork_server.new_reader(wanted)
             self.process, self._there = next(self._numbers), there
         return self._line

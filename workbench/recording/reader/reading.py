@@ -176,7 +176,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
         return ()
     except OSError as error:
         raise RecordingError(f"{failed}{error.strerror}") from error
-    reader = Reader(Path("/"), episodes=False, writes=folder.absolute())
+    reader = Reader(Path("/"), writes=folder.absolute())
     try:
         answer = reader.ask(Recover(folder.absolute()), RECOVERY_SECONDS).answer
     except OSError as error:
@@ -221,7 +221,7 @@ def _reader(folder: Path, episodes: bool) -> Reader:
     gone = None
     with _lock:
         if key not in _readers:
-            _readers[key] = Reader(key[0], episodes)
+            _readers[key] = Reader(key[0])
         _readers.move_to_end(key)
         if len(_readers) > MOST_READERS:
             _, gone = _readers.popitem(last=False)

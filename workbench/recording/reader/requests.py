@@ -19,8 +19,6 @@ class NewReader(msgspec.Struct, tag=True):
     """Fork a reader for these paths; sent with its socket. Answered by its process id."""
 
     paths: list[Path]
-    episodes: bool
-    """It will read whole episodes: import their readers at once."""
     writes: Path | None = None
     """Folder that it may write to."""
 

@@ -1,14 +1,4 @@
-"""Put a blueprint into an ``.rrd`` that is whole.
-
-What writes chunks to a file (``LazyChunkStream.write_rrd``) writes those of a recording alone. Rerun's other way, a ``RecordingStream`` that
-saves to a file, takes a blueprint, but it writes on threads of its own: a disk that is full makes it wait for ever, what it could not
-write it does not say, and their start and end is a quarter of what a short episode's file costs (measured).
-
-An ``.rrd`` is a header of 12 bytes, messages, each with its kind and length before it (16 bytes), the last of them the index, and 32 bytes
-that say where the index is and how it hashes (crate ``re_log_encoding``, ``rrd/frames.rs``; ``rerun/proto/rerun/v1alpha1/log_msg.proto``). The index
-is a list of manifests, one a store, and a blueprint is a store. So a blueprint's messages go before the index, where they move nothing that it
-speaks of; their own manifest, which rerun made, is told how far they moved and added to the list.
-"""
+"""Adds a blueprint to a complete ``.rrd``."""
 
 from __future__ import annotations
 
@@ -35,14 +25,14 @@ _HEADER = 12
 _MESSAGE = struct.Struct("<QQ")
 _INDEX_KIND = 0
 _FOOTER = struct.Struct("<QQI12s")
-"""Where the index begins (without its kind and length), how long it is, its hash, and whose footer this is."""
+"""Offset of the index (behind its kind and length), its length, its hash, and the mark."""
 _FOOTER_MARK = b"RRF2FOOT" + (1).to_bytes(4, "little")
 _HASH_SEED = 7850921
 """Rerun's ``StreamFooter::CRC_SEED``."""
 _MANIFESTS = 1
 """Field of ``RrdFooter``."""
 _TABLE = 4
-"""Field of ``RrdManifest``: where the chunks are. Of what that is, the fields:"""
+"""Field of ``RrdManifest``: the table of chunks. Its fields:"""
 _PAYLOAD, _COMPRESSION, _UNPACKED = 2, 3, 4
 _LZ4 = 2
 _PLACE = "chunk_byte_offset"
@@ -50,7 +40,7 @@ _PLACE = "chunk_byte_offset"
 
 @dataclass(frozen=True)
 class BlueprintBytes:
-    """A blueprint as rerun encodes it, with the message that says to use it, at once and by default."""
+    """An encoded blueprint, with the message that activates it and makes it the default."""
 
     messages: bytes
     manifest: Sequence[Field]
@@ -58,10 +48,10 @@ class BlueprintBytes:
     table: Sequence[Field]
     """All but its payload."""
     places: pa.RecordBatch
-    """The payload, as if `messages` came right after the header."""
+    """The payload, with offsets for `messages` right behind the header."""
 
     def manifest_at(self, begin: int) -> bytes:
-        """What the index says of `messages` that begin `begin` bytes after the beginning of a file."""
+        """The manifest of `messages` at offset `begin` of a file."""
         column = self.places.schema.get_field_index(_PLACE)
         places = pa.array(self.places.column(column).to_numpy() + np.uint64(begin - _HEADER))
         moved = self.places.set_column(column, self.places.schema.field(column), places)
@@ -75,8 +65,7 @@ class BlueprintBytes:
 
 
 _encoding = threading.Lock()
-"""Rerun calls back from a thread of its own, for which it needs the interpreter's lock: two threads that are at this wait for each other
-for ever (seen)."""
+"""Rerun calls back on its own thread, which needs the interpreter's lock: two threads in this call deadlock (seen)."""
 
 
 def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> BlueprintBytes:
@@ -100,7 +89,7 @@ def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> Blueprint
 
 @contextmanager
 def _rerun_on() -> Iterator[None]:
-    """Whoever runs with ``RERUN=off`` means the logging in their own code: rerun would make no blueprint either."""
+    """Override ``RERUN=off`` of the user, which is for logging in their code: with it rerun makes no blueprint."""
     entries = os.environ.get("RERUN")
     if entries is None:
         yield
@@ -125,15 +114,25 @@ def _encoded(application_id: str, blueprint: rrb.Blueprint) -> bytes:
     layout.flush()
     layout.disconnect()
     del layout
-    rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads live as long as the process
-    return streams[-1]  # the one before it has no message
+    rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads never end
+    return streams[-1]  # the stream before has no messages
 
 
 def add_blueprint(path: Path, blueprint: BlueprintBytes) -> None:
-    """Put `blueprint` into the file at `path`.
+    """Add `blueprint` to the file at `path`.
+
+    ``LazyChunkStream.write_rrd`` writes the chunks of a recording only. Rerun's ``RecordingStream`` takes a blueprint, but
+    writes on threads of its own: it waits for ever on a full disk, does not report what it could not write, and starting
+    and ending them takes a quarter of the time of a short episode's file (measured).
+
+    An ``.rrd`` is a header of 12 bytes, messages with kind and length (16 bytes) before each, the last one the index, and
+    a footer of 32 bytes with offset and hash of the index (crate ``re_log_encoding``, ``rrd/frames.rs``;
+    ``rerun/proto/rerun/v1alpha1/log_msg.proto``). The index is a list of manifests, one per store, and a blueprint is a
+    store. So the blueprint's messages go in front of the index, where they move no other message, and their manifest,
+    with shifted offsets, is added to the list.
 
     Raises:
-        OSError: it cannot be read or written, or does not end as an ``.rrd`` with an index does.
+        OSError: it cannot be read or written, or is not a complete ``.rrd``.
     """
     with path.open("r+b") as file:
         size = file.seek(0, os.SEEK_END)
@@ -153,10 +152,10 @@ def add_blueprint(path: Path, blueprint: BlueprintBytes) -> None:
 
 
 def blueprint_stream(path: Path) -> bytes | None:
-    """The blueprint that `add_blueprint` put into the file at `path`, as a stream of its own; None where there is none.
+    """The blueprint that `add_blueprint` added to the file at `path`, as a stream; None if there is none.
 
-    For who reads a file from its beginning, and would show it in an arrangement of its own until the blueprint comes. Raises OSError,
-    ValueError or RuntimeError where the file is no ``.rrd``.
+    Send it before the file: a viewer that reads the file from its beginning uses its own layout until the blueprint
+    comes. Raises OSError, ValueError or RuntimeError if the file is not an ``.rrd``.
     """
     last = max((chunk.end for chunk in index_of(RrdReader(path).store())), default=0)
     with path.open("rb") as file:
@@ -176,7 +175,7 @@ def _message(field: Field) -> list[Field]:
 
 
 def _read_footer(footer: bytes, size: int, name: str) -> tuple[int, int, bytes]:
-    """Where the index of a file of `size` bytes begins, its length, and the mark. Raises OSError where it is another's footer."""
+    """Offset and length of the index of a file of `size` bytes, and the mark. Raises OSError if the footer is invalid."""
     begin, length, _, mark = _FOOTER.unpack(footer) if len(footer) == _FOOTER.size else (0, 0, 0, b"")
     if mark != _FOOTER_MARK or begin + length + _FOOTER.size != size:
         raise OSError(errno.EIO, f"{name} does not end as rerun 0.41 ends a file")

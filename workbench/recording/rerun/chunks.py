@@ -1,9 +1,4 @@
-"""Rerun's chunks, one an entity: what is static, poses and numbers in time.
-
-Rerun's own archetypes check and convert what they are given, which for a few hundred rows takes longer than making the chunk. So of
-those they are asked once what their columns are called and of which Arrow type they are, and the columns of every episode are made
-from that.
-"""
+"""Makes rerun's chunks: static values, poses and numbers over time."""
 
 from __future__ import annotations
 
@@ -31,16 +26,16 @@ SERIES_COLORS = (
     (150, 150, 150),
     (136, 100, 220),
 )
-"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey and violet for its black and
-yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
+"""Okabe and Ito's palette for colour-blind people, with grey and violet instead of black and yellow, which are
+invisible in the viewer's dark or light theme."""
 
 
 def changed_rows(values: NDArray) -> list[NDArray[np.int64] | None]:
-    """Of each of K things, which rows of `values` (K, R, D) say something; None for all of them.
+    """Rows of `values` (K, R, D) to write, for each of the K series; None for all rows.
 
-    A row between two equal ones says nothing: whoever looks there finds the one before, and a curve is the same line.
-    A row of one number takes 20 bytes in the file besides that number, and most flags of a task change once in an episode. The
-    first and the last row always stay, so that an entity is there for as long as it was recorded.
+    A row that equals both neighbours is left out: the row before it holds there, and the curve is the same. A row of one
+    number takes 20 bytes besides the number, and most flags change once per episode. First and last row always stay, so
+    that the entity covers the recorded time.
     """
     count, rows = values.shape[:2]
     if rows < 3 or not values.size:
@@ -55,10 +50,10 @@ def changed_rows(values: NDArray) -> list[NDArray[np.int64] | None]:
 
 
 def static_chunk(entity: str, *values: Any) -> Chunk:
-    """`values` as what `entity` is all through.
+    """`values` of `entity` for all times.
 
     Raises:
-        ValueError: rerun refuses one of them.
+        ValueError: rerun refuses a value.
     """
     batches = [batch for value in values for batch in value.as_component_batches()]
     columns = [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
@@ -66,7 +61,7 @@ def static_chunk(entity: str, *values: Any) -> Chunk:
 
 
 def property_chunk(name: str, values: Mapping[str, Any]) -> Chunk:
-    """What a recording as a whole is said to be; what is None is left out, and a list is several."""
+    """A property of the whole recording; None values are left out, and a list is several values."""
     columns: list[Any] = [
         _Column(rr.ComponentDescriptor(key), pa.array([value if isinstance(value, list) else [value]]))
         for key, value in values.items()
@@ -78,14 +73,18 @@ def property_chunk(name: str, values: Mapping[str, Any]) -> Chunk:
 @lru_cache(maxsize=512)
 def series_chunk(entity: str, names: tuple[str, ...], first_color: int = 0) -> Chunk:
     """Name and colour of each number of the batched scalars of `entity`."""
-    # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
+    # By default rerun gives all series of an entity one colour, and entities of a folder similar ones.
     colors = [SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))]
     return static_chunk(entity, rr.SeriesLines(names=list(names), colors=colors))
 
 
 @dataclass(frozen=True)
 class _Column:
-    """What rerun's ``ComponentColumn`` is, of an array that is Arrow's already."""
+    """Replaces rerun's ``ComponentColumn``, for an Arrow array.
+
+    Rerun's archetypes validate and convert their arguments, which for a few hundred rows takes longer than making the
+    chunk. They are called once, for names and Arrow types of the columns.
+    """
 
     descriptor: rr.ComponentDescriptor
     values: pa.Array
@@ -110,8 +109,8 @@ def _number_column() -> tuple[rr.ComponentDescriptor, pa.DataType]:
 
 
 def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
-    """`numbers`, all of them, as rows of `kind` with `per_row` elements each, which may be fixed lists themselves."""
-    # Rows of a journal lie as they came, at any byte: Arrow takes them over as they lie, and rerun ends the process (seen).
+    """`numbers` as rows of type `kind` with `per_row` elements each, which may be fixed-size lists."""
+    # Rows of a journal may be unaligned: Arrow would use them without a copy, and rerun aborts the process (seen).
     flat = pa.array(np.require(numbers.reshape(-1), requirements=["C", "A"]))
     if pa.types.is_fixed_size_list(kind.value_type):
         flat = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
@@ -129,9 +128,7 @@ class TimedChunks:
     def __init__(self, control_dt: float) -> None:
         """`control_dt` in seconds."""
         self._control_dt = control_dt
-        self._times: dict[
-            bytes, list[rr.TimeColumn]
-        ] = {}  # by their steps, which most entities of a piece share
+        self._times: dict[bytes, list[rr.TimeColumn]] = {}  # by steps: most entities share them
 
     def of(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> Chunk:
         """`columns` with a row for each of `steps` (R,)."""
@@ -140,7 +137,7 @@ class TimedChunks:
     def poses(
         self, entities: Sequence[str], steps: NDArray[np.int64], poses: NDArray[np.float32]
     ) -> Iterator[Chunk]:
-        """`poses` (len(steps), len(entities), 7) translation and xyzw; rows that `changed_rows` leaves out are."""
+        """`poses` (len(steps), len(entities), 7), translation and xyzw; only `changed_rows`."""
         by_entity = np.ascontiguousarray(poses.transpose(1, 0, 2), dtype=np.float32)
         for entity, rows, values in zip(entities, changed_rows(by_entity), by_entity):
             if rows is not None:
@@ -152,7 +149,7 @@ class TimedChunks:
             yield self.of(entity, steps if rows is None else steps[rows], columns)
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> Chunk:
-        """`values` (len(steps), ...), all of a step as one batch, at least one; rows that `changed_rows` leaves out are."""
+        """`values` (len(steps), ...), one batch per step with at least one number; only `changed_rows`."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
         (rows,) = changed_rows(flat[None])
         if rows is not None:
@@ -167,7 +164,7 @@ class TimedChunks:
                 self._times.clear()
             self._times[key] = [
                 rr.TimeColumn(STEP, sequence=steps),
-                # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
+                # Rounded, because rerun truncates: 3 * 0.05 s would be 149999999 ns.
                 rr.TimeColumn(
                     SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
                 ),
@@ -176,5 +173,5 @@ class TimedChunks:
 
 
 def static_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:
-    """The one pose, (3,) and (4,), of what never moves."""
+    """The pose, (3,) and (4,), of an entity that never moves."""
     return static_chunk(entity, rr.Transform3D(translation=translation, quaternion=rr.Quaternion(xyzw=xyzw)))

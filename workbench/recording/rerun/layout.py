@@ -1,23 +1,4 @@
-"""Which entity of a recording holds what: an episode laid out for rerun.
-
-A recording is read by people in the viewer and by programs, so where a thing lies is a contract:
-
-- ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
-- ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
-- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/batch/<entry>`` for numbers that ``evaluate()``
-  returned without a row for each env, ``/observation/state``,
-  ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text.
-
-Two timelines index all of it: ``step``, the state's number, and ``sim_time``. Row k is what
-`StepResult` k said: the state after k control steps, with the action that led there and the reward
-that it earned, so the action of row k is ``episode.action[k - 1]`` and row 0 has neither.
-
-A row of numbers or of a pose that is between two equal ones is left out (`rerun_chunks.changed_rows`): the state before it says what it is.
-
-Everything goes in as columns (one call an entity), which research measured at forty times the speed
-of one call a row. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
-z forward); ManiSkill has wxyz and x forward, y left, z up.
-"""
+"""Lays out an episode as rerun entities."""
 
 from __future__ import annotations
 
@@ -48,29 +29,44 @@ LOGS = "/logs"
 EVENTS = "/logs/events"
 ENTRY_TEXTS = "/logs/evaluate"
 OBSERVATION = "/observation/state"
-"""All observations but pictures as one batch, as LeRobot has them: an entity each would be 5 kB a file and 40 B a step."""
+"""All observations but pictures as one batch, as in LeRobot: an entity each would cost 5 kB per file and 40 B per step."""
 REWARD_TERMS = "reward_terms/"
-"""What an entry of ``evaluate()`` begins with that is a part of the reward."""
+"""Prefix of the entries of ``evaluate()`` that are terms of the reward."""
 
 _MOST_PIXELS, _MOST_PICTURES = 1 << 20, 1024
-"""Of the pictures of one chunk, which are in memory together."""
+"""Limits of one chunk, whose pictures are in memory together."""
 _PNG_RGBA = 6
 """Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
 FRUSTUM_METRES = 0.12
-"""How far in front of a camera its picture is drawn in the 3-D view."""
+"""Distance from a camera to its picture in the 3-D view."""
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
-"""Of a pose: rerun's order of a quaternion from ours."""
+"""Indices of a pose that turn wxyz into rerun's xyzw."""
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
 
 
 def chunks(episode: Episode) -> Iterator[Chunk]:
-    """All of an episode that has a scene, what does not change first; of its pictures some at a time.
+    """All chunks of an episode with a scene, static ones first; pictures are read as they are needed.
+
+    Programs read these files too, so the layout is a contract:
+
+    - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
+    - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
+    - ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/batch/<entry>`` for numbers that
+      ``evaluate()`` returned without a row per env, ``/observation/state``,
+      ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text.
+
+    Timelines are ``step``, the state's number, and ``sim_time``. Row k is the state after k control steps, with the
+    action that led there and its reward: the action of row k is ``episode.action[k - 1]``, and row 0 has neither. Rows
+    of numbers or poses between two equal ones are left out (`chunks.changed_rows`): the last row before them holds.
+
+    All data are columns, one call per entity: forty times faster than one call per row (measured). Rerun has xyzw
+    quaternions and OpenCV cameras (x right, y down, z forward); ManiSkill has wxyz and x forward, y left, z up.
 
     Raises:
-        ValueError: rerun refuses something in it.
-        OSError: one of its pictures cannot be read.
+        ValueError: rerun refuses a value.
+        OSError: a picture cannot be read.
     """
     geometry, poses = episode.geometry, episode.poses
     assert geometry is not None and poses is not None
@@ -111,13 +107,13 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
 
 
 def _never_moves(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(...) of poses (R, ..., 7): whether it never moved."""
-    bits = poses.view(np.int32)  # a NaN is no movement
+    """(...) of poses (R, ..., 7): whether all R are equal."""
+    bits = poses.view(np.int32)  # as bits, so that NaN equals NaN
     return np.asarray((bits == bits[0]).all(axis=(0, -1)))
 
 
 def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
-    """Which pictures of which camera go into one chunk, in order of time."""
+    """Camera and slice of pictures of each chunk, in order of time."""
     found = []
     for number, camera in enumerate(cameras):
         many = min(max(_MOST_PIXELS // (camera.info.width * camera.info.height), 1), _MOST_PICTURES)
@@ -132,8 +128,8 @@ def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
 def body_entities(geometry: SceneGeometry) -> tuple[str, ...]:
     """(B,) entity path of each body: ``/world/<actor>`` or ``/world/<articulation>/<link>``.
 
-    Rerun composes the transforms of nested entities, so no body may lie below another one: an actor
-    that is called like an articulation, or like the folder of the cameras, gets an underscore.
+    Rerun composes the transforms of nested entities, so no body may be below another: an actor with the name of an
+    articulation, or of the cameras' folder, gets an underscore.
     """
     names = [tuple(part for part in name.split("/") if part) or ("unnamed",) for name in geometry.body_names]
     names = [("cameras_", *name[1:]) if name[0] == "cameras" else name for name in names]
@@ -154,14 +150,14 @@ def camera_entities(cameras: Sequence[CameraInfo]) -> tuple[str, ...]:
 
 
 def evaluate_entity(name: str) -> str:
-    """Of an entry of ``evaluate()``; the terms of the reward, as the task names them, lie below ``/reward``."""
+    """Entity of an entry of ``evaluate()``; terms of the reward are below ``/reward``."""
     if name.startswith(REWARD_TERMS):
         return rr.new_entity_path(["reward", name[len(REWARD_TERMS) :] or "unnamed"])
     return rr.new_entity_path(["evaluate", name or "unnamed"])
 
 
 def batch_entity(name: str) -> str:
-    """Of an entry of ``evaluate()`` that is a number of the whole batch."""
+    """Entity of an entry of ``evaluate()`` that is a number of the whole batch."""
     return rr.new_entity_path(["batch", name or "unnamed"])
 
 
@@ -169,12 +165,12 @@ def batch_entity(name: str) -> str:
 
 
 def _meshes(geometry: SceneGeometry, env: int, bodies: Mapping[int, str]) -> Iterator[Chunk]:
-    worn: Counter[int] = Counter()
+    count: Counter[int] = Counter()
     for visual in geometry.visuals:
         for body in map(int, visual.bodies[visual.envs == env]):
-            if body in bodies and (drawn := _drawn(visual, f"{bodies[body]}/{worn[body]}")) is not None:
+            if body in bodies and (drawn := _mesh_chunk(visual, f"{bodies[body]}/{count[body]}")) is not None:
                 yield drawn
-                worn[body] += 1
+                count[body] += 1
 
 
 @cache
@@ -183,16 +179,16 @@ def _world() -> Chunk:
 
 
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
-"""What `_drawn` made, by the visual's id, for as long as the visual lives: episodes follow each other in one scene, and its textures
-are megabytes to convert."""
+"""Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
+textures are megabytes to convert."""
 _MOST_MADE = 64
-"""Of one visual. In a scene that names its bodies by env each env has an entity, and a copy, of its own."""
+"""Entities per visual. A scene that names bodies by env has one, and a copy, for each env."""
 _making = threading.Lock()
-"""Several threads make files, of episodes of one scene too."""
+"""Several threads may write episodes of one scene."""
 
 
-def _drawn(visual: Visual, entity: str) -> Chunk | None:
-    """`visual` as rerun is to have it at `entity`; None where it has no triangles."""
+def _mesh_chunk(visual: Visual, entity: str) -> Chunk | None:
+    """The chunk of `visual` at `entity`; None if it has no triangles."""
     key = id(visual)
     with _making:
         held = _made.get(key)
@@ -211,8 +207,8 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     mesh = _mesh(visual.mesh, visual.material)
     if mesh is None:
         return None
-    # What rerun's mesh does not say, for whoever reads the scene back. With types: rerun takes those of the first value in
-    # the process for all that follow, so behind a colour of whole numbers every other one would be cut down to 0 or 1.
+    # Values that rerun's mesh lacks, for reading the scene back. Typed, because rerun applies the type of the first value
+    # in the process to all: after a colour of integers every other would be truncated to 0 or 1.
     material = visual.material
     said = rr.AnyValues(
         visual=visual.name,
@@ -226,7 +222,7 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
 def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
     if len(mesh.faces) == 0:
         return None
-    # SAPIEN and rerun agree on uv: v = 0 is the first row of the texture, and beyond 0..1 it repeats.
+    # SAPIEN and rerun agree on uv: v = 0 is the first row of the texture, values beyond 0..1 repeat.
     texture = None if material.texture is None or mesh.uvs is None else material.texture[..., :3]
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
@@ -243,7 +239,7 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
 
 def _classes(segmentation: Mapping[int, str]) -> Chunk:
     names = {0: "background", **segmentation}
-    # Class ids are 16 bit in rerun; a name beyond that has nowhere to go (ManiSkill's ids are int16).
+    # Class ids are 16 bit in rerun; names of larger ones are dropped (ManiSkill's are int16).
     classes = [(int(id_), name) for id_, name in sorted(names.items()) if 0 <= id_ <= 0xFFFF]
     return static_chunk(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
 
@@ -273,7 +269,7 @@ def _lens(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]:
 
 
 def _ids(cameras: Sequence[CameraTrack], pieces: Iterable[tuple[int, slice]]) -> list[np.dtype]:
-    """Of the segmentation of each camera; wide where one of its pictures has ids that 16 bits do not hold."""
+    """Dtype of each camera's segmentation ids; int32 if one of its pictures has ids beyond 16 bits."""
     wide = set()
     for number, some in pieces:
         held = cameras[number].segmentation
@@ -287,16 +283,16 @@ def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype)
         return rr.EncodedImage.columns(blob=blobs)
     if modality == "depth":
         return rr.EncodedDepthImage.columns(blob=blobs)
-    # Rerun shows names over ids only where they are plain; its files compress them again.
+    # Rerun shows names of ids only for uncompressed pictures; its files compress them.
     ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(kind)
     return rr.SegmentationImage.columns(buffer=ids.reshape(len(ids), -1).view(np.uint8))
 
 
-# --- numbers and words ----------------------------------------------------------------------------
+# --- numbers and texts ----------------------------------------------------------------------------
 
 
 def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
-    """Entity, the name of each number in it, and their rows: one a state, or one less where a reset has none."""
+    """Entity, names of its numbers, and their rows: one per state, or T without the reset."""
     found = [
         ("/action", list(episode.action_names), episode.action),
         ("/reward", ["reward"], episode.reward),
@@ -316,7 +312,7 @@ def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
 
 
 def series_names(name: str, column: NDArray) -> list[str]:
-    """``name``, or ``name[0]``, ``name[1]`` ... where a step has more than one number of it."""
+    """``name``, or ``name[0]``, ``name[1]`` ... for several numbers per step."""
     if column.ndim == 1:
         return [name]
     return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape[1:])]
@@ -325,7 +321,7 @@ def series_names(name: str, column: NDArray) -> list[str]:
 def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
     for entity, series, _ in numbers:
-        # One view shows all entities of a folder, and those of the whole batch with those of the env.
+        # One view shows all entities of a folder, and the batch's together with the env's.
         folder = entity.split("/")[1].replace("batch", "evaluate")
         if series:
             yield series_chunk(
@@ -335,7 +331,7 @@ def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk
 
 
 def events(episode: Episode) -> list[tuple[int, str, str]]:
-    """(step, level, text) of every moment at which something began, in order of time."""
+    """(step, level, text) of each event, in order of time."""
     seed, flags = episode.info.seed, episode.flags
     found = [(0, "INFO", f"reset with seed {seed}" if seed >= 0 else "reset")]
     for name, level in (("success", "INFO"), ("fail", "WARN")):
@@ -353,7 +349,7 @@ def rising_edges(values: NDArray[np.bool_]) -> list[int]:
 
 
 def _texts(episode: Episode) -> list[tuple[int, str, str]]:
-    """Entries that are no numbers, where they change."""
+    """Changes of the entries that are not numbers."""
     said = [
         (
             state,
@@ -376,7 +372,7 @@ def _log(timed: TimedChunks, entity: str, lines: Sequence[tuple[int, str, str]])
 
 
 def xyzw(wxyz: NDArray) -> NDArray:
-    """(..., 4) quaternions from our order to rerun's."""
+    """(..., 4) quaternions from wxyz to xyzw."""
     return wxyz[..., [1, 2, 3, 0]]
 
 
@@ -387,7 +383,7 @@ def optical_pose(pose: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArra
 
 
 def wxyz_from_optical(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """ManiSkill poses (P, 7) of cameras, from translation and xyzw of their OpenCV frame: `optical_pose`, undone."""
+    """The inverse of `optical_pose`: camera poses (P, 7) from translation and xyzw (P, 7)."""
     wxyz = np.roll(rows[:, 3:], 1, axis=1).T.astype(np.float64)
     turned = qmult(wxyz, qconjugate(_OPTICAL_FROM_CAMERA)).T
     return np.concatenate([rows[:, :3], turned.astype(np.float32)], axis=1)

@@ -1,6 +1,4 @@
-"""What rerun 0.41 must be asked for by names that are not quite public: the index of a file, the bytes of a chunk in it,
-and messages of protobuf as lists of fields.
-"""
+"""Rerun 0.41's private names: a file's index, bytes of a chunk; and protobuf messages."""
 
 from __future__ import annotations
 
@@ -13,36 +11,36 @@ import pyarrow as pa
 from rerun.chunk import LazyStore, RrdReader
 from rerun.error_utils import RerunWarning
 
-# Whoever opens a file that was cut short is told so by an error; this says it once more, in rerun's words, on the terminal.
+# Opening a truncated file raises an error; this warning would repeat it in the terminal.
 warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
 
 
 @dataclass(frozen=True)
 class IndexedChunk:
-    """What the index at the end of an ``.rrd`` says of one chunk."""
+    """A chunk in the index at the end of an ``.rrd``."""
 
     entity: str
     rows: int
     static: bool
     begin: int
-    """Where in the file its bytes begin."""
+    """Offset of its first byte in the file."""
     end: int
-    """Where they end."""
+    """Offset behind its last byte."""
     id: bytes
-    """Rerun's own, unique for ever: the same chunk in two files is the same content."""
+    """Rerun's globally unique id: the same id in two files is the same content."""
     unpacked: int
-    """How many bytes it is when it is not compressed."""
+    """Uncompressed size in bytes."""
     components: tuple[str, ...]
-    """That it has rows of."""
+    """Components with rows in it."""
     steps: tuple[int, int] | None
-    """The first and last of a timeline; None where it has none of them."""
+    """First and last value of the timeline; None if it has none."""
 
 
 def index_of(store: LazyStore, timeline: str | None = None) -> list[IndexedChunk]:
-    """The chunks of an ``.rrd``; none of them is decoded.
+    """The chunks of an ``.rrd``, without decoding any.
 
     Args:
-        timeline: of which `IndexedChunk.steps` and, of chunks that are not static, `IndexedChunk.components` are asked.
+        timeline: the one for `IndexedChunk.steps`, and for `IndexedChunk.components` of chunks that are not static.
     """
     _, index = store._internal._chunk_index()
     names = (
@@ -79,17 +77,17 @@ _COMPRESSION, _UNPACKED, _ENCODING, _PAYLOAD = 2, 3, 4, 5
 """Fields of ``ArrowMsg`` in rerun's ``log_msg.proto``."""
 _LZ4, _ARROW_IPC = 2, 1
 _MOST_PACKED, _SMALL = 255, 4096
-"""What a byte of LZ4 can become at most, and what need not be asked."""
+"""Largest compression ratio of LZ4, and a size that is always allowed."""
 
 
 def decode_chunk(message: bytes) -> pa.RecordBatch:
-    """The bytes in a file from `IndexedChunk.begin` to its end as the table that they are.
+    """The table in a chunk, from its bytes in the file.
 
-    Rerun's own reader gives all chunks of an entity or none, and a camera's are hundreds of megabytes. What lies there is
-    a protobuf message with an Arrow stream in it (``rerun/proto/rerun/v1alpha1/log_msg.proto``).
+    Rerun's reader returns all chunks of an entity or none, and a camera's are hundreds of megabytes. A chunk is a protobuf
+    message with an Arrow stream in it (``rerun/proto/rerun/v1alpha1/log_msg.proto``).
 
     Raises:
-        ValueError: they are no chunk.
+        ValueError: it cannot be decoded.
     """
     try:
         fields = dict(read_fields(message))
@@ -103,12 +101,13 @@ def decode_chunk(message: bytes) -> pa.RecordBatch:
             content = pa.decompress(content, decompressed_size=unpacked, codec="lz4_raw")
         return pa.ipc.open_stream(content).read_next_batch()
     except (KeyError, StopIteration, ValueError, OSError) as error:
-        raise ValueError(f"its bytes are no chunk of rerun's ({error})") from error
+        raise ValueError(f"not a chunk of rerun ({error})") from error
 
 
 def store_id(path: Path) -> str:
-    """What rerun's viewer calls the recording in `path` when it is told something about it (rerun's
-    ``viewer_control.proto``). Raises ValueError or OSError where there is none.
+    """Id of the recording in `path` in messages to rerun's viewer (``viewer_control.proto``).
+
+    Raises ValueError or OSError if there is none.
     """
     recordings = RrdReader(path).recordings()
     if not recordings:
@@ -119,12 +118,12 @@ def store_id(path: Path) -> str:
 
 # --- protobuf --------------------------------------------------------------------------------------
 #
-# Of the two kinds that rerun's files have: whole numbers and bytes. Google's library reads messages whose definition one
-# has; rerun's are not among what its wheel brings along. Format: https://protobuf.dev/programming-guides/encoding/
+# Only the two wire types in rerun's files: varint and bytes. Google's library needs message definitions, which rerun's
+# wheel does not include. Format: https://protobuf.dev/programming-guides/encoding/
 
 _NUMBER, _BYTES = 0, 2
 Field = tuple[int, int | memoryview | bytes]
-"""Its number, and its value; what is a message itself is bytes."""
+"""Number and value; a nested message is bytes."""
 
 
 def read_fields(message: bytes | memoryview) -> list[Field]:
@@ -141,7 +140,7 @@ def read_fields(message: bytes | memoryview) -> list[Field]:
             fields.append((key >> 3, rest[:length]))
             rest = rest[length:]
         else:
-            raise ValueError("a field of a kind that rerun does not write")
+            raise ValueError("a wire type that rerun does not write")
     return fields
 
 

@@ -1,19 +1,4 @@
-"""An ``.rrd`` of ours as arrays, entity by entity.
-
-Rerun's own query engine is an extra of 100 MB. The chunks of a file are plain Arrow tables, though, and what `layout` put
-in by columns comes out by columns. Values are looked at without a Python object a row.
-
-Most of a file is not read at all. Its pictures stay where they are until one is looked at (`rerun_pictures`). And a mesh
-is in every recording of its scene, often as the very same chunk: one that another recording has brought already is
-known by the chunk's id, in the index, and neither read nor compared again.
-
-An episode of ten thousand steps with four cameras is a few hundred megabytes of encoded pictures, and a review may have
-sixty recordings open. The index of a file says where each chunk of pictures lies and which states it is of, so nothing
-of a picture is read until somebody looks. Then its chunk is, a few megabytes, and kept for a while: whoever looks at a
-picture looks at the next one next. What is kept is bounded for all recordings of the process together.
-
-A file stays open for as long as its pictures may be asked for, so one that is deleted meanwhile can still be looked at.
-"""
+"""Reads an ``.rrd`` as arrays, entity by entity."""
 
 from __future__ import annotations
 
@@ -39,16 +24,25 @@ from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, in
 
 _PROPERTIES = "/__properties"
 _ALL = ("+ /**", f"+ {_PROPERTIES}/**")
-"""What rerun keeps for itself is not among all."""
+"""``/**`` does not include rerun's own entities."""
 
 
 class RerunTable:
+    """The content of an ``.rrd`` by entity and component.
+
+    Rerun's query engine is an extra of 100 MB, but chunks are Arrow tables, so columns that `layout` wrote come out as
+    columns. Pictures are read on access (`pictures`). A mesh is in every recording of its scene, often as the same chunk:
+    one that another recording has loaded is found by its id in the index, and not read again.
+
+    The file stays open while its pictures may be read, also after it is deleted.
+    """
+
     def __init__(self, path: Path, shapes: SharedShapes | None = None) -> None:
         """
         Args:
-            shapes: of other recordings, to be shared.
+            shapes: shapes to share with other recordings.
 
-        Raises OSError, ValueError or RuntimeError where `path` is no ``.rrd``.
+        Raises OSError, ValueError or RuntimeError if `path` is not an ``.rrd``.
         """
         self._shapes = SharedShapes() if shapes is None else shapes
         self._timed: dict[tuple[str, str], list[tuple[NDArray[np.int64], pa.Array]]] = {}
@@ -56,9 +50,9 @@ class RerunTable:
         self._file = OpenFile(path)
         self._pictures: dict[tuple[str, str], list[IndexedChunk]] = {}
         self._known: dict[str, tuple[str, Mesh, Material]] = {}
-        """What entities wear that is not read, as another recording has it."""
+        """Visuals by entity that another recording has loaded."""
         self._alone: dict[str, IndexedChunk] = {}
-        """The static chunk of an entity that has one and no more."""
+        """The static chunk of each entity with exactly one."""
         store = RrdReader(path).store()
         self._look(index_of(store, STEP))
         for chunk in self._chunks(store):
@@ -77,7 +71,7 @@ class RerunTable:
                     self._static[key] = column[len(column) - 1].values
 
     def _look(self, index: Sequence[IndexedChunk]) -> None:
-        """Find in the index what need not be read."""
+        """Find the chunks in the index that need not be read."""
         several = set()
         for place in index:
             if not place.static:
@@ -95,14 +89,14 @@ class RerunTable:
                 self._known[entity] = known
 
     def _chunks(self, store: LazyStore) -> Iterator[Chunk]:
-        # Entity by entity, which is what rerun's reader can leave out before it reads.
+        # Rerun's reader can skip whole entities only.
         pictures = [f"- {entity}" for entity in {entity for entity, _ in self._pictures}]
         yield from store.stream().filter(content=[*_ALL, *pictures], is_static=False)
         known = [f"- {entity}" for entity in self._known]
         yield from store.stream().filter(content=[*_ALL, *known], is_static=True)
 
     def property(self, name: str, component: str) -> Any:
-        """A property's value, a list if there are several, None if there is none."""
+        """A property's value, a list of several, None if missing."""
         for (entity, key), values in self._static.items():
             if entity == f"{_PROPERTIES}/{name}" and key.rsplit(":", 1)[-1] == component:
                 found = values.to_pylist()
@@ -114,11 +108,11 @@ class RerunTable:
         return self._rows(entity, "Scalars:scalars")
 
     def pose_rows(self, entity: str, frames: NDArray[np.int64], states: int) -> NDArray[np.float32]:
-        """(len(frames), 7) translation and xyzw at these states."""
+        """(len(frames), 7), translation and xyzw at these states."""
         return self._poses(entity, states)[frames]
 
     def poses(self, entities: Sequence[str], states: int) -> NDArray[np.float32]:
-        """(states, len(entities), 7) position and wxyz; NaN for an entity that is not there."""
+        """(states, len(entities), 7), position and wxyz; NaN for a missing entity."""
         poses = np.full((states, len(entities), 7), np.nan, dtype=np.float32)
         for body, entity in enumerate(entities):
             rows = self._poses(entity, states)
@@ -140,7 +134,7 @@ class RerunTable:
         return poses
 
     def _rows(self, entity: str, component: str) -> tuple[NDArray[np.int64], NDArray]:
-        """Steps (R,) and values (R, K) of a component with K numbers a row."""
+        """Steps (R,) and values (R, K) of a component with K numbers per row."""
         found = self._timed.get((entity, component), [])
         if not found:
             return np.zeros(0, np.int64), np.zeros((0, 0))
@@ -152,7 +146,7 @@ class RerunTable:
     def pictures(
         self, entity: str, modality: Modality, info: CameraInfo
     ) -> tuple[NDArray[np.int64], EncodedPictures] | None:
-        """States and pictures of ``<camera>/<modality>``; None where the camera has none. Raises OSError."""
+        """States and pictures of ``<camera>/<modality>``; None if there are none. Raises OSError."""
         places = self._pictures.get((entity, PICTURE_COMPONENTS[modality]), [])
         if not places:
             return None
@@ -160,7 +154,7 @@ class RerunTable:
         return pictures_in(self._file, places, modality, info.height, info.width)
 
     def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
-        """`bare` with the meshes that its bodies wear, shared with other recordings; `entities` are theirs."""
+        """`bare` with the visuals of its bodies, shared with other recordings; `entities` are the bodies'."""
         visuals: dict[str, tuple[Mesh, Material, list[int]]] = {}
         for body, entity in enumerate(entities):
             number = 0
@@ -179,7 +173,7 @@ class RerunTable:
         )
 
     def _visual_at(self, entity: str, default: str) -> tuple[str, Mesh, Material] | None:
-        """The name of a visual, by default `default`, and what it looks like; None if there is none."""
+        """Name (`default` if not recorded), mesh and material of a visual; None if there is none."""
         if entity in self._known:
             return self._known[entity]
         mesh = self._mesh(entity)
@@ -229,30 +223,29 @@ class RerunTable:
 
 
 def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int64]:
-    """(states - first,) which row says what was at each state: the one before where it has none; -1 where there is none yet.
+    """(states - first,) index of the row that holds at each state: its own or the last before it; -1 if there is none.
 
-    Rows that say nothing new are left out (`rerun_chunks.changed_rows`).
+    Equal rows are left out of a file (`chunks.changed_rows`).
     """
     return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 
 
 def _mark(place: IndexedChunk) -> tuple[bytes, int, int]:
-    """Of one content. Rerun's ids are unique; the sizes are for a file that somebody made by hand."""
+    """Key of a chunk's content. Rerun's ids are unique; the sizes guard against manipulated files."""
     return (place.id, place.end - place.begin, place.unpacked)
 
 
 def _plain(values: pa.Array) -> NDArray:
-    """The numbers in an array of numbers, of fixed lists of numbers, or of bytes."""
+    """The numbers in an array of numbers, of lists of numbers, or of bytes."""
     while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
         values = values.flatten()
     return values.to_numpy(zero_copy_only=False)
 
 
 def read_properties(path: Path) -> dict[str, dict[str, Any]]:
-    """The properties of the first recording in `path`, by name and then by component.
+    """The properties of the first recording in `path`, by name and component; several values are a list.
 
-    A component of one value is that value, a longer one a list. It is all that a library needs of a bare ``.rrd``; a file without a footer
-    (its writer was killed) is read as far as it goes.
+    A library needs no more of a lone ``.rrd``. A truncated file is read up to its end.
 
     Raises:
         ValueError: `path` holds no recording.
@@ -272,19 +265,18 @@ def read_properties(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
-    """The columns of a chunk but its timelines and the ids of its rows."""
+    """The columns of a chunk without timelines and row ids."""
     for field, column in zip(batch.schema, batch.columns):
         if (field.metadata or {}).get(b"rerun:kind") == b"data":
             yield field.name, column
 
 
-# --- Pictures of an ``.rrd``, read where they lie when one is looked at -----------------------
-
+# --- pictures --------------------------------------------------------------------------------------
 
 KEPT_BYTES = 64 << 20
-"""Of decompressed chunks, in the whole process; the newest is kept however large it is."""
+"""Decompressed chunks kept in the process; the newest is kept at any size."""
 MOST_ROWS = 1_000_000
-"""Of a chunk: its index is believed before anything of it is read."""
+"""Limit of a chunk: the number comes from an untrusted index."""
 PICTURE_COMPONENTS: dict[Modality, str] = {
     "rgb": "EncodedImage:blob",
     "depth": "EncodedDepthImage:blob",
@@ -293,7 +285,7 @@ PICTURE_COMPONENTS: dict[Modality, str] = {
 
 
 class OpenFile:
-    """A file that can be read from any thread."""
+    """An open file for chunks, usable from any thread."""
 
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
@@ -306,11 +298,11 @@ class OpenFile:
             os.close(self._descriptor)
 
     def __reduce__(self) -> str:
-        # The number of a descriptor means another file in another process, which would be closed with it.
+        # In another process the descriptor would be another file, which `__del__` would close.
         raise TypeError("An open recording cannot be sent to another process; send its path.")
 
     def chunk(self, place: IndexedChunk) -> pa.RecordBatch:
-        """Raises OSError where it is no chunk."""
+        """The chunk at `place`. Raises OSError if it cannot be decoded."""
         content = os.pread(self._descriptor, place.end - place.begin, place.begin)
         try:
             return decode_chunk(content)
@@ -319,7 +311,11 @@ class OpenFile:
 
 
 class _ChunkCache:
-    """The chunks that were looked at last."""
+    """The last used chunks of pictures, of all recordings of the process.
+
+    An episode of ten thousand steps with four cameras is a few hundred megabytes, and a review may have sixty open. A
+    chunk is a few megabytes, and the next picture is usually in the same one.
+    """
 
     def __init__(self) -> None:
         self._chunks: OrderedDict[tuple[int, int], tuple[OpenFile, pa.Array]] = OrderedDict()
@@ -327,8 +323,8 @@ class _ChunkCache:
         self._lock = threading.Lock()
 
     def rows(self, file: OpenFile, place: IndexedChunk, component: str) -> pa.Array:
-        """The rows of that component. Raises OSError."""
-        # The file is kept with it, so its id is nobody else's.
+        """The rows of a component. Raises OSError."""
+        # The cache keeps the file alive, so its id is not reused.
         key = (id(file), place.begin)
         with self._lock:
             if key in self._chunks:
@@ -351,7 +347,7 @@ _chunk_cache = _ChunkCache()
 def pictures_in(
     file: OpenFile, places: Sequence[IndexedChunk], modality: Modality, height: int, width: int
 ) -> tuple[NDArray[np.int64], EncodedPictures]:
-    """One modality of one camera, and (P,) the state of each picture; `places` are its chunks, in order of time. Raises OSError."""
+    """State (P,) of each picture, and the pictures, in the chunks `places`, ordered by time. Raises OSError."""
     component, ends = PICTURE_COMPONENTS[modality], np.cumsum([place.rows for place in places])
 
     def one(number: int) -> bytes:
@@ -360,7 +356,7 @@ def pictures_in(
         content = rows[number - int(ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
         if modality != "segmentation":
             return content
-        # Plain ids, as the PNG that they were, or would have been.
+        # The file holds plain ids: encode them as in the journal.
         wide = len(content) == 4 * height * width
         ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(height, width)
         return encode("segmentation", ids.astype(np.int32))
@@ -374,5 +370,5 @@ def _steps(file: OpenFile, place: IndexedChunk) -> NDArray[np.int64]:
         raise OSError(f"{file.name} claims {place.rows:,} pictures in one piece")
     if place.steps is not None and place.steps[1] - place.steps[0] + 1 == place.rows:
         return np.arange(place.steps[0], place.steps[1] + 1)
-    # A picture here and there: only the chunk itself says of which states.
+    # With gaps, only the chunk itself has the states.
     return file.chunk(place).column(STEP).cast(pa.int64(), safe=False).to_numpy()

@@ -1,11 +1,4 @@
-"""Rerun's own viewer, which its wheel brings along as a command: in a window on a screen, or as files for a page.
-
-What rerun serves binds to every address by default; here it is told loopback. Its web viewer is inside the command, which
-serves it when asked to, without packing 43 MB of program. So the command is started for a moment, its three files are
-taken out, and each is kept as gzip in a folder of the user's cache, one folder a version of rerun: whoever serves them
-then (`workbench.ui.share.rerun_view`) sends 14 MB and reads no more of it than a block at a time. Fetching and packing takes
-about ten seconds, once for good.
-"""
+"""Runs rerun's own viewer in a window, and extracts its web viewer for a page."""
 
 from __future__ import annotations
 
@@ -46,21 +39,19 @@ VIEWER_POLICY = (
     "connect-src 'self'; img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; "
     "frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
-"""Content-Security-Policy under which rerun's page runs and talks to nobody but who served it: by itself it asks for
-fonts, for news of releases, and sends usage statistics. Inline scripts and ``wasm-unsafe-eval`` are how the page starts
-its program (rerun 0.41)."""
+"""Content-Security-Policy that restricts rerun's page to its own server: by default it loads fonts and release notes
+and sends usage statistics. It needs inline scripts and ``wasm-unsafe-eval`` to start its program (rerun 0.41)."""
 _packing = threading.Lock()
 
 
-# --- its command -----------------------------------------------------------------------------------
+# --- rerun's command -------------------------------------------------------------------------------
 
 
 def rerun_command() -> list[str]:
     """The command of the rerun that this interpreter imports.
 
-    A ``rerun`` on PATH may belong to another environment and another version, and file and viewer go
-    together by version. The program itself and not ``python -m rerun_cli``: that one forgets the exit
-    status (rerun 0.41), and ending it would leave the program that it started behind.
+    A ``rerun`` on PATH may have another version, and file and viewer must match. ``python -m rerun_cli`` loses the exit
+    status (rerun 0.41), and killing it leaves its program running.
     """
     for folder in rerun_cli.__path__:
         if (program := Path(folder, "rerun")).is_file():
@@ -71,8 +62,8 @@ def rerun_command() -> list[str]:
 def quiet_environment() -> dict[str, str]:
     """The environment in which rerun's command sends no usage statistics.
 
-    Rerun has no variable for just that; but where ``CI`` is set it neither sends nor asks, and leaves
-    the person's own settings for rerun as they are (rerun 0.41, crate re_analytics).
+    Rerun has no variable for that alone; with ``CI`` set it neither sends nor asks, and keeps the user's settings (rerun
+    0.41, crate re_analytics).
     """
     environment = child_environment(CI="true")
     environment.pop("FORCE_RERUN_ANALYTICS", None)
@@ -80,7 +71,7 @@ def quiet_environment() -> dict[str, str]:
 
 
 def free_port() -> int:
-    """A loopback port that was free a moment ago; rerun cannot be told to pick one and say which."""
+    """A loopback port that was free just now; rerun cannot choose one and report it."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return probe.getsockname()[1]
@@ -90,7 +81,7 @@ def await_port(process: subprocess.Popen[bytes], port: int) -> None:
     """Return when `process` listens on `port`.
 
     Raises:
-        RuntimeError: it ended before, or took too long (and was ended).
+        RuntimeError: it ended, or was killed after `START_SECONDS`.
     """
     deadline = time.monotonic() + START_SECONDS
     while time.monotonic() < deadline:
@@ -119,7 +110,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 @dataclass
 class Viewer:
-    """A window that is open; `wait` until its person is done with it, or `close` it."""
+    """An open window."""
 
     _process: subprocess.Popen[bytes]
     _says: threading.Thread
@@ -128,25 +119,25 @@ class Viewer:
         """Return when the window is closed.
 
         Raises:
-            RuntimeError: the viewer ended by itself with an error.
+            RuntimeError: the viewer ended with an error.
         """
-        # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
+        # Polled: a signal that the kernel delivers to another thread does not wake a blocking wait.
         while (status := self._process.poll()) is None:
             time.sleep(0.1)
         if status:
             self._says.join(timeout=5.0)
-            raise RuntimeError(f"rerun's viewer ended with {status}; what it said is above.")
+            raise RuntimeError(f"rerun's viewer ended with {status}; its output is above.")
 
     def close(self) -> None:
         end(self._process)
 
 
 def resolve_recordings(paths: Sequence[Path]) -> list[Path]:
-    """These recordings, in full.
+    """Absolute paths of these recordings.
 
     Raises:
-        ValueError: `paths` is empty, or one is no .rrd file by its name.
-        FileNotFoundError: one of them is no file.
+        ValueError: `paths` is empty, or one does not end in .rrd.
+        FileNotFoundError: one of them is not a file.
     """
     files = [Path(path).resolve() for path in paths]
     if not files:
@@ -155,7 +146,7 @@ def resolve_recordings(paths: Sequence[Path]) -> list[Path]:
         if not file.is_file():
             raise FileNotFoundError(f"{file} is not a file: give the path of an .rrd file.")
         if file.suffix != ".rrd":
-            # A page would show nothing of it, and say nothing.
+            # The web viewer would show nothing, without an error.
             raise ValueError(f"{file} is no .rrd file.")
     return files
 
@@ -165,11 +156,11 @@ def open_window(paths: Sequence[Path]) -> Viewer:
 
     Raises:
         ValueError, FileNotFoundError: see `resolve_recordings`.
-        RuntimeError: there is no screen here, or rerun did not start.
+        RuntimeError: there is no screen, or rerun did not start.
     """
     files = resolve_recordings(paths)
     if not has_screen(os.environ):
-        # Rerun would listen, load and only then find out.
+        # Rerun would only fail after loading the files.
         raise RuntimeError(
             "There is no screen here (DISPLAY and WAYLAND_DISPLAY are empty); open the page instead."
         )
@@ -189,14 +180,14 @@ def open_window(paths: Sequence[Path]) -> Viewer:
 
 
 def _print_all(output: IO[bytes]) -> None:
-    """What rerun says of a file has names from the file in it."""
+    """Print rerun's output without control characters, since it contains names from the file."""
     with output:
         for line in output:
             print(only_colours(line.decode(errors="replace")), end="", file=sys.stderr, flush=True)
 
 
 def has_screen(environment: Mapping[str, str]) -> bool:
-    """Whether a window can be opened: where a display is named."""
+    """Whether a window can be opened: the environment names a display."""
     return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
 
 
@@ -204,32 +195,36 @@ def has_screen(environment: Mapping[str, str]) -> bool:
 
 
 def viewer_file(name: str) -> Path:
-    """The gzip of the file of the web viewer that is called `name`, one of `VIEWER_FILES`."""
+    """Path of the gzip of a file of the web viewer, `name` in `VIEWER_FILES`."""
     return web_viewer_folder() / f"{name}.gz"
 
 
 def web_viewer_folder() -> Path:
-    """Where the web viewer's files are, each packed as ``<name>.gz``; they are made at the first time.
+    """Folder of the web viewer's files, ``<name>.gz`` each; the first call makes them, in about ten seconds.
+
+    The files are inside rerun's command, which only serves them, uncompressed (43 MB). So it is started once per version
+    of rerun, on loopback (by default it binds to every address), and the files are stored as gzip (14 MB) in the user's
+    cache. `ui.share.rerun_view` serves them.
 
     Raises:
-        RuntimeError: rerun did not hand them over, or there is no room for them.
+        RuntimeError: rerun did not serve them, or they cannot be stored.
     """
     folder = _cache_path()
-    # One lock for all threads: a page asks for three files at once.
+    # A page requests all files at once.
     with _packing:
         if not folder.is_dir():
             try:
                 _write_cache(web_viewer_files(), folder)
             except OSError as error:
                 raise RuntimeError(
-                    f"rerun's web viewer could not be kept in {folder} ({error.strerror or error}); make room there, or name "
+                    f"rerun's web viewer could not be stored in {folder} ({error.strerror or error}); make room there, or name "
                     "another folder in XDG_CACHE_HOME."
                 ) from error
     return folder
 
 
 def viewer_is_cached() -> bool:
-    """Whether `web_viewer_folder` answers at once."""
+    """Whether `web_viewer_folder` has its files."""
     return _cache_path().is_dir()
 
 
@@ -243,19 +238,19 @@ def _write_cache(files: dict[str, bytes], folder: Path) -> None:
     try:
         for name, content in files.items():
             (made / f"{name}.gz").write_bytes(gzip.compress(content, 6))
-        # All three or none: another process sees a whole folder under this name.
+        # By one rename: other processes see a complete folder.
         made.rename(folder)
     except OSError:
         shutil.rmtree(made, ignore_errors=True)
-        if not folder.is_dir():  # else another process was quicker, with the same files
+        if not folder.is_dir():  # else another process has stored the same files
             raise
 
 
 def web_viewer_files() -> dict[str, bytes]:
-    """The files of rerun's web viewer, by name: page, script and program (43 MB in rerun 0.41).
+    """Contents of the web viewer's files by name: page, script and program (43 MB in rerun 0.41).
 
     Raises:
-        RuntimeError: rerun's command did not hand them over.
+        RuntimeError: rerun's command did not serve them.
     """
     port, page_port = free_port(), free_port()
     command = [*rerun_command(), "--serve-web", "--bind", LOOPBACK, "--port", str(port)]
@@ -268,7 +263,7 @@ def web_viewer_files() -> dict[str, bytes]:
     )
     try:
         await_port(process, page_port)
-        # A proxy that the environment names must not be asked for what lies on this machine.
+        # Ignore proxies of the environment: the files are on this machine.
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         files = {}
         for name in VIEWER_FILES:

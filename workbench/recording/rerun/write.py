@@ -1,12 +1,4 @@
-"""Write an episode as an ``.rrd``, and how it looks when it is opened: the same arrangement as the workbench's own page.
-
-Its chunks are made while rerun writes them, so that its pictures are never in memory all at once, and what the disk refuses is
-an error here and not on a thread of rerun's.
-
-The scene is large on the left, what the cameras saw is on the right, and the curves lie below, all moved by one slider over
-``step``. Rerun can also arrange views by itself, but its rules change from release to release and put one view on every
-number, so nothing is left to them.
-"""
+"""Writes an episode as an ``.rrd`` with a blueprint in the arrangement of the workbench's page."""
 
 from __future__ import annotations
 
@@ -45,22 +37,24 @@ from workbench.recording.rerun.layout import (
 )
 
 MAX_SERIES = 32
-"""An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
+"""An ``evaluate()`` entry with more numbers is not drawn: it would hide the others."""
 MAX_STACKED = 3
-"""More cameras than this lie behind tabs: one above the other each would be a strip."""
+"""More cameras than this are in tabs: stacked, each would be a narrow strip."""
 EYE_DIRECTION = (0.75, 0.85, 0.6)
-"""From where the scene is looked at, seen from its middle: ManiSkill's render cameras do likewise."""
+"""Direction from the scene's middle to the eye, like ManiSkill's render cameras."""
 
 
 def write_rrd(episode: Episode, path: Path) -> None:
-    """Write `episode`, which has a scene, to `path`; what lies there is written over.
+    """Write `episode`, which has a scene, to `path`, overwriting a file there.
+
+    Chunks are made while rerun writes them, so that pictures are never in memory all at once.
 
     Raises:
-        OSError: it cannot be written, or one of its pictures not be read.
-        ValueError: rerun refuses something in it.
+        OSError: it cannot be written, or a picture cannot be read.
+        ValueError: rerun refuses a value.
     """
     application_id = _application_id(episode.info)
-    # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
+    # Without strict mode rerun drops a mesh that it refuses, with a warning.
     with catch_and_log_exceptions(strict=True):
         write_chunks(_chunks(episode), path, application_id)
         add_blueprint(path, _blueprint(application_id, arrangement(episode)))
@@ -77,13 +71,13 @@ def _chunks(episode: Episode) -> Iterator[Chunk]:
 
 
 def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> None:
-    """Write `chunks` as a recording of its own. Raises OSError, and whatever `chunks` raises."""
+    """Write `chunks` as one recording. Raises OSError, and errors of `chunks`."""
     failed: list[BaseException] = []
 
     def watched() -> Iterator[Chunk]:
         try:
             yield from chunks
-        except GeneratorExit:  # rerun wants no more
+        except GeneratorExit:  # rerun has stopped reading
             raise
         except BaseException as error:
             failed.append(error)
@@ -91,7 +85,7 @@ def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> No
 
     stream = LazyChunkStream.from_iter(watched())
     try:
-        # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
+        # Rerun's default id is that of the process: two episodes of one process would become one.
         stream.write_rrd(path, application_id=application_id, recording_id=uuid.uuid4().hex)
     except RuntimeError as error:
         if failed:
@@ -100,7 +94,7 @@ def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> No
 
 
 def _disk_error(error: RuntimeError, path: Path) -> OSError:
-    """What rerun says of a disk, with the number that the system gave."""
+    """The OSError for rerun's message of a disk error, with its errno."""
     number = re.search(r"\(os error (\d+)\)", str(error))
     if number is None:
         return OSError(errno.EIO, f"{path.name} could not be written ({error})")
@@ -113,7 +107,7 @@ def _blueprint(application_id: str, arranged: Arrangement) -> BlueprintBytes:
 
 
 def _application_id(info: EpisodeInfo) -> str:
-    """The viewer keeps one blueprint an application id; a slash in it makes rerun rename it."""
+    """The viewer keeps one blueprint per application id; rerun renames an id with a slash."""
     return f"workbench {info.task}".replace("/", "-")
 
 
@@ -132,11 +126,11 @@ def _title(episode: Episode) -> str:
 
 
 def properties(episode: Episode) -> dict[str, dict[str, Any]]:
-    """What the file says of the episode as a whole, property by property.
+    """The properties of the recording, by name and component.
 
-    ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as
-    in ManiSkill's own metrics. ``source`` holds the text of the task's files, so that the episode can
-    be made again where the files have changed since. ``workbench`` is the `Description` for programs.
+    ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as in ManiSkill's
+    metrics. ``source`` has the texts of the task's files, so that the episode can be replayed after they change.
+    ``workbench`` is the `Description` for programs.
     """
     described = fields_of(describe(episode))
     words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
@@ -152,26 +146,26 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
         values["versions"] = dict(described["versions"])
     if described["source"]:
         values["source"] = {"files": list(described["source"]), "texts": list(described["source"].values())}
-    # The texts are megabytes in no task, and once is enough.
+    # Without the texts, which `source` holds.
     values["workbench"] = {"description": json_text({**described, "source": None})}
     return values
 
 
-# --- how it looks ----------------------------------------------------------------------------------
+# --- blueprint -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """All that an episode's blueprint hangs on: most episodes of a scene share one."""
+    """The inputs of an episode's blueprint, which most episodes of a scene share."""
 
     cameras: tuple[tuple[str, str, tuple[str, ...]], ...]
     """Name, entity and modalities of each."""
     drawn: tuple[str, ...]
-    """Entities of ``evaluate()`` that are curves."""
+    """Entities of ``evaluate()`` that are drawn as curves."""
     texts: bool
     """Whether ``evaluate()`` returned texts."""
     acted: bool
-    """Whether actions have names, and so curves."""
+    """Whether there are actions to draw."""
     fps: float | None
     eye: tuple[float, float, float]
     looked_at: tuple[float, float, float]
@@ -202,10 +196,14 @@ def arrangement(episode: Episode) -> Arrangement:
 
 
 def blueprint_of(arranged: Arrangement) -> rrb.Blueprint:
+    """The scene on the left, cameras on the right, curves below.
+
+    All views are given: rerun's automatic layout changes between releases and makes a view for every number.
+    """
     scene = rrb.Spatial3DView(
         name="Scene",
         origin=WORLD,
-        # A depth picture in a 3-D view is a cloud of points over the very meshes that it shows.
+        # In a 3-D view a depth picture is a point cloud over the meshes.
         contents=[
             "$origin/**",
             *(f"- {entity}/{m}" for _, entity, _ in arranged.cameras for m in ("depth", "segmentation")),
@@ -268,10 +266,10 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
 
 
 def _eye(episode: Episode) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Where the eye is and what it looks at: what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
+    """Eye and target, which frame the movable bodies. By default rerun frames the whole scene, with 100 m of ground."""
     assert episode.poses is not None and episode.geometry is not None
     low, high = box_of_moving(episode.poses[0], episode.geometry.body_kinds)
-    # Of what differs by centimetres from episode to episode nothing hangs on, and the same blueprint is made once.
+    # Rounded, so that episodes of a scene share one cached blueprint.
     middle = np.round((low + high).astype(np.float64) / 2, 1)
     direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)
     distance = round(1.5 * max(float(np.linalg.norm(high - low)), 0.5), 1)
