@@ -14,7 +14,20 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import page_on
-from tests.drive.studio import HEIGHT, VIEW, WIDTH, choose, field, numbers, option, picture, press, tool, view
+from tests.drive.studio import (
+    HEIGHT,
+    VIEW,
+    WIDTH,
+    choose,
+    end_of_the_left_arrow,
+    field,
+    numbers,
+    option,
+    picture,
+    press,
+    tool,
+    view,
+)
 from tests.drive.waiting import until
 from workbench.ui.cameras.studio import NO_CAMERA
 
@@ -46,16 +59,6 @@ def page(opened: Page) -> Page:
         press(opened, "Back to the file")
     expect(opened.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
     return opened
-
-
-def end_of_the_left_arrow(page: Page) -> tuple[float, float] | None:
-    """The world's y axis goes to the right in the page: the rightmost of what is as green as the gizmo's arrow."""
-    r, g, b = np.moveaxis(view(page), -1, 0)
-    ys, xs = np.nonzero((g > 180) & (g - r > 50) & (g - b > 30))
-    if not len(xs):
-        return None
-    tip = xs.argmax()
-    return float(xs[tip] - 6 + VIEW["x"]), float(ys[tip] + VIEW["y"])
 
 
 def base_camera(file: Path) -> tuple[list[float], list[float]]:

@@ -70,6 +70,16 @@ def view(page: Page) -> NDArray[np.int64]:
     return picture_of_view(page, VIEW).astype(np.int64)
 
 
+def end_of_the_left_arrow(page: Page) -> tuple[float, float] | None:
+    """The world's y axis goes to the right in the page: the rightmost of what is as green as the gizmo's arrow."""
+    r, g, b = np.moveaxis(view(page), -1, 0)
+    ys, xs = np.nonzero((g > 180) & (g - r > 50) & (g - b > 30))
+    if not len(xs):
+        return None
+    tip = xs.argmax()
+    return float(xs[tip] - 6 + VIEW["x"]), float(ys[tip] + VIEW["y"])
+
+
 def picture(page: Page) -> str:
     """What the picture shows, as text that can be compared."""
     return page.evaluate(

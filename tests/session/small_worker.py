@@ -6,7 +6,6 @@ All else is the real thing: how it begins, its keeper, its pulse, its signals an
 from __future__ import annotations
 
 import ctypes
-import functools
 import multiprocessing.connection
 import os
 import signal
@@ -48,8 +47,13 @@ class SmallWorker:
                 )
             if isinstance(request, Call) and isinstance(request.request, RunCameras):
                 words = str(request.request.task).partition(" ")
+                self.interrupts.begin()
                 try:
-                    self.interrupts.run(functools.partial(self.do, *words))
+                    try:
+                        self.interrupts.allowed = True
+                        self.do(*words)
+                    finally:
+                        self.interrupts.allowed = False
                 except Interrupted:
                     self.line.send_bytes(pack_message(Loading("interrupted")))
             elif isinstance(request, Call):

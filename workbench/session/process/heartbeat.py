@@ -8,7 +8,7 @@ import re
 import signal
 import struct
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import dropwhile
@@ -293,12 +293,14 @@ class Interrupts:
 
     A signal's handler runs in the main thread between two bytecodes and may raise there, so a Python loop that never ends
     is left with a traceback that names the author's line. Elsewhere it must not raise: half a message in the pipe would
-    end the session. So a signal counts only within `run`, and not within `shielded`. Native code that does not return,
+    end the session. So a signal counts only while `allowed`, and not within `shielded`. Native code that does not return,
     and a loop that catches everything, cannot be left this way; the supervisor reports that.
     """
 
     def __init__(self) -> None:
-        self._allowed = False
+        self.allowed = False
+        """Set it after `begin`, and clear it in a ``finally``, by plain assignments: a signal can raise at the start of
+        any call, and would leave it set for good."""
         self._waiting = False
         self._began = 0.0
 
@@ -306,32 +308,23 @@ class Interrupts:
         """Install the handler; without it the signal would end the process."""
         signal.signal(INTERRUPT_SIGNAL, self._on_signal)
 
-    def run(self, work: Callable[[], object]) -> None:
-        """Run `work`, which a signal may interrupt.
-
-        Raises:
-            Interrupted: a signal came.
-        """
+    def begin(self) -> None:
+        """Forget the signals that came before the work that begins now."""
         self._began, self._waiting = time.monotonic(), False
-        try:
-            self._allowed = True
-            work()
-        finally:
-            self._allowed = False
 
     @contextmanager
     def shielded(self) -> Iterator[None]:
         """Finish what is done within this; a signal that came meanwhile is raised afterwards."""
-        before, self._allowed = self._allowed, False
+        before, self.allowed = self.allowed, False
         try:
             yield
         finally:
-            self._allowed = before
+            self.allowed = before
         if before and self._waiting:
             self._raise()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._allowed:
+        if self.allowed:
             self._raise()
         # Between two pieces of work there is nothing to stop; within `shielded` it is raised at its end.
         self._waiting = True

@@ -109,8 +109,13 @@ class GuardedTask:
             work()
             return None
         self.heartbeat.begin(doing)
+        self.interrupts.begin()
         try:
-            self.interrupts.run(work)
+            try:
+                self.interrupts.allowed = True
+                work()
+            finally:
+                self.interrupts.allowed = False
         except Exception:
             raise
         except BaseException as error:
