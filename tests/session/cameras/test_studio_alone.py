@@ -49,7 +49,7 @@ class Alone:
             Background(),
             lambda: None,
             past,
-            self.versions.same_again,
+            self.versions.running_load,
             self.versions.open_file,
         )
         self.step = step_of(POSES)

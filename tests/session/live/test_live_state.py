@@ -155,10 +155,10 @@ def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before
 def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
     state = LiveState("push.py", TaskOptions(), 10**8, wants_play=True)
     state.died(DEATH, while_loading=True, printed="")
-    state.waits_for_the_file()
+    state.wait_for_file()
     assert (view(state).state, state.wants_play) == ("error", False)
     assert state.died(replace(DEATH, asked=True, gives_up=True), while_loading=True, printed="") is None
-    state.waits_for_the_file()
+    state.wait_for_file()
     assert view(state).state == "stopped" and view(state).problem is not None
 
 
@@ -230,7 +230,7 @@ def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved()
     state = LiveState(agreed, TaskOptions(), 2**20)
     assert state.own_file == Path("/home/me/push.py")
     assert state.load_request(None).task is agreed
-    state.file_is_edited()
+    state.use_saved_file()
     assert state.load_request(None).task == "/home/me/push.py:Push"
 
 

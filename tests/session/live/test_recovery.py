@@ -44,12 +44,12 @@ def test_a_file_that_kills_before_anything_ran_is_waited_for() -> None:
     recovery.wanted()
     recovery.died(file_waits=False)
     assert recovery.wanted() is None
-    assert recovery.file_asked() == LoadInputs(None, None)
+    assert recovery.file_requested() == LoadInputs(None, None)
 
 
 def test_a_new_version_that_kills_gives_way_to_the_last_good_one() -> None:
     recovery = ran()
-    recovery.file_asked()
+    recovery.file_requested()
     recovery.died(file_waits=False)
     assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest")
 
@@ -64,7 +64,7 @@ def test_a_file_that_waits_is_loaded_at_the_newest_moment_and_if_it_fails_the_la
 
 def test_a_failure_that_leaves_the_version_before_asks_for_nothing() -> None:
     recovery = ran()
-    recovery.file_asked()
+    recovery.file_requested()
     assert not recovery.failed(kept=True)
     assert not recovery.failed(kept=True), "one while it runs"
 
@@ -75,7 +75,7 @@ def test_workers_do_not_die_for_ever(events: list[str]) -> None:
     loads = 0
     for event in events:
         if event == "asked":
-            recovery.restart_asked()
+            recovery.restart_requested()
             loads = 0
         elif event == "failed":
             recovery.failed(kept=False)

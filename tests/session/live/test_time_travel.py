@@ -92,7 +92,7 @@ def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session)
     branches = []
     for _ in range(2):
         session.past.seek(start + 3)
-        view = after(session, lambda: session.past.go_on("all"))
+        view = after(session, lambda: session.past.continue_from_shown("all"))
         assert view.step.elapsed_steps.tolist() == [3] * N
         assert is_close(view.step.poses, poses(session, start + 3))
         step(session, 5)
@@ -110,7 +110,7 @@ def test_one_env_goes_back_alone(session: Session) -> None:
     before = session.view().step
     session.change(selected_env=1)
     session.past.seek(start + 1)
-    view = after(session, lambda: session.past.go_on("this"))
+    view = after(session, lambda: session.past.continue_from_shown("this"))
     assert view.step.elapsed_steps.tolist() == [4, 1, 4]
     assert is_close(view.step.poses[1], poses(session, start + 1)[1])
     assert is_close(view.step.poses[[0, 2]], before.poses[[0, 2]])
@@ -123,7 +123,7 @@ def test_one_envs_moment_is_put_into_all(session: Session) -> None:
     step(session, 3)
     session.change(selected_env=2)
     session.past.seek(start + 2)
-    view = after(session, lambda: session.past.go_on("into all"))
+    view = after(session, lambda: session.past.continue_from_shown("into all"))
     assert view.step.elapsed_steps.tolist() == [2] * N
     was = poses(session, start + 2)[2]
     for env in range(N):
@@ -136,7 +136,7 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     step(session, 6)
     left = session.view().step
     session.past.seek(start + 2)
-    after(session, lambda: session.past.go_on("all"))
+    after(session, lambda: session.past.continue_from_shown("all"))
     step(session, 2)
     assert session.view().timeline.undo == "going back of all"
     view = after(session, session.past.undo)
@@ -188,14 +188,14 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
     view = after(session, lambda: session.reset((1,)))
     assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
     session.past.seek(start + 2)
-    view = after(session, lambda: session.past.go_on("all"))
+    view = after(session, lambda: session.past.continue_from_shown("all"))
     assert np.array_equal(view.step.reward, rewards[1])
     assert not view.timeline.not_carried
     strip = session.past.strip(start, view.timeline.last)
     kept = [np.nan, *(reward[0] for reward in rewards), rewards[3][0], rewards[1][0]]
     assert np.array_equal(strip.reward, kept, equal_nan=True)
     session.past.seek(start + 2)
-    assert not after(session, lambda: session.past.go_on("into all")).timeline.not_carried
+    assert not after(session, lambda: session.past.continue_from_shown("into all")).timeline.not_carried
 
 
 def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
@@ -207,7 +207,7 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
     step(session, 3)
     session.past.seek(start + 1)
-    after(session, lambda: session.past.go_on("this"))
+    after(session, lambda: session.past.continue_from_shown("this"))
     view = wait_until(session, lambda v: v.recording.episodes_written == written + 1, "the file")
     assert view.recording.active and view.recording.problem is None
     step(session, 1)
@@ -241,7 +241,7 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     assert np.abs(then.rgb.astype(int) - now.rgb).mean() > 0.5, "the arm stood elsewhere"
     # The same moment, gone back to, looks the same.
     last = session.view().timeline.last
-    session.past.go_on("all")
+    session.past.continue_from_shown("all")
     wait_until(session, lambda v: v.timeline.last > last and v.timeline.shown is None, "the jump")
     serial = session.view().pictures_serial
     again = wait_until(session, lambda v: v.pictures_serial > serial and key in v.pictures, "its picture")

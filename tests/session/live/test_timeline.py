@@ -163,9 +163,9 @@ def test_a_strip_is_of_one_env_between_two_moments() -> None:
 )
 def test_who_goes_back_and_to_whose_moment(scope, envs: tuple[int, ...], source: tuple[int, ...]) -> None:
     timeline = played(4)
-    assert timeline.go_on(2, scope) is None, "there is nothing to go back to while live"
+    assert timeline.continue_from_shown(2, scope) is None, "there is nothing to go back to while live"
     timeline.seek(3)
-    asked = timeline.go_on(2, scope)
+    asked = timeline.continue_from_shown(2, scope)
     assert asked is not None and (asked.env_idx, asked.source, asked.origin) == (envs, source, 3)
     assert asked.undoes is None and timeline.shown is None
     assert asked.snapshot == timeline.history.snapshot_at(3)
@@ -206,4 +206,4 @@ def test_the_view_is_of_the_moment_that_is_shown() -> None:
     timeline.seek(1)
     view = timeline.view(0, (EYE,))
     assert (view.first, view.last, view.shown, view.tick, view.moments) == (0, 4, 1, 1, 5)
-    assert view.can_go_on and view.used == timeline.history.used and view.limit == 10**9
+    assert view.can_continue and view.used == timeline.history.used and view.limit == 10**9

@@ -44,14 +44,14 @@ class Open:
         task = replace(description(geometry), file=files[0], source_files=files, source={files[0]: text})
         step = replace(step_of(poses), elapsed_steps=np.zeros(1, np.int32))
         with self.shared.changing() as state:
-            restored, stale = self.versions.came_in(task)
+            restored, stale = self.versions.version_loaded(task)
             state.loaded(Loaded(task, step, {}), restored=restored, stale=stale)
             state.stepped(Stepped(step, np.ones(1, bool), snapshot=b"body", part_keys=(), number=0))
         self.versions.follow(task, stale)
         return restored, stale
 
     def loads(self) -> list[Load]:
-        return [request for request in self.versions.greeting() if isinstance(request, Load)]
+        return [request for request in self.versions.first_requests() if isinstance(request, Load)]
 
 
 @pytest.fixture
@@ -94,13 +94,13 @@ def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Open) ->
 
 
 def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Open) -> None:
-    settings, load = one.versions.greeting()
+    settings, load = one.versions.first_requests()
     assert settings == one.shared.state.settings()
     assert isinstance(load, Load) and (load.source, load.snapshot) == (None, None)
     one.runs()
     one.shared.state.wants_play = True
     assert one.versions.died(FILE_WAITS, "")[1]
-    (_, load, play) = one.versions.greeting()
+    (_, load, play) = one.versions.first_requests()
     assert play == Play(True)
     assert isinstance(load, Load) and load.source is None and load.snapshot is not None
 
@@ -142,7 +142,7 @@ def test_after_too_many_deaths_a_reload_starts_another_worker(one: Open) -> None
 
 
 def test_how_another_worker_gets_the_version_that_runs(one: Open) -> None:
-    assert one.versions.same_again() is None
+    assert one.versions.running_load() is None
     one.runs()
-    again = one.versions.same_again()
+    again = one.versions.running_load()
     assert again is not None and again.source == {str(one.file): GOOD} and again.snapshot is None

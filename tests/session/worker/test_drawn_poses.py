@@ -68,6 +68,6 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         view = wait_until(session, lambda v: v.timeline.shown == past and drawn(v, 1), "a picture of then")
         assert not shows_cube(view)
         last = view.timeline.last
-        session.past.go_on("all")
+        session.past.continue_from_shown("all")
         view = wait_until(session, lambda v: v.timeline.last > last and drawn(v, 1), "a picture of now")
         assert view.timeline.shown is None and not shows_cube(view)

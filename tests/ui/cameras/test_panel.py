@@ -9,7 +9,7 @@ import numpy as np
 from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import camera, description, running, table_scene
 from workbench.core.camera_data import CameraInfo, Picture
-from workbench.session.live.view import Seen
+from workbench.session.live.view import ShownCameras
 from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.cameras.panel import CamerasPanel
 
@@ -29,7 +29,7 @@ class RequestParts:
 BASE, TOP = "base · sensor", "top · sensor"
 
 
-def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> Seen | None:
+def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> ShownCameras | None:
     pictures = {
         (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
     }

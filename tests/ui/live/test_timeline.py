@@ -158,9 +158,9 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
 
 
 def test_of_one_env_there_is_one_way_to_go_on() -> None:
-    assert panel.go_on_labels(running(1)) == ("Go on from here",)
-    assert panel.go_on_labels(SessionView()) == ("Go on from here",)
-    labels = panel.go_on_labels(running(3, selected_env=2))
+    assert panel.continue_labels(running(1)) == ("Go on from here",)
+    assert panel.continue_labels(SessionView()) == ("Go on from here",)
+    labels = panel.continue_labels(running(3, selected_env=2))
     assert labels == ("Go on from here: env 2", "all envs", "env 2 into all envs")
 
 

@@ -1,1 +1,1 @@
-"""The session of the open task: its state, its versions, its place in time."""
+"""The session of the open task: its state, its versions, its timeline."""

@@ -1,9 +1,4 @@
-"""What a session knows: how the task stands, what its batch lived through, and what the page has chosen.
-
-Every event of the worker changes a little of this, and every snapshot that the page draws is made of it. What an
-event means for what is seen is one idea and worth reading alone, so `LiveState` has no lock, no thread and no message:
-`Session` calls its methods under the lock of `SharedState`, and sends whatever is to be sent.
-"""
+"""State of a session, changed by the worker's events and by the page."""
 
 from __future__ import annotations
 
@@ -52,22 +47,25 @@ from workbench.session.record.keep_past import KeepRequest, PastEpisode, find_ep
 
 @dataclass
 class LiveState:
-    """See the module's text. Not thread-safe: the session locks."""
+    """What each event and each request changes in the page's view.
+
+    No lock, no thread, no messages: `Session` calls it under the lock of `SharedState` and sends what is needed.
+    """
 
     reference: TaskName
-    """The task that was asked for: a file, ``file.py:ClassName``, or a registered env id; or what a recording names."""
+    """The requested task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names."""
     options: TaskOptions
-    """How it is made, but for the seed."""
+    """Build options; the seed is that of `now`."""
     history_bytes: int
-    """What the past may take."""
+    """Memory limit of the history."""
     now: SessionView = SessionView(activity="starting the worker")
-    """What is live, but for what `view` adds."""
+    """The live view, without the fields that `view` adds."""
     timeline: Timeline | None = None
     """None before a task is loaded."""
     problem_at_run: bool = False
-    """It came while the task ran, not while a version was loaded."""
-    first_due: bool = False
-    """The next step is the one that a new scene begins with: it does not show that anything runs."""
+    """`now.problem` came while the task ran, not while a version was loaded."""
+    first_step_due: bool = False
+    """The next step is the first of a new scene: it does not prove that the task runs."""
     clients: int = 0
     """Pages that are open."""
     wants_play: bool = False
@@ -75,29 +73,29 @@ class LiveState:
     def __post_init__(self) -> None:
         self.set(seed=self.options.seed)
         self.own_file = named_file(self.reference)
-        """The file that was named, whether or not it ever loaded; None for an env id."""
+        """The named file, even if it never loaded; None for an env id."""
         self.own_folder = followed_folder(self.reference)
-        """Modules in or below it are followed with the file; None where nothing is."""
+        """Modules in or below it are watched with the file; None if nothing is watched."""
         self.running_reference = self.reference
-        """The task that runs."""
+        """The running task."""
 
     def set(self, **changes: Any) -> None:
         """Replace fields of `now`."""
         self.now = replace(self.now, **changes)
 
-    # --- what the worker says ----------------------------------------------------------------------
+    # --- events of the worker ----------------------------------------------------------------------
 
     def loaded(self, event: Loaded, *, restored: bool, stale: bool) -> None:
         """A version runs.
 
         Args:
-            restored: it is the last good one, brought back after a worker's death.
-            stale: the files hold another by now.
+            restored: it was brought back after a crash.
+            stale: the files have changed since.
         """
         task, report, before = event.task, event.reload, self.now.task
         kept = scene_kept(event)
         if kept and before is not None:
-            # The same scene: who has drawn it can see that by its being the same object.
+            # The same object, so that the page sees that it need not build the scene again.
             task = replace(task, geometry=before.geometry)
         self.set(
             task=task,
@@ -108,9 +106,9 @@ class LiveState:
             activity="",
             stale=stale,
         )
-        self.first_due = not kept
+        self.first_step_due = not kept
         if not kept:
-            # What was broken of the rules in this scene comes after it.
+            # Broken rules of the new scene are reported after it.
             self.set(rules=None, rules_serial=self.now.rules_serial + 1)
             same = restored and before is not None and before.source_hash == task.source_hash
             self._new_scene(task, event.first, its_past_stays=same)
@@ -119,18 +117,18 @@ class LiveState:
         if report is None or report.level not in ("same", "patched"):
             self.set(cameras_serial=self.now.cameras_serial + 1)
             self.new_pictures(**{} if kept else {"pictures": {}})
-        if not (restored and self.now.choices):  # else another may have been asked for since
+        if not (restored and self.now.choices):  # else another class may have been chosen since
             self.set(choices=(task.chosen, *task.others) if task.others else ())
         if task.others and task.source_files and task.file is not None:
             self.running_reference = reference_to_class(self.reference, Path(task.file), task.chosen)
             if task.in_place_of is not None:
-                # Saves bring in what is open; the other is to be chosen when it is mended.
+                # Another class runs in place of the one that fails: saves reload that one.
                 self.reference = self.running_reference
         else:
             self.running_reference = self.reference
-        if not restored:  # else what killed the worker still stands
+        if not restored:  # else the problem that killed the worker stays
             self.set_problem(None)
-        self._runs()
+        self._set_running()
 
     def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool) -> None:
         settings = self.now.settings
@@ -151,11 +149,11 @@ class LiveState:
         else:
             moment = self.timeline.add(event)
             self.set(step=moment.step, step_serial=moment.serial)
-        first, self.first_due = self.first_due, False
+        first, self.first_step_due = self.first_step_due, False
         if self.now.problem is not None and self.problem_at_run and not first:
-            # What failed while running runs again: the task was reset, or the policy changed.
+            # It runs again after a problem at run time: the task was reset, or the policy changed.
             self.set_problem(None)
-            self._runs()
+            self._set_running()
 
     def take(self, event: Event) -> None:
         """Any other event."""
@@ -181,7 +179,7 @@ class LiveState:
             if self.timeline is not None:
                 self.timeline.history.add_pictures(event)
             if event.pictures and event.pictures[0].env == now.settings.selected_env:
-                # They come a kind at a time; what nobody looks through any more is not to stay.
+                # Sensors and human cameras come separately, so pictures are merged; unwatched cameras are dropped.
                 watched = {(camera.kind, camera.name) for camera in now.settings.cameras}
                 made = {picture.key: picture for picture in event.pictures}
                 shown = {key: p for key, p in {**now.pictures, **made}.items() if key in watched}
@@ -200,7 +198,7 @@ class LiveState:
                 self.set(state="loading", activity=event.activity)
             elif now.state in ("running", "paused", "loading"):
                 self.set(activity="")
-                self._runs()
+                self._set_running()
 
     def _placed(self, event: Placed) -> None:
         if event.info is None or self.now.task is None:
@@ -208,7 +206,7 @@ class LiveState:
         infos = tuple(event.info if c.key == event.key else c for c in self.now.task.cameras)
         self.set(task=replace(self.now.task, cameras=infos))
         if event.reshaped:
-            self.set(cameras_serial=self.now.cameras_serial + 1)  # what it can show may be something else
+            self.set(cameras_serial=self.now.cameras_serial + 1)  # its modalities may have changed
         if self.timeline is not None:
             self.timeline.camera_moved(*event.key)
 
@@ -216,11 +214,11 @@ class LiveState:
         """The worker is gone.
 
         Args:
-            while_loading: a version was being loaded, so it is not the running one that killed it.
+            while_loading: a version was being loaded, so the running one is not to blame.
             printed: the last lines.
 
         Returns:
-            what is to be told of it; None where somebody asked for it.
+            The problem to show; None if the end was requested.
         """
         problem = None
         if not death.asked or death.stack:
@@ -240,25 +238,25 @@ class LiveState:
         )
         return problem
 
-    def waits_for_the_file(self) -> None:
-        """A worker is up and has nothing that it could load: the problem stands."""
+    def wait_for_file(self) -> None:
+        """A new worker has no version to load: the problem stays."""
         if self.now.state == "starting":
             self.set(state="error", activity="")
 
     def set_problem(self, problem: Problem | None) -> None:
         self.set(problem=problem, problem_serial=self.now.problem_serial + 1)
 
-    def _runs(self) -> None:
+    def _set_running(self) -> None:
         self.set(state="running" if self.now.playing else "paused")
 
     def new_pictures(self, **changes: Any) -> None:
-        """Others are shown now."""
+        """The shown pictures change."""
         self.set(pictures_serial=self.now.pictures_serial + 1, **changes)
 
-    # --- what the page asks for --------------------------------------------------------------------
+    # --- requests of the page ----------------------------------------------------------------------
 
     def change(self, **settings: Any) -> bool:
-        """Choose other `Settings`; the env is the nearest that there is. False if they were chosen."""
+        """Change fields of `Settings`; the selected env is clipped to the batch. False if nothing changes."""
         before, task = self.now.settings, self.now.task
         new = replace(before, **settings)
         last = 0 if task is None else task.num_envs - 1
@@ -267,12 +265,12 @@ class LiveState:
             return False
         self.set(settings=new)
         if new.selected_env != before.selected_env:
-            # The other env's picture must not stand beside this env's numbers until a new one comes.
+            # Without this the other env's picture would stay until a new one comes.
             self.new_pictures(pictures={})
         return True
 
     def choose_class(self, name: str) -> bool:
-        """Ask for another task class of the same file. False if the file has no such class."""
+        """Choose another task class of the same file. False if the file has no such class."""
         if self.own_file is None or name not in self.now.choices:
             return False
         file = (
@@ -283,12 +281,12 @@ class LiveState:
         return True
 
     def open_file(self, file: Path, class_name: str) -> None:
-        """Ask for a class of another file."""
+        """Choose a class of another file."""
         self.reference, self.own_file, self.own_folder = f"{file}:{class_name}", file, file.parent
         self.set(choices=())
 
-    def file_is_edited(self) -> None:
-        """A file that a recording named is open live and is saved: from now on it is what is on disk that is open."""
+    def use_saved_file(self) -> None:
+        """A watched file was saved. If it was opened with a recording's approved text, use the file on disk from now on."""
         if isinstance(self.reference, RecordedTask) and self.reference.approved is not None:
             self.reference = str(self.reference)
 
@@ -297,13 +295,13 @@ class LiveState:
     ) -> Load:
         """See `Load`."""
         options = replace(self.options, seed=self.now.seed)
-        # The version that ran is brought back although another class of the file was asked for since.
+        # The version that ran is brought back even if another class of the file was chosen since.
         reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)
         return Load(reference, options, source, level, snapshot, any_task)
 
     def settings(self) -> Settings:
-        """What the worker is to know of what was chosen."""
+        """Settings for the worker: without cameras if no page is open."""
         chosen = self.now.settings
         return replace(
             chosen,
@@ -313,28 +311,28 @@ class LiveState:
 
     @property
     def folder(self) -> Path | None:
-        """Of the task's own file, where a policy's may lie too."""
+        """Folder of the task's own file, where policies are looked for too."""
         return None if self.own_file is None else self.own_file.parent
 
     @property
     def policy(self) -> str | None:
-        """The one that acts."""
+        """The acting policy, if one is chosen."""
         chosen = self.now.settings
         return chosen.policy if chosen.action_source == "policy" else None
 
     def policy_saved(self) -> ReadPolicyAgain:
-        """What was wrong with it before is past; what it stopped goes on, if it is well now."""
+        """Clear a problem of the policy; playing resumes if that problem had stopped it."""
         problem = self.now.problem
         mended = problem is not None and problem.stage == "policy"
         if mended:
             self.set_problem(None)
-            self._runs()
+            self._set_running()
         return ReadPolicyAgain(play=mended and self.wants_play)
 
-    # --- what is read --------------------------------------------------------------------------------
+    # --- reading -------------------------------------------------------------------------------------
 
     def own_files(self) -> list[str]:
-        """The author's files, as far as they are known."""
+        """The known files of the author."""
         return own_files_of(() if self.now.task is None else self.now.task.source_files, self.own_file)
 
     def newest_moment(self) -> bytes | None:
@@ -350,7 +348,7 @@ class LiveState:
         placed: tuple[PlaceCamera, ...],
         before: bool = False,
     ) -> KeepRequest | str:
-        """See `Session.keep_past`; in a sentence why there is nothing to keep."""
+        """See `Session.keep_past`; or the reason why there is nothing to keep."""
         if self.now.task is None or self.timeline is None or load is None:
             return "no task is loaded"
         history, shown = self.timeline.history, self.timeline.shown
@@ -364,10 +362,10 @@ class LiveState:
         return KeepRequest(self.now.task, load, placed, episodes)
 
     def view(self, **known: Any) -> SessionView:
-        """A snapshot of what is shown.
+        """The view of the shown moment.
 
         Args:
-            known: fields that others know.
+            known: further fields of the view.
         """
         now, timeline = self.now, self.timeline
         refused = now.problem if now.stale and not self.problem_at_run else None
@@ -382,20 +380,20 @@ class LiveState:
 
 
 def scene_kept(event: Loaded) -> bool:
-    """Whether the env, its episodes and its past are those that were there before."""
+    """Whether the env, its episodes and its history stay."""
     return event.reload is not None and event.reload.level in SCENE_KEPT
 
 
 class SharedState:
-    """What a session knows, behind the one lock, and how a page hears that something of it is new.
+    """A session's state with its lock, and a counter of changes that pages wait for.
 
-    Pages, the worker's thread, the file watcher and the recorder all change it. A page asks for everything at once
-    (`Session.view`), so it needs only be told *that* there is something: a counter, and a wait for its next value.
+    Pages, the worker's thread, the file watcher and the recorder all change it. A page reads all of it at once
+    (`Session.view`), so a counter is enough.
     """
 
     def __init__(self, state: LiveState) -> None:
         self.lock = threading.Lock()
-        """Of `state`; to be held for moments only."""
+        """Of `state`; hold it for moments only."""
         self.state = state
         self._changed = threading.Condition(self.lock)
         self._count = 0
@@ -403,25 +401,25 @@ class SharedState:
 
     @contextmanager
     def changing(self) -> Iterator[LiveState]:
-        """The state, with the lock held, to set fields of it; then notes that they are new."""
+        """The state, with the lock held, to change it; notifies pages at the end."""
         with self.lock:
             yield self.state
-        self.note()
+        self.notify()
 
-    def note(self) -> None:
-        """Something is new. Not to be called with the lock held."""
+    def notify(self) -> None:
+        """Notify pages of a change. Call it without the lock."""
         with self._changed:
             self._count += 1
             self._changed.notify_all()
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Block until something is new since the counter `seen`; returns the counter as it is now."""
+        """Block until the counter differs from `seen`; returns the counter."""
         with self._changed:
             self._changed.wait_for(lambda: self._count != seen or self._closing, timeout)
             return self._count
 
     def close(self) -> None:
-        """From now on nobody waits."""
+        """Wake all waiting pages; `wait` returns at once from now on."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()

@@ -1,13 +1,4 @@
-"""The session on the server's side: what the page asks for, and what it sees.
-
-The page's controls call methods here; each only notes the wish and sends a message, so none waits for
-the env. The worker's events come one by one on one thread and change the `LiveState`, of which
-`Session.view` makes a snapshot. When the worker dies, `Supervisor` starts another, which is greeted with
-the last version that ran, and the page never goes away.
-
-What is done here is to bring those together: who is asked, and who is told of what. What an event means is in
-`live_state`, which version is loaded, and when, in `versions`, how the past is gone through in `timeline`.
-"""
+"""The live session: takes requests of the page and events of the worker."""
 
 from __future__ import annotations
 
@@ -56,11 +47,16 @@ from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
 
 HISTORY_BYTES = 256 * 1024**2
-"""What the past may take unless somebody says otherwise."""
+"""Default memory limit of the history."""
 
 
 class Session:
-    """One task, one worker, any number of pages. All methods are thread-safe and return at once."""
+    """One task, one worker, any number of pages. All methods are thread-safe and return at once.
+
+    Requests only change the state and send a message; none waits for the env. The worker's events come one by one on one
+    thread and change the `LiveState`, of which `view` makes a snapshot. When the worker dies, `Supervisor` starts
+    another, which loads the last good version; pages stay open.
+    """
 
     def __init__(
         self,
@@ -78,34 +74,33 @@ class Session:
         """
         Args:
             task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names, cleared.
-            recordings: folder that recorded episodes go to; made when the first is written.
-            history_bytes: memory that the past may take.
+            recordings: folder for recorded episodes; made when the first is written.
+            history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
-            make_worker: what the worker is kept by: another, for tests that need none.
-            on_event: called with every event of the worker, and its death as a failure, on the session's thread
-                (the terminal).
-            on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
-            on_notice: called, on any thread, with a sentence that is to be seen in the terminal too.
+            make_worker: makes the supervisor; tests without a worker process give another.
+            on_event: called with every event of the worker, and with its death as `LoadFailed`, on the session's thread.
+            on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
+            on_notice: called, on any thread, with a message for the terminal.
         """
         self._on_event = on_event
         self._print = on_line
         self._state = LiveState(task, options, history_bytes)
         self._shared = SharedState(self._state)
-        self._lock, self._note = self._shared.lock, self._shared.note
+        self._lock, self._notify = self._shared.lock, self._shared.notify
         self._sending_settings = threading.Lock()
         """Taken before `_lock`."""
         self._to_enter: tuple[Callable[[tuple[int, ...]], EnterRecording], bool] | None = None
-        """What is to be gone into, and whether by all envs, as soon as a task is there."""
-        self._step_backs = itertools.count(1)
+        """Request to send as soon as a task is loaded, and whether for all envs."""
+        self._enter_numbers = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
         self.versions = Versions(
             self._shared, self._send, lambda: self._worker.replace(), on_save=self._on_save
         )
-        """Which version of the file runs, and what is loaded in its place."""
+        """Loads versions of the file."""
         self._worker = make_worker(
             worker or WorkerOptions(),
             WarmUp(options),
-            greet=self.versions.greeting,
+            greet=self.versions.first_requests,
             on_event=self._handle,
             on_death=self._on_death,
             on_busy=self._on_busy,
@@ -113,31 +108,31 @@ class Session:
             output=self._printed.feed,
         )
         self._recorder = LiveRecorder(
-            recordings, self._note, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
+            recordings, self._notify, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
         )
         self._background = Background()
-        """The process that does all that is done beside playing."""
-        self.keeper = PastKeeper(recordings, self._recorder.finisher, self._note, self._background)
-        self.rescorer = PastRescorer(self._note, self._background)
+        """Asks the background process."""
+        self.keeper = PastKeeper(recordings, self._recorder.finisher, self._notify, self._background)
+        self.rescorer = PastRescorer(self._notify, self._background)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
-        """What the batch lived through."""
+        """The timeline."""
         self._asker = Asker(self._send)
         self.studio = CameraStudio(
             self._send,
             self._asker,
             self._background,
-            self._note,
+            self._notify,
             self.past,
-            self.versions.same_again,
+            self.versions.running_load,
             self.versions.open_file,
         )
-        """Cameras placed by hand."""
-        listen(self._say)
+        """The camera studio."""
+        listen(self._log)
         self.versions.start()
         self._worker.start()
 
-    # --- what the page reads -----------------------------------------------------------------------
+    # --- reading -----------------------------------------------------------------------------------
 
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
@@ -152,12 +147,12 @@ class Session:
         return replace(view, studio=self.studio.view(view.step, view.settings.selected_env))
 
     def env_rows(self) -> EnvRows | None:
-        """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
+        """The table of envs; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
         with self._lock:
             return None if self._state.timeline is None else self._state.timeline.history.env_rows()
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Block until something changed since the counter `seen`; returns the counter as it is now."""
+        """Block until the counter of changes differs from `seen`; returns the counter."""
         return self._shared.wait(seen, timeout)
 
     @property
@@ -165,16 +160,16 @@ class Session:
         """Process id of the worker; None while there is none."""
         return self._worker.pid
 
-    # --- what the page asks for --------------------------------------------------------------------
+    # --- requests ----------------------------------------------------------------------------------
 
     def interrupt(self) -> None:
-        """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
+        """Interrupt the author's code, if it is running; its traceback becomes the problem."""
         self._worker.interrupt()
 
     def clear_printed(self) -> None:
-        """Forget what the author's code printed."""
+        """Clear the log."""
         self._printed.clear()
-        self._note()
+        self._notify()
 
     def play(self) -> None:
         self.past.seek(None)
@@ -196,52 +191,52 @@ class Session:
         self._send(request or Play(playing))
 
     def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
-        """All envs with the session's seed, or some with fresh seeds."""
+        """Reset all envs with the session's seed, or some with fresh seeds."""
         self.past.seek(None)
         self._send(Reset(env_idx, self._state.now.seed if env_idx is None else None))
 
     def set_seed(self, seed: int) -> None:
-        """Take another seed and reset all envs with it."""
+        """Change the seed and reset all envs with it."""
         with self._lock:
             self._state.set(seed=int(seed))
         self.reset()
 
     def change(self, **settings: Any) -> None:
-        """Choose otherwise: fields of `Settings`."""
+        """Change fields of `Settings`."""
         with self._lock:
             if not self._state.change(**settings):
                 return
             policy, folder = self._state.policy, self._state.folder
         self._send_settings()
         self._policy_file.follow(policy, folder)
-        self._note()
+        self._notify()
 
     def _on_policy_saved(self) -> None:
         with self._lock:
             request = self._state.policy_saved()
-        # A policy beside the task is taken for one of its modules too, of which "nothing changed" is said.
-        self._say("the policy's file was saved: it is read anew")
-        self._note()
+        # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
+        self._log("the policy's file was saved: it is read anew")
+        self._notify()
         self._send(request)
 
     def inspect(self, sections: tuple[Section, ...]) -> None:
-        """Read the selected env out, once; the answer becomes `SessionView.inspection`."""
+        """Inspect the selected env once; the answer becomes `SessionView.inspection`."""
         with self._lock:
             env = self._state.now.settings.selected_env
         self._send(Inspect(env, sections))
 
     def set_clients(self, count: int) -> None:
-        """How many pages are open; with none, no picture is rendered."""
+        """Set the number of open pages; with none, no picture is rendered."""
         with self._lock:
             before, self._state.clients = self._state.clients, count
         if (before == 0) != (count == 0):
             self._send_settings()
 
     def start_recording(self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False) -> None:
-        """Record these envs (all if None): from a reset on that is made now, until it is stopped.
+        """Reset these envs (all if None) and record them until `stop_recording`.
 
         Args:
-            next_episode: reset nothing, and record of each env only the episode that begins with its next reset.
+            next_episode: do not reset; record only the episode of each env that begins with its next reset.
         """
         with self._lock:
             task = self._state.now.task
@@ -252,24 +247,24 @@ class Session:
         self._send(SetCapture(envs, from_reset=True))
         if not next_episode:
             self.reset(None if env_idx is None else envs)
-        self._note()
+        self._notify()
 
     def stop_recording(self) -> None:
-        """Write what was gathered of the episodes under way, and stop."""
+        """Stop recording; the running episodes are written as far as they are."""
         self._send(SetCapture(()))
         self._recorder.stop()
-        self._note()
+        self._notify()
 
     def keep_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
-        """Record after the fact: the episode of each of these envs (of all if None) round the moment that is shown.
+        """Record from the history: for each of these envs (all if None) the episode that contains the shown moment.
 
-        Live, that is the episode that runs, or the one before if that has no step yet. `SessionView.recording` says how
-        far it is and what came of it.
+        Live, that is the running episode, or the one before if that has no step yet. `SessionView.recording` has progress
+        and result.
 
         Args:
-            before: the episode before that one.
+            before: record the episode before that one.
         """
-        load = self.versions.same_again()
+        load = self.versions.running_load()
         placed = self.studio.placed_cameras()
         with self._lock:
             what = self._state.keep_request(env_idx, load, placed, before)
@@ -285,22 +280,21 @@ class Session:
         source_file: str | None = None,
         source: Mapping[str, str] = MappingProxyType({}),
     ) -> int:
-        """Put the selected env, or all, into the last state of a recorded run; pauses there. Before a task is loaded
-        it is done when one is.
+        """Put the selected env, or all, into the last state of a recorded run, and pause. Waits for a task to be loaded.
 
         Args:
-            source_file, source: what the task was then; what has changed since is told on arrival.
+            source_file, source: the task's source when it was recorded; changes since are reported with the result.
 
         Returns:
-            What `TimelineView.entered` is when it is done.
+            The value of `TimelineView.entered` when it is done.
         """
-        number = next(self._step_backs)
-        self._go_into(
+        number = next(self._enter_numbers)
+        self._send_enter(
             lambda env_idx: EnterRecording(run, env_idx, source_file, dict(source), number), everywhere
         )
         return number
 
-    def _go_into(self, request: Callable[[tuple[int, ...]], EnterRecording], everywhere: bool) -> None:
+    def _send_enter(self, request: Callable[[tuple[int, ...]], EnterRecording], everywhere: bool) -> None:
         self.past.seek(None)
         self.pause()
         with self._lock:
@@ -309,16 +303,16 @@ class Session:
                 self._to_enter = request, everywhere
                 return
         self._send(request(tuple(range(task.num_envs)) if everywhere else (env,)))
-        self._note()
+        self._notify()
 
     def show(self, env: int, serial: int) -> None:
-        """Select an env and show a moment of its past."""
+        """Select an env and show a moment of the history."""
         self.change(selected_env=env)
         self.past.seek(serial)
 
     def close(self) -> None:
-        """End the worker and the watcher, and wait for episodes that are being written."""
-        stop_listening(self._say)
+        """End all processes and threads; waits for episodes that are being written."""
+        stop_listening(self._log)
         self._shared.close()
         self.versions.close()
         self._policy_file.close()
@@ -329,13 +323,13 @@ class Session:
         self._background.end()
         self._recorder.close()
 
-    # --- what the worker says, on the session's thread -------------------------------------------
+    # --- events of the worker, on the session's thread -------------------------------------------
 
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
         self.studio.interrupted()
         problem, kept = self.versions.died(death, self._printed.tail(20))
-        self._note()
+        self._notify()
         if problem is not None:
             self._on_event(LoadFailed(problem, kept))
 
@@ -344,11 +338,11 @@ class Session:
             if busy is None and self._state.now.busy is None:
                 return
             self._state.set(busy=busy)
-        self._note()
+        self._notify()
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, LoadFailed) and self._worker.load_pending and event.problem.interrupted:
-            return  # left for the sake of a newer version, which waits: nobody need hear of it
+            return  # interrupted because a newer version waits: no failure to report
         if isinstance(event, Loaded):
             self._on_loaded(event)
         elif isinstance(event, Stepped):
@@ -364,18 +358,18 @@ class Session:
                 self.versions.failed(event)
                 if not self._state.problem_at_run:
                     self.studio.failed_to_load()
-        self._note()
+        self._notify()
         self._on_event(event)
 
     def _on_loaded(self, event: Loaded) -> None:
         self._worker.reset_deaths()
         recording, one_each = self._recorder.recording, self._recorder.one_each
         if not scene_kept(event) or (event.reload is not None and event.reload.level != "same"):
-            # Episodes of the version before end here: their steps and the new ones do not belong together.
+            # An episode must not mix steps of two versions.
             self._recorder.stop()
         with self._lock:
             s = self._state
-            restored, stale = self.versions.came_in(event.task)
+            restored, stale = self.versions.version_loaded(event.task)
             meaning = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
             rescored = None
             if meaning == "rescore" and s.timeline is not None:
@@ -384,7 +378,7 @@ class Session:
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)
         if rescored is not None:
-            load = self.versions.same_again()
+            load = self.versions.running_load()
             assert load is not None
             self.rescorer.rescore(load, rescored)
         elif meaning == "forget":
@@ -393,18 +387,18 @@ class Session:
         self._send_settings()
         self.studio.ask_for(placed)
         if recording:
-            self._record_on(event, recording, one_each)
+            self._continue_recording(event, recording, one_each)
         with self._lock:
             to_enter, self._to_enter = self._to_enter, None
         if to_enter is not None:
-            self._go_into(*to_enter)
+            self._send_enter(*to_enter)
 
-    def _record_on(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
-        """A version came in while these envs were recorded."""
+    def _continue_recording(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
+        """Continue recording these envs after a version came in."""
         if not scene_kept(event):
             self.start_recording(env_idx, next_episode=one_each)
         elif not self._recorder.recording:
-            # The moment is not to be lost: recording goes on with each env's next episode.
+            # No reset, which would lose the present moment: recording continues with each env's next episode.
             with self._lock:
                 task = self._state.now.task
             if task is not None:
@@ -420,19 +414,19 @@ class Session:
         self.studio.interrupted()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
-        self._note()
+        self._notify()
         for line in lines:
             self._print(line)
 
-    def _say(self, text: str) -> None:
-        """In the log on the page and in the terminal."""
+    def _log(self, text: str) -> None:
+        """Add a text to the log of the page and of the terminal."""
         for line in text.splitlines():
             self._printed.feed("stderr", f"workbench: {line}\n".encode(errors="replace"))
 
-    # --- small things --------------------------------------------------------------------------------
+    # --- sending -------------------------------------------------------------------------------------
 
     def _send_settings(self) -> None:
-        # Read and sent in one go, or of two threads the one that read first might send last.
+        # Read and sent under one lock: otherwise, of two threads, the older settings might be sent last.
         with self._sending_settings:
             with self._lock:
                 settings = self._state.settings()

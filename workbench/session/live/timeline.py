@@ -1,10 +1,4 @@
-"""What of the past is shown, and where one may go from there; and how a page asks for it.
-
-Live is the newest moment. Whoever moves the slider pins another one, and all that the page draws of the batch
-(poses, numbers, pictures) comes from it, out of the server's own memory: the worker hears nothing of it and goes
-on. Only three things are asked of the worker: to go on from a moment, to take back a jump, and, when somebody
-stands still at a moment that has no pictures, to draw it.
-"""
+"""The time slider: which moment of the history is shown, and continuing from it."""
 
 from __future__ import annotations
 
@@ -25,60 +19,65 @@ if TYPE_CHECKING:
     from workbench.session.live.live_state import SharedState
 
 Scope = Literal["this", "all", "into all"]
-"""Who goes back: the selected env; every env, each to its own; or every env to the selected env's moment."""
+"""Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
 _MOST_EVENTS = 400
 MOST_STEPS = 400
-"""Control steps that are made again, at the most, to go back to a moment."""
+"""Most control steps that are replayed to go back to a moment."""
 
 
 @dataclass(frozen=True)
 class TimelineView:
-    """The past in numbers, for the page. Moments are named by serials, which count up and never come again."""
+    """State of the time slider. Moments are named by serials, which count up and are never reused."""
 
     first: int = 0
     last: int = -1
     """The kept moments; `last` is the live one."""
     shown: int | None = None
-    """The moment that is shown; None while live."""
+    """The shown moment; None while live."""
     tick: int = 0
-    """Where the shown moment is on the curves."""
+    """`Curves.tick` of the shown moment."""
     used: int = 0
     limit: int = 0
     """Bytes."""
     moments: int = 0
-    can_go_on: bool = False
-    """Whether the shown moment can be gone back to."""
+    can_continue: bool = False
+    """Whether envs can go back to the shown moment."""
     undo: str | None = None
-    """What `TimeTravel.undo` would take back, in words."""
+    """What `TimeTravel.undo` would undo, as text."""
     not_carried: tuple[str, ...] = ()
-    """What the last going back could not put back, each with its reason."""
+    """State that the last jump could not restore, each with its reason."""
     arrived: str = ""
-    """Where the last jump came from, and how, if that was a recording."""
+    """How the last jump entered a recording; empty if it did not."""
     entered: int = 0
-    """Number of the last `Session.enter_recording` that has arrived; 0 for none."""
+    """Number of the last finished `Session.enter_recording`; 0 for none."""
     wants_pictures: bool = False
-    """The shown moment has no pictures of the cameras that are looked through."""
+    """The shown moment lacks pictures of the watched cameras."""
 
 
 @dataclass(frozen=True)
 class Strip:
-    """A part of the past of one env, to be drawn under the slider."""
+    """A part of one env's history, for the strip under the slider."""
 
     low: int
     high: int
     """Serials, both included."""
     events: tuple[tuple[int, int], ...]
-    """Serial, and what happened (`history.RESET` ... added up)."""
+    """Serial and event flags (`history.RESET` ... added up)."""
     reward: NDArray[np.float32]
     """(high - low + 1,)"""
     branches: tuple[tuple[int, int], ...]
-    """Serials at which the env went back, and of the moments that it went back to."""
+    """Serials at which the env went back, each with the serial that it went back to."""
     segments: tuple[tuple[int, int], ...]
-    """First and last serial of what it lived through without a jump."""
+    """First and last serial of each segment (see `History`)."""
 
 
 class Timeline:
-    """The history of the present task and the moment that is shown. Not thread-safe: the session locks."""
+    """The history of the present task and the shown moment. Not thread-safe: the session locks.
+
+    Live is the newest moment. The slider pins another one, and then all that the page draws of the batch (poses, numbers,
+    pictures) comes from the server's memory, while the worker continues. The worker gets requests only to continue from a
+    moment, to undo a jump, and to draw a moment that has no pictures.
+    """
 
     def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
         """See `History`."""
@@ -86,11 +85,11 @@ class Timeline:
         self._num_envs = table.rows().num_envs
         self._shown: int | None = None
         self._jump: Restored | None = None
-        """Of the last jump."""
+        """The last jump; None for a reset."""
         self._entered = 0
-        self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
+        self._requested: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
-    # --- what comes ----------------------------------------------------------------------------------
+    # --- events --------------------------------------------------------------------------------------
 
     def add(self, stepped: Stepped) -> Moment:
         moment = self.history.add(stepped)
@@ -99,10 +98,10 @@ class Timeline:
         if stepped.restored is not None and stepped.restored.number:
             self._entered = stepped.restored.number
         if self._shown is not None and self._shown < self.history.first:
-            self._shown = self.history.first  # what was looked at had to go
+            self._shown = self.history.first  # the shown moment was dropped
         return moment
 
-    # --- what is shown -------------------------------------------------------------------------------
+    # --- the shown moment ----------------------------------------------------------------------------
 
     @property
     def shown(self) -> Moment | None:
@@ -111,29 +110,29 @@ class Timeline:
 
     @property
     def at(self) -> int:
-        """Serial of the moment that is shown, the newest while live."""
+        """Serial of the shown moment, the newest while live."""
         return self.history.last if self._shown is None else self._shown
 
     def seek(self, serial: int | None) -> None:
-        """Pin a moment, the nearest that is kept; the newest, or None, is live."""
+        """Pin a moment, or the nearest kept one; the newest, or None, is live."""
         if serial is None or serial >= self.history.last:
             self._shown = None
         else:
             self._shown = max(serial, self.history.first)
 
     def seek_by(self, steps: int) -> None:
-        """Some moments on (or back, if negative) from what is shown."""
+        """Go some moments forward (or back, if negative) from the shown one."""
         self.seek(self.at + steps)
 
     def seek_step(self, env: int, step: int) -> None:
-        """To that control step of the present episode of this env, through its goings back; or the nearest kept."""
+        """Go to a control step of the present episode of this env, through its jumps back; or the nearest kept."""
         episode_backwards = self.history.episode_backwards(env, self.history.last)
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if serials:
             self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
     def seek_event(self, env: int, direction: int) -> None:
-        """To the next (1) or last (-1) event of this env; forward from the last one is live."""
+        """Go to the next (1) or previous (-1) event of this env; forward from the last one is live."""
         here = self.at
         if direction > 0:
             after = self.history.events(env, here + 1, self.history.last)
@@ -143,12 +142,12 @@ class Timeline:
             self.seek(before[-1][0] if before else self.history.first)
 
     def camera_moved(self, kind: CameraKind, name: str) -> None:
-        """See `History.camera_moved`; what is shown is drawn again when it is asked for."""
+        """See `History.camera_moved`; the shown moment is drawn again on the next `draw`."""
         self.history.camera_moved(kind, name)
-        self._asked = None
+        self._requested = None
 
     def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
-        """Those of the shown moment that were kept."""
+        """Stored pictures of the shown moment."""
         moment = self.shown
         if moment is None:
             return {}
@@ -167,8 +166,8 @@ class Timeline:
             used=history.used,
             limit=history.limit,
             moments=len(history),
-            can_go_on=moment is not None and moment.snapshot is not None,
-            undo=None if jump is None else _in_words(jump, history.envs_still_at(jump), self._num_envs),
+            can_continue=moment is not None and moment.snapshot is not None,
+            undo=None if jump is None else _jump_text(jump, history.envs_still_at(jump), self._num_envs),
             not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
             arrived=how,
             entered=self._entered,
@@ -176,7 +175,7 @@ class Timeline:
         )
 
     def strip(self, env: int, low: int, high: int) -> Strip:
-        """The past of one env between two moments."""
+        """The history of one env between two moments, both included."""
         history = self.history
         low, high = max(low, history.first), min(high, history.last)
         return Strip(
@@ -192,10 +191,10 @@ class Timeline:
             ),
         )
 
-    # --- what is asked of the worker -------------------------------------------------------------------
+    # --- requests to the worker ------------------------------------------------------------------------
 
-    def go_on(self, env: int, scope: Scope) -> Restore | None:
-        """Ask to go on from the shown moment, which is left for live; None where that cannot be."""
+    def continue_from_shown(self, env: int, scope: Scope) -> Restore | None:
+        """Request to continue from the shown moment, and show live; None if that is not possible."""
         moment = self.shown
         snapshot = None if moment is None else self.history.snapshot_at(moment.serial)
         if moment is None or snapshot is None:
@@ -206,7 +205,7 @@ class Timeline:
         return self._restore(snapshot, envs, source, moment.serial)
 
     def undo(self, env: int) -> Restore | None:
-        """Ask to take back this env's last jump, in all envs that it brought where they are; None if there is none."""
+        """Request to undo this env's last jump, in all envs that have not jumped since; None if there is none."""
         jump = self.history.last_jump(env)
         if jump is None:
             return None
@@ -233,15 +232,15 @@ class Timeline:
         return Restore(snapshot, envs, source, origin, undoes, ways, starts)
 
     def draw(self, env: int, cameras: tuple[CameraRequest, ...]) -> DrawPast | None:
-        """Ask for the pictures that the shown moment lacks; once for each moment, env and choice of cameras."""
+        """Request the missing pictures of the shown moment; only once for each moment, env and set of cameras."""
         moment = self.shown
         if moment is None:
             return None
         lacking = self._lacking(moment, env, cameras)
-        asked = (moment.serial, env, lacking)
-        if not lacking or asked == self._asked:
+        requested = (moment.serial, env, lacking)
+        if not lacking or requested == self._requested:
             return None
-        self._asked = asked
+        self._requested = requested
         return DrawPast(moment.step.poses[env].copy(), env, lacking, moment.serial)
 
     def _lacking(
@@ -259,7 +258,7 @@ class Timeline:
         return tuple(camera for camera in cameras if lacks(camera))
 
 
-def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
+def _jump_text(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
     what = "reset" if jump.restored is None else "going back"
     if jump.restored is not None and jump.restored.recording:
         what = "going live"
@@ -271,68 +270,68 @@ def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
 
 
 class TimeTravel:
-    """What the batch lived through. All methods are thread-safe and return at once."""
+    """The timeline as the page uses it. All methods are thread-safe and return at once."""
 
     def __init__(
         self, shared: SharedState, send: Callable[[Request], None], pause: Callable[[], None]
     ) -> None:
         """
         Args:
-            shared: what the session knows.
-            send: tells the worker.
+            shared: the session's state.
+            send: sends a request to the worker.
             pause: stops playing.
         """
-        self._state, self._lock, self._note = shared.state, shared.lock, shared.note
+        self._state, self._lock, self._notify = shared.state, shared.lock, shared.notify
         self._send, self._pause = send, pause
 
-    # --- looked at -------------------------------------------------------------------------------
+    # --- show ------------------------------------------------------------------------------------
 
     def seek(self, serial: int | None) -> None:
-        """Show a moment of the past, by its number (see `TimelineView`); None shows what is live."""
+        """Show the moment of this serial; None shows live."""
         self._seek(lambda timeline: timeline.seek(serial))
 
     def seek_by(self, steps: int) -> None:
-        """Show a moment before (negative) or after the one that is shown."""
+        """Show a moment before (negative) or after the shown one."""
         self._seek(lambda timeline: timeline.seek_by(steps))
 
     def seek_step(self, env: int, step: int) -> None:
-        """Show the moment at which this env was at that step of its present episode."""
+        """Show the moment of a step of this env's present episode."""
         self._seek(lambda timeline: timeline.seek_step(env, step))
 
     def seek_event(self, direction: int) -> None:
-        """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
+        """Show the next (1) or previous (-1) event of the selected env: reset, success, fail, truncation, jump back."""
         env = self._env
         self._seek(lambda timeline: timeline.seek_event(env, direction))
 
     def draw(self) -> None:
-        """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
+        """Request pictures of the shown moment, if some of the watched cameras lack one."""
         with self._lock:
             s = self._state
             request = None if s.timeline is None else s.timeline.draw(self._env, s.now.settings.cameras)
         if request is not None:
             self._send(request)
 
-    # --- gone back to ----------------------------------------------------------------------------
+    # --- go back ---------------------------------------------------------------------------------
 
-    def go_on(self, scope: Scope) -> None:
-        """Put envs back to the shown moment; the simulation goes on from there (see `timeline.Scope`)."""
-        self._travel(lambda timeline, env: timeline.go_on(env, scope))
+    def continue_from_shown(self, scope: Scope) -> None:
+        """Continue the simulation from the shown moment, in the envs of `scope`."""
+        self._travel(lambda timeline, env: timeline.continue_from_shown(env, scope))
 
     def undo(self) -> None:
-        """Take back the selected env's last reset or going back, and pause there."""
+        """Undo the selected env's last reset or jump back, and pause."""
         self._pause()
         self._travel(lambda timeline, env: timeline.undo(env))
 
     # --- read ------------------------------------------------------------------------------------
 
     def strip(self, low: int, high: int) -> Strip | None:
-        """The selected env's past between two moments; None before a task is loaded."""
+        """The selected env's history between two moments; None before a task is loaded."""
         with self._lock:
             s = self._state
             return None if s.timeline is None else s.timeline.strip(self._env, low, high)
 
     def segment(self) -> tuple[int, int] | None:
-        """First and last moment of what the selected env lived through round the shown moment, without a jump."""
+        """First and last serial of the selected env's segment that contains the shown moment."""
         with self._lock:
             timeline = self._state.timeline
             if timeline is None or not len(timeline.history):
@@ -340,7 +339,7 @@ class TimeTravel:
             return timeline.history.segment_at(self._env, timeline.at)
 
     def shown_moment(self) -> ShownMoment:
-        """Which env is looked at, and where its bodies are if that is not live."""
+        """See `Shown`."""
         with self._lock:
             s = self._state
             shown = None if s.timeline is None else s.timeline.shown
@@ -348,7 +347,7 @@ class TimeTravel:
             return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
 
     def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
-        """Moments, at the most so many, of the selected env's episode round the one that is shown."""
+        """See `Shown`."""
         with self._lock:
             s = self._state
             if s.timeline is None or not len(s.timeline.history):
@@ -369,7 +368,7 @@ class TimeTravel:
             if timeline.shown is before:
                 return
             self._state.new_pictures()
-        self._note()
+        self._notify()
 
     def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
         with self._lock:
@@ -378,4 +377,4 @@ class TimeTravel:
             self._state.new_pictures()
         if request is not None:
             self._send(request)
-        self._note()
+        self._notify()

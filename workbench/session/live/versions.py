@@ -1,8 +1,4 @@
-"""Which version of the author's file is asked for, and from where: a save, a person, or the end of a worker.
-
-The file is followed whether or not it ever loaded, with the modules beside it that the task imported. What a worker is
-asked to load after another's end is `Recovery`'s to say; `Versions` says it to the worker, and the page's state follows.
-"""
+"""Decides which version of the author's file the worker loads: after a save, on request, or after a crash."""
 
 from __future__ import annotations
 
@@ -18,16 +14,16 @@ from workbench.session.live.live_state import SharedState
 from workbench.session.process.supervisor import Death
 from workbench.session.protocol.messages import Load, LoadFailed, LoadLevel, Play, Request
 
-Rung = Literal["file", "moment", "version", "nothing"]
+Attempt = Literal["file", "moment", "version", "nothing"]
 
 
 class LoadInputs(NamedTuple):
-    """What a load is to name besides the task."""
+    """Source and moment of a load."""
 
     source: dict[str, str] | None
-    """Text to be used in place of the files; None for what is on disk."""
+    """Texts to use in place of the files; None for those on disk."""
     snapshot: bytes | None
-    """The moment to be restored."""
+    """The moment to restore."""
 
 
 def is_on_disk(source: Mapping[str, str]) -> bool:
@@ -42,87 +38,89 @@ def is_on_disk(source: Mapping[str, str]) -> bool:
 
 
 class Recovery:
-    """What the next worker is asked to load when one has gone: the last good version at the last moment.
+    """Chooses what the next worker loads after one has died.
 
-    Bringing back a version can itself fail, in ways that end the worker again: the moment cannot be restored, the file kills
-    whoever imports it, the memory does not suffice. So there is a way down: the file as it is on disk (if that is what
-    somebody waits for), the last good version at its last moment, the same from its start, and at last nothing: a worker
-    that is up and waits for the file to change. None is tried twice, so that no file can make workers die one after the
-    other. Used under the session's lock.
+    Loading may kill the worker again: the moment cannot be restored, importing the file crashes, memory runs out. So the
+    attempts are, in order: the file on disk (if a newer one waits), the last good version at its newest moment, the same
+    from its start, and at last nothing, until the file changes. None is tried twice, so that no file can kill workers one
+    after the other. Used under the session's lock.
     """
 
     def __init__(self, newest: Callable[[], bytes | None]) -> None:
         """
         Args:
-            newest: the newest state of the batch, a pickled `core.snapshots.snapshot.Snapshot`, or None. Asked for only
-                when it is wanted, since putting one together takes longer than a step.
+            newest: returns the newest state of the batch, a pickled `core.snapshots.snapshot.Snapshot`, or None. Called
+                only when needed, since assembling one takes longer than a step.
         """
         self._good: TaskDescription | None = None
         self._newest = newest
-        self._rung: Rung = "file"
+        self._attempt: Attempt = "file"
         self.loading = True
-        """Whether a load is under way."""
+        """A load is running."""
         self._has_env = False
 
     @property
     def restoring(self) -> bool:
-        """Whether the load under way brings back what there was."""
-        return self.loading and self._rung in ("moment", "version")
+        """Whether the running load brings back the last good version."""
+        return self.loading and self._attempt in ("moment", "version")
 
     def wanted(self) -> LoadInputs | None:
-        """What a fresh worker is to load; None to load nothing."""
-        if self._rung == "nothing":
+        """What a new worker has to load; None for nothing."""
+        if self._attempt == "nothing":
             return None
         self.loading = True
-        good = self._good.source if self._good is not None and self._rung != "file" else None
-        return LoadInputs(good or None, self._newest() if self._rung in ("file", "moment") else None)
+        good = self._good.source if self._good is not None and self._attempt != "file" else None
+        return LoadInputs(good or None, self._newest() if self._attempt in ("file", "moment") else None)
 
-    def file_asked(self) -> LoadInputs:
-        """The file is to be loaded as it is on disk, by the worker that there is."""
-        self._rung, self.loading = "file", True
+    def file_requested(self) -> LoadInputs:
+        """The present worker is to load the file on disk."""
+        self._attempt, self.loading = "file", True
         return LoadInputs(None, None if self._has_env else self._newest())
 
     def loaded(self, task: TaskDescription) -> None:
-        """`task` runs, and is the last good version from now on."""
+        """`task` runs: it is the last good version from now on."""
         self._good, self._has_env = task, True
-        self._rung, self.loading = "file", False
+        self._attempt, self.loading = "file", False
 
     def failed(self, kept: bool) -> bool:
-        """A load failed in a worker that goes on. True if it has nothing now, and `wanted` says what to try."""
+        """A load failed in a worker that still runs. True if it has no version now, and `wanted` has one to try."""
         was_loading, self.loading = self.loading, False
         if kept or not was_loading:
             return False
         self._step_down()
-        return self._rung != "nothing"
+        return self._attempt != "nothing"
 
     def died(self, file_waits: bool) -> None:
-        """The worker is gone; `file_waits`: it was ended because a newer file waited behind it."""
+        """The worker is gone; `file_waits`: it was ended since a newer file waited to be loaded."""
         if file_waits:
-            self._rung = "file"
+            self._attempt = "file"
         elif self.loading:
             self._step_down()
-        elif self._rung != "nothing":
-            self._rung = "moment" if self._good is not None else "nothing"
+        elif self._attempt != "nothing":
+            self._attempt = "moment" if self._good is not None else "nothing"
         self.loading = self._has_env = False
 
-    def restart_asked(self) -> None:
-        """Somebody had the worker replaced: what there was comes back, or the file if nothing ever ran."""
-        self._rung = "file" if self._good is None else "moment"
+    def restart_requested(self) -> None:
+        """A person restarts the worker: the last good version comes back, or the file if there is none."""
+        self._attempt = "file" if self._good is None else "moment"
         self.loading = self._has_env = False
 
     def _step_down(self) -> None:
         if self._good is None:
-            self._rung = "nothing"
-        elif self._rung == "file":
-            self._rung = "moment" if self._newest() is not None else "version"
-        elif self._rung == "moment" and self._newest() is not None:
-            self._rung = "version"
+            self._attempt = "nothing"
+        elif self._attempt == "file":
+            self._attempt = "moment" if self._newest() is not None else "version"
+        elif self._attempt == "moment" and self._newest() is not None:
+            self._attempt = "version"
         else:
-            self._rung = "nothing"
+            self._attempt = "nothing"
 
 
 class Versions:
-    """See the module's text."""
+    """Watches the author's files and asks the worker to load them.
+
+    The task's own file is watched even if it never loaded, and with it the modules in its folder that the task imported.
+    """
 
     def __init__(
         self,
@@ -133,7 +131,7 @@ class Versions:
     ) -> None:
         """
         Args:
-            on_save: called when a file that is followed was saved, before it is loaded.
+            on_save: called when a watched file was saved, before it is loaded.
         """
         self._shared, self._send, self._replace_worker = shared, send, replace_worker
         self._on_save = on_save
@@ -141,56 +139,56 @@ class Versions:
         self._watcher = SourceWatcher(self._on_files_changed)
 
     def start(self) -> None:
-        """Follow the task's own file from now on."""
+        """Watch the task's own file from now on."""
         self._follow((), {})
 
-    # --- what is asked for ---------------------------------------------------------------------------
+    # --- requests ------------------------------------------------------------------------------------
 
     def reload(self, level: LoadLevel = "auto") -> None:
-        """Load the file again, by a level that is named whatever it may leave of the old version.
+        """Load the file again. A level other than ``auto`` is forced, even if it keeps parts of the old version.
 
-        A worker that does not take it up (an endless loop) is interrupted or replaced.
+        A worker that does not take the request (an endless loop) is interrupted or replaced.
         """
         with self._shared.lock:
             state = self._shared.state
-            request = state.load_request(*self._recovery.file_asked(), level)
+            request = state.load_request(*self._recovery.file_requested(), level)
             stopped = state.now.state == "stopped"
         if stopped:
-            self._replace_worker()  # it will be greeted with the file
+            self._replace_worker()  # the new one loads the file, see `first_requests`
         else:
             self._send(request)
 
     def choose_class(self, name: str) -> None:
-        """Another task class of the same file, one that `TaskDescription.others` names."""
+        """Load another task class of the same file, one of `TaskDescription.others`."""
         with self._shared.lock:
             chosen = self._shared.state.choose_class(name)
         if chosen:
             self.reload()
 
     def open_file(self, file: Path, class_name: str) -> None:
-        """Open a task class of another file in place of the one that is open, and follow that file."""
+        """Open a task class of another file instead, and watch that file."""
         with self._shared.lock:
             self._shared.state.open_file(file, class_name)
         self.start()
         self.reload()
 
     def restart_worker(self) -> None:
-        """End the worker, whatever it is doing, and start another with the last good version where it was."""
+        """Kill the worker and start another with the last good version at its newest moment."""
         with self._shared.lock:
-            self._recovery.restart_asked()
+            self._recovery.restart_requested()
         self._replace_worker()
 
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._on_save()
         with self._shared.changing() as state:
             state.set(stale=True)
-            state.file_is_edited()
+            state.use_saved_file()
         self.reload()
 
-    # --- what a worker needs to know -----------------------------------------------------------------
+    # --- for a new worker ----------------------------------------------------------------------------
 
-    def greeting(self) -> list[Request]:
-        """Everything that a worker before this one knew."""
+    def first_requests(self) -> list[Request]:
+        """First requests to a new worker: settings, what to load, and whether to play."""
         with self._shared.lock:
             state = self._shared.state
             requests: list[Request] = [state.settings()]
@@ -198,40 +196,40 @@ class Versions:
             if wanted is not None:
                 requests.append(state.load_request(*wanted))
             else:
-                state.waits_for_the_file()
+                state.wait_for_file()
             if state.wants_play:
                 requests.append(Play(True))
             return requests
 
     def own_files(self) -> list[str]:
-        """The author's files, as far as they are known."""
+        """The known files of the author."""
         with self._shared.lock:
             return self._shared.state.own_files()
 
-    def same_again(self) -> Load | None:
-        """How another worker gets the version that runs."""
+    def running_load(self) -> Load | None:
+        """Loads the running version into another worker; None if no task runs."""
         with self._shared.lock:
             task = self._shared.state.now.task
             return None if task is None else self._shared.state.load_request(dict(task.source))
 
-    # --- what came of it -----------------------------------------------------------------------------
+    # --- results -------------------------------------------------------------------------------------
 
-    def came_in(self, task: TaskDescription) -> tuple[bool, bool]:
+    def version_loaded(self, task: TaskDescription) -> tuple[bool, bool]:
         """A version runs. Under the lock.
 
         Returns:
-            whether it is the last good one, brought back, and whether the files hold another by now.
+            Whether it was brought back after a crash, and whether it differs from the files.
         """
         restored = self._recovery.restoring
         self._recovery.loaded(task)
         return restored, restored and not is_on_disk(task.source)
 
     def follow(self, task: TaskDescription, stale: bool) -> None:
-        """The files of a version that runs."""
+        """Watch the files of the running version."""
         self._follow(task.source_files, {} if stale else task.source)
 
     def failed(self, failed: LoadFailed) -> None:
-        """If it was a load of a fresh worker, that is to have the last good version."""
+        """A load failed; a worker without a version gets the next attempt of `Recovery`."""
         with self._shared.lock:
             wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
             request = None if wanted is None else self._shared.state.load_request(*wanted)
@@ -239,7 +237,7 @@ class Versions:
         if request is not None:
             self._send(request)
         if failed.problem.file is not None:
-            # A module beside the task that broke before the task had ever imported it whole.
+            # It may be a module that the task has never imported without an error, so it is in no `source_files`.
             self._follow((*(() if task is None else task.source_files), failed.problem.file), {})
 
     def died(self, death: Death, printed: str) -> tuple[Problem | None, bool]:
@@ -249,7 +247,7 @@ class Versions:
             printed: the last lines.
 
         Returns:
-            what is to be told of it, if anything, and whether there is a version that can come back.
+            The problem to show, if any, and whether there is a version to bring back.
         """
         with self._shared.lock:
             while_loading = self._recovery.loading
@@ -258,13 +256,13 @@ class Versions:
             return problem, self._shared.state.now.task is not None
 
     def close(self) -> None:
-        """Follow nothing any more."""
+        """Stop watching."""
         self._watcher.stop()
 
     def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
-        """The task's own file, whether or not it ever loaded, and `paths` beside it."""
+        """Watch the task's own file, and those of `paths` in its folder."""
         own_file, folder = self._shared.state.own_file, self._shared.state.own_folder
         if own_file is None or folder is None:
             return
-        beside = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
-        self._watcher.follow({own_file, *beside}, texts)
+        modules = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
+        self._watcher.follow({own_file, *modules}, texts)

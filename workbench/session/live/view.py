@@ -1,8 +1,4 @@
-"""What the page reads: one immutable snapshot of the session, taken as often as it likes.
-
-The page is redrawn by one loop that compares this snapshot with the last one it drew. Counters
-(``serial``) say cheaply whether a part is new, so nothing is drawn or sent twice.
-"""
+"""Snapshot of the session that the page draws."""
 
 from __future__ import annotations
 
@@ -25,92 +21,94 @@ from workbench.session.record.live import RecordingStatus
 from workbench.session.rescore.background import RescoreView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
-"""``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
-``error``: a problem stands (see `SessionView.problem`); ``stopped``: the worker is gone."""
+"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: see `SessionView.problem`;
+``stopped``: there is no worker."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What cameras see of the env that is looked at: a session's at the moment that is shown, or a recording's."""
+class ShownCameras:
+    """Cameras and pictures of the shown env: of a session at the shown moment, or of a recording."""
 
     cameras: tuple[CameraInfo, ...]
     cameras_serial: int
-    """Another one for another set of cameras."""
+    """Differs for each set of cameras."""
     pictures: dict[CameraKey, Picture]
     pictures_serial: int
     segmentation: dict[int, str]
     """Names of the ids in a segmentation."""
     env: int = 0
     milliseconds: float | None = None
-    """That the newest picture took; None for one that was recorded."""
+    """Render time of the newest picture; None for a recorded one."""
     can_render: bool = True
     placed: CameraKey | None = None
     """The camera that is placed by hand."""
     quick: bool = False
-    """That one is looked through in another size than its own."""
+    """That camera is shown in another size than its own."""
 
 
 @dataclass(frozen=True)
 class SessionView:
+    """Immutable; its serials tell the redraw loop cheaply which parts are new, so that nothing is drawn twice."""
+
     state: State = "starting"
     activity: str = ""
-    """What is being done while starting or loading, else empty."""
+    """Current step of starting or loading, else empty."""
     stale: bool = False
-    """The file on disk is newer than (or failed to become) the version that is shown."""
+    """The file on disk is newer than the running version, or does not load."""
     task: TaskDescription | None = None
     task_serial: int = 0
-    """Grows with every load that succeeded."""
+    """Grows with every successful load."""
     scene_serial: int = 0
-    """Grows with every scene: not with a version that was put on the one that is there."""
+    """Grows with every new scene: not with a version that is patched into the present one."""
     cameras_serial: int = 0
-    """Grows with every set of cameras."""
+    """Grows with every new set of cameras."""
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
-    """How the version that is shown came in; None for the first."""
+    """How the running version came in; None for the first."""
     choices: tuple[str, ...] = ()
-    """What can be chosen in the file, where it has several tasks: the one that was asked for first."""
+    """Task classes of the file, the chosen one first; empty if it has only one."""
     step: StepResult | None = None
-    """What is shown: the newest step, or a moment of the past (`timeline`)."""
+    """The shown step: the newest, or a past one (`timeline`)."""
     step_serial: int = 0
-    """Number of the moment that is shown."""
+    """Serial of the shown moment."""
     pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
     pictures_serial: int = 0
     picture_milliseconds: float = 0.0
     problem: Problem | None = None
     problem_serial: int = 0
     refused: Problem | None = None
-    """Why what the file holds does not run, while another version does or none."""
+    """Why the file's present version does not run."""
     curves: Curves | None = None
     settings: Settings = Settings()
-    """What pages chose."""
+    """Chosen on the page."""
     seed: int = 0
     playing: bool = False
     steps_per_second: float = 0.0
     real_time_factor: float = 0.0
     timeline: TimelineView = TimelineView()
-    """The past. While a moment of it is shown, `step` and `pictures` are of that moment."""
+    """The history. While one of its moments is shown, `step` and `pictures` are of that moment."""
     busy: Busy | None = None
-    """What the worker has been at for long."""
+    """A long-running call in the worker."""
     rules: RulesBroken | None = None
-    """What the version that is shown has broken of the rules of GPU simulation; None while nothing."""
+    """Rules of GPU simulation that the running version has broken; None for none."""
     rules_serial: int = 0
     inspection: Inspection | None = None
-    """The newest answer to `Session.inspect`, of whichever env was selected then."""
+    """The newest answer to `Session.inspect`, of the env that was selected then."""
     recording: RecordingStatus = RecordingStatus()
     printed: Printed = NOTHING_PRINTED
     """The last lines that the author's code printed."""
     vitals: Vitals = Vitals()
-    """What the processes hold."""
+    """Memory of the processes."""
     rescored: RescoreView = RescoreView()
-    """What the new code says of the episodes that were run with the old."""
+    """The history rescored with the new code."""
     studio: StudioView = StudioView()
-    """Cameras, as they are placed by hand."""
+    """The camera studio."""
 
     @property
-    def seen(self) -> Seen | None:
+    def shown_cameras(self) -> ShownCameras | None:
         """None while there is no task."""
         task, studio = self.task, self.studio
-        return task and Seen(
+        return task and ShownCameras(
             task.cameras,
             self.cameras_serial,
             self.pictures,
@@ -125,5 +123,5 @@ class SessionView:
 
     @property
     def selected_env(self) -> int:
-        """Whose pictures and numbers are shown."""
+        """The env whose pictures and numbers are shown."""
         return self.settings.selected_env

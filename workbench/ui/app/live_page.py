@@ -169,7 +169,7 @@ class Page:
 
     def _draw_panels(self, view: SessionView) -> None:
         self._parts.draw(view)
-        self._cameras.draw(view.seen)
+        self._cameras.draw(view.shown_cameras)
 
     def _toggle_envs(self) -> None:
         self._envs_open = not self._envs_open
@@ -186,7 +186,7 @@ class Page:
     # --- the 3-D view ----------------------------------------------------------------------------
 
     def _draw_scene(self, view: SessionView) -> None:
-        task, step, seen = view.task, view.step, view.seen
+        task, step, seen = view.task, view.step, view.shown_cameras
         if (
             task is None
             or step is None
@@ -278,7 +278,7 @@ class Page:
             *timeline.commands(),
             Command("The first moment", timeline.go_to_the_first, "home"),
             Command("What is live", timeline.go_live, "end"),
-            Command("Go on from here, in the selected env", timeline.go_on, "G"),
+            Command("Go on from here, in the selected env", timeline.continue_from_shown, "G"),
             Command(
                 "To the next episode that is judged otherwise now", lambda: rescored.go_to_difference(1), "J"
             ),

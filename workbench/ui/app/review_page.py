@@ -11,7 +11,7 @@ import viser
 
 from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
-from workbench.session.live.view import Seen
+from workbench.session.live.view import ShownCameras
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.review import MOST_OPEN, Review
 from workbench.session.review.view import PictureReader, ReviewView, column_at, outcome_text
@@ -300,7 +300,7 @@ class ReviewPage:
         self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
         self._cameras.draw(
             episode
-            and Seen(
+            and ShownCameras(
                 self._reader.cameras(episode),
                 # Each recording brings its own cameras.
                 view.opened_serial * 1000 + view.selected,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.session.cameras.studio import IN_A_QUICK_LOOK
 from workbench.session.live.session import Session
-from workbench.session.live.view import Seen, SessionView
+from workbench.session.live.view import SessionView, ShownCameras
 from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.widgets.images import COLOUR, MODALITIES, DepthRange, depth_span, image_format, in_colours
 from workbench.ui.widgets.parts import Clock, DrawDue
@@ -112,7 +112,7 @@ class CamerasPanel:
     def show_frustums(self) -> bool:
         return self._frustums.value
 
-    def draw(self, seen: Seen | None) -> None:
+    def draw(self, seen: ShownCameras | None) -> None:
         if seen is None:
             return
         if seen.cameras_serial != self._cameras_serial:
@@ -131,7 +131,7 @@ class CamerasPanel:
                 camera.drawn = (picture, camera.wanted())
                 self._draw_camera(camera, picture, seen)
 
-    def shown_pictures(self, seen: Seen) -> dict[tuple[CameraKind, str], Picture]:
+    def shown_pictures(self, seen: ShownCameras) -> dict[tuple[CameraKind, str], Picture]:
         """The selected env's pictures of ticked cameras, for the frustums."""
         return {
             key: picture
@@ -141,7 +141,7 @@ class CamerasPanel:
             and (key == seen.placed or self._cameras[key].wanted())
         }
 
-    def _build(self, seen: Seen) -> None:
+    def _build(self, seen: ShownCameras) -> None:
         """Make one folder for each camera; a camera that is still there keeps its folder and ticks."""
         for key, camera in self._cameras.items():
             for modality, tick in camera.ticks.items():
@@ -194,7 +194,7 @@ class CamerasPanel:
         about.content = facts(camera)
         return camera
 
-    def _ask(self, seen: Seen) -> None:
+    def _ask(self, seen: ShownCameras) -> None:
         wanted = tuple(
             CameraRequest(camera.info.name, camera.info.kind, modalities)
             for key, camera in self._cameras.items()
@@ -208,14 +208,14 @@ class CamerasPanel:
                 camera.captions[modality].visible = tick.value
                 camera.images[modality].show(tick.value)
 
-    def _wanted_of(self, key: CameraKey, camera: _Camera, seen: Seen) -> tuple[str, ...]:
+    def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
         """The ticked modalities; for a camera that is being placed also what the Studio shows, in full size."""
         wanted = camera.wanted()
         if seen.quick or key != seen.placed:
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 
-    def _mark_stale(self, seen: Seen) -> None:
+    def _mark_stale(self, seen: ShownCameras) -> None:
         """Mark shown pictures that are not of the present moment."""
         for key, camera in self._cameras.items():
             picture = seen.pictures.get(key)
@@ -225,7 +225,7 @@ class CamerasPanel:
                 camera.stale = stale
                 camera.facts.content = facts(camera)
 
-    def _draw_camera(self, camera: _Camera, picture: Picture, seen: Seen) -> None:
+    def _draw_camera(self, camera: _Camera, picture: Picture, seen: ShownCameras) -> None:
         if picture.depth is not None:
             camera.depth_span = depth_span(camera.depth_span, picture)
         for modality in camera.wanted():

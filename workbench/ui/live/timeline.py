@@ -175,8 +175,8 @@ class TimelinePanel(TimeBar[SessionView]):
         """Go to the left end of the slider, where a slider with the focus goes too."""
         self._session.past.seek(self._range[0] if self._episode_only else 0)
 
-    def go_on(self) -> None:
-        self._session.past.go_on("this")
+    def continue_from_shown(self) -> None:
+        self._session.past.continue_from_shown("this")
 
     def _place_of(self, value: int) -> int | None:
         return None if value == 0 else self._newest + value
@@ -187,7 +187,7 @@ class TimelinePanel(TimeBar[SessionView]):
     def _on_travel(self, name: str) -> None:
         for scope, label in zip(SCOPES, self._travel.options, strict=False):
             if label == name:
-                self._session.past.go_on(scope)
+                self._session.past.continue_from_shown(scope)
 
     # --- drawing -----------------------------------------------------------------------------------
 
@@ -215,7 +215,7 @@ class TimelinePanel(TimeBar[SessionView]):
         # Buttons of a group cannot be disabled, so those that would do nothing are left out.
         undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
         self._walk.options = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
-        travel = go_on_labels(view) if past.can_go_on else ()
+        travel = continue_labels(view) if past.can_continue else ()
         if travel:
             self._travel.options = travel
         not_carried = "; ".join(past.not_carried)
@@ -241,7 +241,7 @@ class TimelinePanel(TimeBar[SessionView]):
             self._session.past.draw()
 
 
-def go_on_labels(view: SessionView) -> tuple[str, ...]:
+def continue_labels(view: SessionView) -> tuple[str, ...]:
     """Labels of the go-on buttons, in the order of `SCOPES`."""
     if view.task is None or view.task.num_envs == 1:
         return (GO_ON,)
