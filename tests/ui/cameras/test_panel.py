@@ -40,7 +40,7 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
         pictures=pictures if pictured else {},
         pictures_serial=serial,
     )
-    return view.seen
+    return view.shown_cameras
 
 
 def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
