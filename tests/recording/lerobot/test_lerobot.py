@@ -150,7 +150,7 @@ def test_what_goes_into_it_can_be_chosen(episode: Episode) -> None:
 def test_a_lower_rate_has_to_divide_the_steps(episode: Episode, tmp_path: Path) -> None:
     made = export(tmp_path / "set", episode, options=ExportOptions(fps=10))
     assert made.frames == episode.length // 2
-    with pytest.raises(ValueError, match="no whole multiple of 7"):
+    with pytest.raises(ValueError, match="not an integer multiple of 7"):
         export(tmp_path / "other", episode, options=ExportOptions(fps=7))
 
 
@@ -195,7 +195,7 @@ def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
     with pytest.raises(UnreadableRecording, match="version v2.1; version 3 can be read"):
         lerobot_rows(folder)
     (folder / "meta/info.json").write_text("{")
-    with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+    with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
         lerobot_rows(folder)
 
 
@@ -205,7 +205,7 @@ def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Pa
     (tmp_path / "broken/meta/info.json").write_text("{")
     broken, whole = find_all_sources([tmp_path])
     assert (broken.name, whole.name) == ("broken#0", "whole#0")
-    with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+    with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
         read_source(broken)
     np.testing.assert_array_equal(read_source(whole).action, episode.action)
 
@@ -259,7 +259,7 @@ def test_what_a_dataset_claims_is_bounded(episode: Episode, tmp_path: Path) -> N
     # Python's own formatting would write a gigabyte, or say what an object is made of.
     for pattern in ("data/{chunk_index:01000000000d}.parquet", "data/{chunk_index.__class__}.parquet"):
         said({"data_path": pattern})
-        with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+        with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
             read_lerobot(folder, 0)
     huge = {**info["features"][camera], "shape": [100_000, 100_000, 3]}
     said({"features": {**info["features"], camera: huge}})

@@ -62,7 +62,7 @@ def test_a_chunk_is_decoded_as_rerun_decodes_it(tmp_path: Path) -> None:
 
 @given(st.binary(max_size=60))
 def test_what_is_no_chunk_is_said_to_be_none(content: bytes) -> None:
-    with pytest.raises(ValueError, match="no chunk"):
+    with pytest.raises(ValueError, match="not a chunk"):
         decode_chunk(content)
 
 

@@ -1,10 +1,4 @@
-"""Recorded episodes as a LeRobot dataset, to train a policy on.
-
-Episodes are read one after the other and written as they come, so a thousand of them take no more memory than one.
-Films of successive episodes go into one mp4 a camera, one frame after the other, which is how the format wants it and
-needs no film to be made twice. All of it is written into a folder beside the one that was named, which gets its name
-when everything is in it: a disk that runs full leaves nothing half-written.
-"""
+"""Writes episodes as a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -28,7 +22,7 @@ from workbench.recording.lerobot import format as form
 from workbench.recording.lerobot.format import Choice, Frames, feature_name, frames_of
 
 ENCODING = Encoding(crf=20, key_every=2, exact_size=True)
-"""A whole frame every second one, as lerobot's own films: training asks for frames in no order."""
+"""A key frame every second frame, as in lerobot's films: training reads frames in random order."""
 ROBOT = "robot_uids"
 
 
@@ -36,17 +30,17 @@ ROBOT = "robot_uids"
 class ExportOptions:
     choice: Choice = Choice()
     only_successes: bool = False
-    """Leave out episodes that reach success at no step."""
+    """Leave out episodes without success at any step."""
     only_fitting: bool = False
-    """Leave out episodes that cannot be read, or lack what the first one has, and say which; else such a one ends it."""
+    """Leave out, and report, episodes that cannot be read or lack a feature of the first one; else raise DoesNotFit."""
     instruction: str | None = None
-    """The task in words, as policies that read are given it; None is the task's id."""
+    """The task's instruction for language-conditioned policies; None is the task's id."""
     fps: int | None = None
-    """Frames a second; the control rate has to be a whole multiple of it. None is the control rate."""
+    """Frames per second; the control rate must be an integer multiple of it. None is the control rate."""
 
 
 class DoesNotFit(ValueError):
-    """An episode that cannot be one of the dataset's, in a sentence; without it the others can."""
+    """An episode cannot be part of the dataset; the message is a sentence."""
 
 
 @dataclass
@@ -57,7 +51,7 @@ class Exported:
     left_out: int = 0
     """Episodes without success."""
     not_fitting: list[str] = field(default_factory=list)
-    """A sentence on each episode that was left out for that."""
+    """A sentence for each episode that was left out by `only_fitting`."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -69,16 +63,18 @@ def export_lerobot(
 ) -> Exported:
     """Write a dataset of these episodes to a new folder.
 
+    Episodes are read and written one by one, so memory use does not grow with their number. A film holds successive
+    episodes. The folder gets its name when it is complete: a full disk leaves nothing behind.
+
     Args:
-        sources: a name for messages, and what reads the episode; read one at a time, in this order.
-        folder: must not exist, or be empty.
-        options: what goes into it.
-        on_progress: called with the number of episodes that are done, and what is done now.
+        sources: a name for messages and a function that reads the episode.
+        folder: must be empty or not exist.
+        on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
-        DoesNotFit: an episode cannot be read, or lacks what was chosen or what the first one has; the message says which.
-        ValueError: nothing is left to write.
-        OSError: it cannot be written there.
+        DoesNotFit: an episode cannot be read, or lacks a chosen feature or one of the first episode.
+        ValueError: there is no episode to write.
+        OSError: it cannot be written.
     """
     folder = Path(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -117,7 +113,7 @@ def export_lerobot(
 
 
 class _Films:
-    """The film of one camera: its files, and where the episode under way begins."""
+    """The films of one camera."""
 
     def __init__(self, folder: Path, key: str, fps: int) -> None:
         self._folder, self._key, self._fps = folder, key, fps
@@ -126,7 +122,7 @@ class _Films:
         self._path = folder
 
     def add(self, frames: Frames, camera: str) -> tuple[dict[str, Any], form.Stats]:
-        """Append an episode: its entries in ``meta/episodes``, and its statistics."""
+        """Append an episode; returns its fields in ``meta/episodes`` and its statistics."""
         wanted, samples = set(form.sampled(len(frames.states)).tolist()), []
         if self._film is not None and self._path.stat().st_size >= form.VIDEO_MB * 2**20:
             self.close()
@@ -175,7 +171,7 @@ class _Writer:
         self._fps, self._robot = 0, None
 
     def fitting(self, name: str, read: Callable[[], Episode]) -> Frames | None:
-        """What there is to `add` of an episode; None for one without success where those are left out.
+        """The frames of an episode for `add`; None if it is left out for lack of success.
 
         Raises:
             DoesNotFit: it cannot be added.
@@ -205,7 +201,7 @@ class _Writer:
         return frames
 
     def add(self, frames: Frames) -> None:
-        """The next episode. Raises OSError, or ValueError where its pictures cannot be decoded."""
+        """Append an episode. Raises OSError, or ValueError if a picture cannot be decoded."""
         episode = frames.episode
         entry: dict[str, Any] = {"episode_index": self._made.episodes}
         task = self._options.instruction or episode.info.task
@@ -217,7 +213,7 @@ class _Writer:
             key = form.IMAGES + feature_name(camera)
             if key not in self._films:
                 self._films[key] = films = _Films(self._folder, key, self._fps)
-                # The first to be let go where something fails; `finish` has closed them where nothing did.
+                # On an error: kill ffmpeg. Otherwise `finish` has closed the films before.
                 self._stack.callback(films.close, abandoned=True)
             said, stats[key] = self._films[key].add(frames, camera)
             entry |= said
@@ -236,25 +232,25 @@ class _Writer:
         self._made.frames += len(frames.states)
 
     def _rate(self, name: str, episode: Episode) -> tuple[int, int]:
-        """Frames a second and how many steps one of them is."""
+        """Frames per second, and steps per frame."""
         rate = 1.0 / episode.info.control_dt if episode.info.control_dt > 0 else 20.0
         if self._options.fps is None:
             fps = max(1, round(rate))
             if abs(rate - fps) > 1e-3 and not self._made.notes:
                 self._made.notes.append(
-                    f"The format knows whole frames a second only: {rate:.3f} is written as {fps}."
+                    f"The format has integer frame rates only: {rate:.3f} is written as {fps}."
                 )
             return fps, 1
         every = round(rate / self._options.fps)
         if every < 1 or abs(rate / self._options.fps - every) > 1e-3:
             raise DoesNotFit(
-                f"{name} has {rate:g} steps a second, which is no whole multiple of {self._options.fps}; choose another "
-                "number of frames a second."
+                f"{name} has {rate:g} steps per second, which is not an integer multiple of {self._options.fps}; choose "
+                "another frame rate."
             )
         return self._options.fps, every
 
     def _columns(self, frames: Frames, task_index: int) -> dict[str, np.ndarray]:
-        """Every feature that is a column of numbers, (T, D)."""
+        """All features that are columns of numbers, (T, D)."""
         count = len(frames.states)
         index = np.arange(count, dtype=np.int64)
         return {
@@ -347,7 +343,7 @@ class _Writer:
 
 
 def _arrow(values: np.ndarray) -> pa.Array:
-    """A column (T, D): plain numbers where D is 1, else lists of one length."""
+    """A column (T, D) as plain numbers if D is 1, else as fixed-size lists."""
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
     return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 

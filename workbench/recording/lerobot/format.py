@@ -1,14 +1,4 @@
-"""The LeRobot dataset format, version 3.0: names of its files, features, and statistics.
-
-Written after lerobot 0.4.4 (``lerobot/datasets/utils.py``, ``compute_stats.py``, ``lerobot_dataset.py``), whose own
-reader loads what is written here. A dataset is a folder: ``meta/info.json`` says what there is, ``meta/tasks.parquet``
-the tasks in words, ``meta/episodes`` one row an episode (where its frames and its film begin and end, and its
-statistics), ``data`` one row a frame, ``videos`` one mp4 a camera with the episodes one after another.
-
-We have T actions and T + 1 states. LeRobot has a row a decision: the observation of state t, action t, and under
-``next.`` what came of it. So row t is state t with action t and the reward of the step that followed; the last state,
-in which nothing was decided, is left out.
-"""
+"""The LeRobot dataset format 3.0: file names, features, statistics, and an episode as frames."""
 
 from __future__ import annotations
 
@@ -23,6 +13,10 @@ from numpy.typing import NDArray
 from workbench.recording.episode.episode import Episode
 from workbench.recording.films import cameras_by_name, picture_index
 
+# As in lerobot 0.4.4 (``lerobot/datasets/utils.py``, ``compute_stats.py``, ``lerobot_dataset.py``), whose reader loads
+# these datasets. ``meta/info.json`` describes the features, ``meta/tasks.parquet`` has the tasks' instructions,
+# ``meta/episodes`` a row per episode (offsets of its frames and films, and its statistics), ``data`` a row per frame,
+# ``videos`` an mp4 per camera with several episodes.
 VERSION = "v3.0"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -31,12 +25,12 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 OURS = "meta/workbench.json"
-"""Not of the format: which recordings the episodes were made from."""
+"""Not part of the format: the recordings that the episodes were made from."""
 
 CHUNK_SIZE = 1000
-"""Files in a folder."""
+"""Files per folder."""
 DATA_MB, VIDEO_MB = 100, 200
-"""A file that has grown to this is followed by the next."""
+"""A file of this size is followed by a new one."""
 
 IMAGES = "observation.images."
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
@@ -47,7 +41,7 @@ OF_EVERY_FRAME = {
 }
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 MOST_SAMPLED = 100
-"""Pictures of an episode that its statistics are made from."""
+"""Pictures of an episode that its statistics use."""
 
 Stats = dict[str, NDArray[Any]]
 
@@ -58,7 +52,7 @@ def next_file(chunk: int, file: int) -> tuple[int, int]:
 
 
 def stats_of(values: NDArray) -> Stats:
-    """Of one feature over an episode: `values` (T, D); (D,) each, and ``count`` (1,)."""
+    """Statistics of `values` (T, D), one feature of an episode; (D,) each, and ``count`` (1,)."""
     numbers = values.astype(np.float64)
     stats = {
         "min": numbers.min(axis=0),
@@ -73,10 +67,10 @@ def stats_of(values: NDArray) -> Stats:
 
 
 def picture_stats(pictures: list[NDArray[np.uint8]]) -> Stats:
-    """Of one camera over an episode: (3, 1, 1) each in 0..1, of sampled pictures and every few pixels of large ones."""
+    """Statistics of sampled pictures of one camera in an episode; (3, 1, 1) each in 0..1, and ``count`` (1,)."""
     thinned = []
     for picture in pictures:
-        # lerobot's own measure: pictures from 300 pixels on are thinned to about 150.
+        # As lerobot does: pictures from 300 pixels on are subsampled to about 150.
         longer = max(picture.shape[:2])
         every = longer // 150 if longer >= 300 else 1
         thinned.append(picture[::every, ::every].reshape(-1, 3))
@@ -86,12 +80,12 @@ def picture_stats(pictures: list[NDArray[np.uint8]]) -> Stats:
 
 
 def sampled(count: int) -> NDArray[np.int64]:
-    """Which of `count` pictures statistics are made from."""
+    """Indices of the pictures among `count` that statistics use."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_SAMPLED)).round().astype(np.int64))
 
 
 def combined_stats(parts: list[Stats]) -> Stats:
-    """The statistics of all episodes from those of each, as lerobot puts them together (quantiles are means of them)."""
+    """Statistics of all episodes from those of each, as lerobot combines them (quantiles are averaged)."""
     counts = np.array([float(part["count"][0]) for part in parts])
     weights = (counts / counts.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
     means = np.stack([part["mean"] for part in parts])
@@ -108,7 +102,7 @@ def combined_stats(parts: list[Stats]) -> Stats:
 
 
 def tasks_metadata() -> dict[bytes, bytes]:
-    """What pandas needs to take the tasks' words for the index of the table, as lerobot's reader does."""
+    """Metadata by which pandas makes the instructions the table's index, as lerobot's reader expects."""
 
     def column(name: str | None, field: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:
         types = {"pandas_type": pandas_type, "numpy_type": numpy_type}
@@ -128,44 +122,48 @@ def tasks_metadata() -> dict[bytes, bytes]:
     return {b"pandas": json.dumps(described).encode()}
 
 
-# --- One episode as LeRobot sees it: T frames, each with what was observed and the action that was taken then ---
+# --- an episode as frames ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What of an episode goes into the dataset."""
+    """The parts of an episode that go into the dataset."""
 
     state: tuple[str, ...] = ()
-    """Keys of the state observations that become ``observation.state``; ``agent`` takes all below it. Empty: what the
-    robot knows of itself (``agent``), or all where nothing is called so."""
+    """Keys of the state observations for ``observation.state``; ``agent`` includes all below it. Empty: ``agent``, the
+    robot's own state, or all observations if there is no such key."""
     environment: tuple[str, ...] = ()
-    """Keys that become ``observation.environment_state``; empty leaves it out."""
+    """Keys for ``observation.environment_state``; empty leaves it out."""
     cameras: tuple[str, ...] | None = None
-    """By name; None takes all that have colour pictures."""
+    """Names; None takes all with colour pictures."""
     every: int = 1
-    """Keep each so-manieth step, with the action of that step."""
+    """Keep every n-th step, with its action."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """An episode's columns (T, D) by feature, the names of their parts, and its films."""
+    """Frames of an episode.
+
+    LeRobot has a row per decision: the observation of state t, action t, and the result under ``next.``. So row t of our
+    T actions and T + 1 states is state t with action t and the reward of that step; the last state is left out.
+    """
 
     columns: dict[str, NDArray]
     names: dict[str, list[str]]
     episode: Episode
     cameras: tuple[str, ...]
     states: NDArray[np.int64]
-    """(T,) which states of the episode they are."""
+    """(T,) state index of each frame."""
 
     def pictures(self, camera: str) -> Iterator[NDArray[np.uint8]]:
-        """One (H, W, 3) a frame."""
+        """One (H, W, 3) per frame."""
         track = cameras_by_name(self.episode)[camera]
         assert track.rgb is not None
         for state in self.states.tolist():
             yield track.rgb[picture_index(track, state)]
 
     def features(self) -> dict[str, dict]:
-        """As ``meta/info.json`` says them, without those of every frame."""
+        """The features for ``meta/info.json``, without those that every dataset has."""
         features: dict[str, dict] = {}
         for camera in self.cameras:
             info = cameras_by_name(self.episode)[camera].info
@@ -184,7 +182,7 @@ class Frames:
 
 
 def feature_name(name: str) -> str:
-    """A camera's name as part of a feature's, where a slash is not allowed."""
+    """A camera's name as part of a feature's name, which must not contain a slash."""
     return name.replace("/", "_")
 
 
@@ -192,12 +190,12 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     """The episode as frames.
 
     Raises:
-        ValueError: it has no step, or lacks what was chosen; the message says what there is.
+        ValueError: it has no step, or lacks a chosen part; the message lists what it has.
     """
     if not episode.length:
         raise ValueError("has no step")
     states = np.arange(0, episode.length, choice.every)
-    # Of a step that is left out, the reward counts and the end is not lost.
+    # Rewards of left-out steps are added to the frame before, and `done` is kept.
     rewards = np.add.reduceat(episode.reward.astype(np.float64), states).astype(np.float32)
     done = np.logical_or.reduceat(episode.terminated | episode.truncated, states)
     columns: dict[str, NDArray] = {}
@@ -224,7 +222,7 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
 
 
 def _numbers(episode: Episode) -> dict[str, NDArray[np.float32]]:
-    """State observations (T + 1, D) by key; where there are none, the joints of the robots from the env states."""
+    """State observations (T + 1, D) by key; if there are none, joint positions from the env states."""
     found = {
         key: values
         for key, values in episode.obs.items()

@@ -1,10 +1,4 @@
-"""An episode of a LeRobot dataset (version 3) as an `Episode`, for review: its cameras, curves, observations.
-
-A dataset holds no scene, so there is nothing to show in 3-D. What it holds of an episode is T decisions; the state
-after the last of them was never written down and is NaN here, without a picture. Films are taken apart when a camera
-is first looked at. A dataset that somebody was sent may say anything of itself: what it names has to lie in it, and
-what it claims is bounded.
-"""
+"""Reads episodes of LeRobot datasets (version 3) for review."""
 
 from __future__ import annotations
 
@@ -31,10 +25,10 @@ from workbench.recording.films import FilmPart
 from workbench.recording.lerobot import format as form
 
 DEFAULT_FOVY = math.radians(60)
-"""A dataset does not say how its cameras see; nothing is computed from this."""
+"""Datasets have no camera parameters; nothing is computed from this."""
 MOST_EPISODES = 100_000
 MOST_FRAMES = 20_000_000
-"""Of a dataset."""
+"""Frames of a dataset."""
 MOST_LENGTH = 1_000_000
 """Frames of an episode."""
 _PLACE = re.compile(r"\{(?P<name>chunk_index|file_index|video_key)(:0?(?P<width>\d)d)?\}")
@@ -46,10 +40,10 @@ def is_lerobot(folder: Path) -> bool:
 
 
 def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
-    """The episodes of the dataset in this folder; each a success that is one at some frame.
+    """The episodes of the dataset in this folder; success means success at some frame.
 
     Raises:
-        UnreadableRecording: it is none of version 3, or broken; the message says what is wrong.
+        UnreadableRecording: it has another version, or is broken.
     """
     info = _info(folder)
     try:
@@ -77,7 +71,7 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
 def _of_episodes(
     folder: Path, info: dict[str, Any]
 ) -> tuple[dict[int, float] | None, dict[int, float] | None]:
-    """The sum of the rewards of each episode, and in how many of its frames it has success; None where none are written."""
+    """Sum of rewards and number of frames with success by episode; None if the dataset lacks the feature."""
     wanted = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
     if not wanted:
         return None, None
@@ -96,7 +90,7 @@ def _of_episodes(
 
 
 def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
-    """One number a frame, which some datasets keep as lists of one."""
+    """One number per frame, which some datasets store as lists of one."""
     array: Any = column.combine_chunks()
     while pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
         array = array.flatten()
@@ -104,7 +98,10 @@ def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
 
 
 def read_lerobot(folder: Path, index: int) -> Episode:
-    """Episode `index` of the dataset in this folder.
+    """Episode `index` of the dataset in this folder, without a scene.
+
+    A dataset lacks the state after the last action: it is NaN here, without a picture. Films are decoded when a camera is
+    first accessed. A dataset is untrusted: its paths must lie in its folder, and claimed sizes are bounded.
 
     Raises:
         UnreadableRecording: it cannot be read; the message says what is wrong.
@@ -181,10 +178,10 @@ def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: i
 
 def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str, length: int) -> CameraTrack:
     height, width = info["features"][key]["shape"][:2]
-    if info["features"][key]["names"][0] == "channels":  # (3, H, W), as some datasets say it
+    if info["features"][key]["names"][0] == "channels":  # (3, H, W) in some datasets
         height, width = info["features"][key]["shape"][1:]
     if not 0 < width * height <= MOST_PIXELS:
-        raise ValueError(f"{key} is said to have pictures of {width} x {height}")
+        raise ValueError(f"{key} claims pictures of {width} x {height}")
     where = {
         "chunk_index": entry[f"videos/{key}/chunk_index"],
         "file_index": entry[f"videos/{key}/file_index"],
@@ -217,7 +214,7 @@ def _info(folder: Path) -> dict[str, Any]:
         info = read_json(Path(folder) / form.INFO)
         version = str(info["codebase_version"])
         if not isinstance(info["features"], dict) or not float(info["fps"]) > 0:
-            raise ValueError("it names no features or no rate")
+            raise ValueError("it has no features or no frame rate")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _broken(Path(folder), error) from error
     if not version.startswith("v3."):
@@ -240,7 +237,7 @@ def _task(entry: dict[str, Any]) -> str:
 
 
 def _tables(folder: Path) -> list[str]:
-    """The parquet files below a folder; a pipe of such a name would be waited for."""
+    """The parquet files below a folder; regular files only, since opening a pipe would block."""
     found = [
         os.path.join(below, name)
         for below, _, names in os.walk(folder)
@@ -253,12 +250,12 @@ def _tables(folder: Path) -> list[str]:
 
 
 def _number_type(name: object) -> str:
-    """As numpy calls it; an object, which is no number, for what is none."""
+    """numpy's name of a number's type; ``O`` for other types."""
     return name if isinstance(name, str) and _NUMBER.fullmatch(name) else "O"
 
 
 def _filled(pattern: str, values: dict[str, Any]) -> str:
-    """``data/chunk-{chunk_index:03d}/...`` with these values; nothing else of Python's format can be said there."""
+    """``data/chunk-{chunk_index:03d}/...`` with these values; no other feature of ``str.format`` is evaluated."""
 
     def value(found: re.Match[str]) -> str:
         held = values[found["name"]]
@@ -268,7 +265,7 @@ def _filled(pattern: str, values: dict[str, Any]) -> str:
 
 
 def _ours(folder: Path) -> list[dict[str, Any]]:
-    """Which recordings the episodes come from, where we wrote the dataset."""
+    """The recordings of the episodes, if the workbench wrote the dataset."""
     try:
         found = read_json(Path(folder) / form.OURS)["episodes"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -277,10 +274,10 @@ def _ours(folder: Path) -> list[dict[str, Any]]:
 
 
 def _inside(folder: Path, path: str) -> Path:
-    """A file that the dataset names; one outside of its folder is none of it."""
+    """Path of a file that the dataset names. Raises ValueError if it is outside the folder."""
     file = (folder / path).resolve()
     if not file.is_relative_to(folder.resolve()):
-        raise ValueError(f"it names the file {path}, which lies outside of it")
+        raise ValueError(f"it names the file {path}, which is outside of it")
     return file
 
 
@@ -293,4 +290,4 @@ def _names(names: Any, width: int) -> tuple[str, ...]:
 
 
 def _broken(folder: Path, error: Exception) -> UnreadableRecording:
-    return UnreadableRecording(f"{Path(folder).name} is no LeRobot dataset that can be read: {error}.")
+    return UnreadableRecording(f"{Path(folder).name} cannot be read as a LeRobot dataset: {error}.")
