@@ -58,14 +58,12 @@ PROTECTED = {
     "authoring/loading/modules": "authoring/loading/test_load.py authoring/loading/test_task_content.py authoring/loading/test_library_names.py"
     " authoring/loading/test_named_modules.py",
     "authoring/source/text": "authoring/camera_source/test_which_camera.py authoring/camera_source/test_members.py"
-    " authoring/camera_source/test_shapes.py authoring/source/test_text.py",
+    " authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py authoring/source/test_text.py",
     "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
     " authoring/camera_source/test_which_camera.py",
     "authoring/source/changes": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
     " authoring/camera_source/test_which_camera.py authoring/camera_source/test_rotations.py"
     " authoring/camera_source/test_members.py",
-    "authoring/source/trace": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
-    " authoring/camera_source/test_which_camera.py",
     "authoring/source/names": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
     " authoring/camera_source/test_which_camera.py",
     "authoring/camera_source/disk": "authoring/camera_source/test_disk.py",

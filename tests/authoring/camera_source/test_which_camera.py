@@ -15,8 +15,7 @@ from tests.authoring.camera_source.real_cameras import FILE, HEADER, planned, re
 from workbench.authoring.camera_source.cameras import HookCameras, RunHooks
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import RefusedEdit
-from workbench.authoring.source.trace import Place, Read
+from workbench.authoring.source.text import Place, Read, RefusedEdit
 from workbench.core.camera_data import CallSite, CameraKey, CameraSettings
 
 TWO = HEADER + dedent(

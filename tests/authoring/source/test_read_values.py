@@ -13,7 +13,7 @@ import pytest
 from tests.authoring.camera_source.real_cameras import FILE, modules
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import DEGREE, trace_call
-from workbench.authoring.source.trace import Part, Trace
+from workbench.authoring.source.text import Part, Trace
 
 HEAD = """\
 import math

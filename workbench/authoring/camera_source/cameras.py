@@ -6,8 +6,7 @@ import ast
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from workbench.authoring.source.text import LOOPS, SourceFile
-from workbench.authoring.source.trace import Trace
+from workbench.authoring.source.text import LOOPS, SourceFile, Trace
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind, CameraSettings, differences
 
 FIELDS = ("pose", "fov", "intrinsic", "width", "height", "near", "far", "shader_pack")

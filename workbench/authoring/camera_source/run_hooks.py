@@ -13,7 +13,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from workbench.authoring.camera_source.cameras import FIELDS, HOOKS, PARAMETERS, CameraRun, HookCameras
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import trace_call
-from workbench.authoring.source.trace import Trace
+from workbench.authoring.source.text import Trace
 from workbench.core import maniskill_private
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.place import settings_of

@@ -13,8 +13,7 @@ from transforms3d.euler import euler2quat
 from transforms3d.quaternions import mat2quat
 
 from workbench.authoring.source.changes import Changes, list_text, quaternion_texts, same_side, written_value
-from workbench.authoring.source.text import Replacement, SourceFile
-from workbench.authoring.source.trace import Part
+from workbench.authoring.source.text import Part, Replacement, SourceFile
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import angle_between, rotation_matrix, target_of
 

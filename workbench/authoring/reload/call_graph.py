@@ -3,10 +3,261 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import PurePath
+from typing import Literal
 
-from workbench.authoring.reload.symbols import Key, Symbol, read_symbols
+Kind = Literal["function", "value", "import", "class", "statements"]
+Key = tuple[str, str]
+"""File and name within it: ``("/x/push.py", "PushEnv.evaluate")``."""
+
+STATEMENTS = "(statements)"
+"""Name of the symbol of all statements that are no definition, and run in order when the file is imported."""
+
+_INTROSPECTION = frozenset(
+    (
+        "globals locals vars eval exec compile __import__ dir breakpoint __dict__ __getattribute__ __code__ "
+        "__globals__ __subclasses__ __mro__ __bases__ __defaults__ __kwdefaults__ __closure__ __wrapped__ "
+        "f_globals f_locals f_lineno _getframe attrgetter methodcaller import_module getmembers getsource "
+        "__annotations__ __func__ __reduce__ __getstate__ __setstate__ __builtins__ modules"
+    ).split()
+)
+_INTROSPECTION_MODULES = frozenset(
+    (
+        "inspect importlib gc ctypes pickle dill cloudpickle marshal builtins runpy pkgutil threading "
+        "multiprocessing asyncio concurrent atexit signal traceback linecache"
+    ).split()
+)
+
+
+@dataclass(frozen=True)
+class Symbol:
+    """A function, method, constant, class attribute or import.
+
+    Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as all of them, in all files, and a string that is
+    an identifier counts as a name (``getattr(self, "reset")``). If a name is computed or code inspects itself, see
+    `dynamic`.
+    """
+
+    path: str
+    name: str
+    kind: Kind
+    parts: Sequence[ast.AST]
+    """The nodes that make its text; for a class without its members."""
+    nodes: Sequence[ast.AST]
+    """Its nodes: a property with its setter is one symbol."""
+    short_names: frozenset[str]
+    """Names by which other code may mention it."""
+    owner: str | None = None
+    """The class of a member."""
+
+    @cached_property
+    def text(self) -> str:
+        """Equal in two versions if and only if the code is: without comments, docstrings and layout."""
+        return "\n".join([self.kind, *map(ast.dump, self.parts)])
+
+    @cached_property
+    def _mentions(self) -> tuple[frozenset[str], str | None]:
+        return _mentions(self.parts)
+
+    @property
+    def mentions(self) -> frozenset[str]:
+        """Names of variables and attributes in it, and strings that are identifiers."""
+        return self._mentions[0]
+
+    @property
+    def dynamic(self) -> str | None:
+        """A name in it by which it may reach code that it does not mention; None if there is none."""
+        return self._mentions[1]
+
+    @property
+    def key(self) -> Key:
+        return self.path, self.name
+
+    @property
+    def short(self) -> str:
+        """The name within its class."""
+        return self.name.rpartition(".")[2]
+
+
+def read_symbols(path: str, text: str, keep_docstrings: bool = False) -> dict[Key, Symbol]:
+    """The symbols of one file, in order. Raises SyntaxError, as ``compile``."""
+    tree = ast.parse(text, path)
+    if not keep_docstrings:
+        _remove_docstrings(tree)
+    return {symbol.key: symbol for symbol in _scope(path, tree.body, None)}
+
+
+def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbol]:
+    groups: dict[str, list[ast.stmt]] = {}
+    loose: list[ast.stmt] = []
+    for statement in body if owner is not None else _one_import_each(body):
+        name = _defines(statement, at_top=owner is None)
+        if name is not None:
+            groups.setdefault(name, []).append(statement)
+        elif not isinstance(statement, ast.Pass) and not _runs_as_script_only(statement):
+            loose.append(statement)
+    taken = _bound(loose)
+    for name, statements in list(groups.items()):
+        several = len(statements) > 1 and not all(isinstance(s, ast.FunctionDef) for s in statements)
+        if name in taken or several:
+            # Which definition holds depends on what ran, so they are not separated.
+            loose += groups.pop(name)
+    prefix = "" if owner is None else f"{owner}."
+    for name, statements in groups.items():
+        first = statements[0]
+        if isinstance(first, ast.ClassDef) and owner is None:
+            head = [*first.decorator_list, *first.bases, *first.keywords, *getattr(first, "type_params", [])]
+            yield Symbol(path, name, "class", head, [first], frozenset({name}))
+            yield from _scope(path, first.body, name)
+        else:
+            functions = isinstance(first, (ast.FunctionDef, ast.AsyncFunctionDef))
+            kind: Kind = (
+                "function"
+                if functions
+                else "import"
+                if isinstance(first, (ast.Import, ast.ImportFrom))
+                else "value"
+            )
+            yield Symbol(path, prefix + name, kind, statements, statements, _bound(statements), owner)
+    if loose:
+        loose.sort(key=lambda statement: statement.lineno)
+        yield Symbol(path, prefix + STATEMENTS, "statements", loose, loose, _bound(loose), owner)
+
+
+def _bound(statements: Iterable[ast.AST]) -> frozenset[str]:
+    return frozenset(name for statement in statements for name in bound_names(statement))
+
+
+def _defines(statement: ast.stmt, at_top: bool) -> str | None:
+    """The name of a plain definition; None for other statements."""
+    if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        return statement.name
+    if isinstance(statement, ast.ClassDef):
+        return statement.name if at_top else None
+    if isinstance(statement, (ast.Import, ast.ImportFrom)) and at_top:
+        alias = statement.names[0]
+        if alias.name == "*":
+            return ast.unparse(statement)
+        return alias.asname or alias.name.partition(".")[0]
+    if isinstance(statement, ast.Assign) and len(statement.targets) == 1:
+        target = statement.targets[0]
+        return target.id if isinstance(target, ast.Name) else None
+    if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+        return statement.target.id
+    return None
+
+
+def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """``from x import a, b`` as two statements, so that adding a name does not change the others."""
+    for statement in body:
+        if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
+            # Annotations are ignored, and the other features are the default now.
+            continue
+        if isinstance(statement, ast.Import):
+            yield from (ast.copy_location(ast.Import([alias]), statement) for alias in statement.names)
+        elif isinstance(statement, ast.ImportFrom):
+            module, level = statement.module, statement.level
+            for alias in statement.names:
+                yield ast.copy_location(ast.ImportFrom(module, [alias], level), statement)
+        else:
+            yield statement
+
+
+def bound_names(statement: ast.AST) -> set[str]:
+    """Names that `statement` binds in its own scope."""
+    found: set[str] = set()
+    waiting = [statement]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            found.add(node.name)
+            continue
+        if isinstance(node, ast.Lambda):
+            continue
+        if isinstance(node, ast.Name) and isinstance(node.ctx, (ast.Store, ast.Del)):
+            found.add(node.id)
+        elif isinstance(node, ast.alias):
+            found.add(node.asname or node.name.partition(".")[0])
+        elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name:
+            found.add(node.name)
+        waiting += ast.iter_child_nodes(node)
+    return found
+
+
+def _runs_as_script_only(statement: ast.stmt) -> bool:
+    """``if __name__ == "__main__":``, which does not run here."""
+    if not isinstance(statement, ast.If) or statement.orelse:
+        return False
+    return ast.unparse(statement.test) in ("__name__ == '__main__'", "'__main__' == __name__")
+
+
+def _mentions(parts: Iterable[ast.AST]) -> tuple[frozenset[str], str | None]:
+    """The names in `parts`, and the first one that may reach more than is named."""
+    names: set[str] = set()
+    dynamic: list[str] = []
+    modules: set[str] = set()
+    called = set()
+    for node in (node for part in parts for node in _walk_code(part)):
+        if isinstance(node, ast.Name):
+            names.add(node.id)
+            if node.id in ("getattr", "setattr", "delattr", "hasattr") and id(node) not in called:
+                dynamic.append(node.id)
+        elif isinstance(node, ast.Attribute):
+            names.add(node.attr)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            names.update(word for word in node.value.split(".") if word.isidentifier())
+        elif isinstance(node, ast.MatchClass):
+            names.update(node.kwd_attrs)
+        elif isinstance(node, ast.Global):
+            names.update(node.names)
+        elif isinstance(node, ast.Import):
+            modules.update(alias.name for alias in node.names)
+            names.update(word for alias in node.names for word in alias.name.split("."))
+        elif isinstance(node, ast.ImportFrom):
+            modules.add(node.module or "")
+            names.update(alias.name for alias in node.names)
+            if any(alias.name == "*" for alias in node.names):
+                dynamic.append(ast.unparse(node))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            if node.func.id in ("getattr", "setattr", "delattr", "hasattr"):
+                name = node.args[1] if len(node.args) > 1 else None
+                if isinstance(name, ast.Constant) and isinstance(name.value, str):
+                    called.add(id(node.func))
+            elif node.func.id == "type" and len(node.args) != 1:
+                dynamic.append("type")
+    dynamic += sorted(names & _INTROSPECTION)
+    dynamic += sorted(module for module in modules if module.partition(".")[0] in _INTROSPECTION_MODULES)
+    return frozenset(names), dynamic[0] if dynamic else None
+
+
+def _walk_code(node: ast.AST) -> Iterator[ast.AST]:
+    """``ast.walk``, parents first, without annotations, which have no effect."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield from _walk_code(child)
+
+
+def _remove_docstrings(tree: ast.Module) -> None:
+    """Remove statements that are only a constant."""
+    for node in ast.walk(tree):
+        for name in ("body", "orelse", "finalbody"):
+            block = getattr(node, name, None)
+            if not isinstance(block, list):
+                continue
+            kept = [s for s in block if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))]
+            if not kept and block and name == "body" and not isinstance(node, ast.Module):
+                kept = [ast.copy_location(ast.Pass(), block[0])]
+            block[:] = kept
+
+
+# --- two versions --------------------------------------------------------------------------------
 
 
 class TwoVersions:

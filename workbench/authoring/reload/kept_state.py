@@ -6,7 +6,7 @@ import ast
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Literal
 
-from workbench.authoring.reload.symbols import Symbol, bound_names
+from workbench.authoring.reload.call_graph import Symbol, bound_names
 
 MUTATES = frozenset(
     (

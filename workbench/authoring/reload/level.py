@@ -11,14 +11,13 @@ from types import CodeType, FunctionType
 from typing import Any, Literal
 
 from workbench.authoring.problem import hooks_of
-from workbench.authoring.reload.call_graph import TwoVersions
+from workbench.authoring.reload.call_graph import STATEMENTS, Key, TwoVersions
 from workbench.authoring.reload.kept_state import (
     changed_while_running,
     memoizing_statement,
     root_name,
     written_attributes,
 )
-from workbench.authoring.reload.symbols import STATEMENTS, Key
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
 """same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets: the new class is

@@ -9,8 +9,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from workbench.authoring.source.names import Project
-from workbench.authoring.source.text import RefusedEdit, Replacement, SourceFile, arguments
-from workbench.authoring.source.trace import DEGREE, Part, Place
+from workbench.authoring.source.text import (
+    DEGREE,
+    Part,
+    Place,
+    RefusedEdit,
+    Replacement,
+    SourceFile,
+    arguments,
+)
 from workbench.core.cameras.conventions import normalised
 
 

@@ -24,8 +24,19 @@ from mani_skill.utils.structs.pose import Pose
 from transforms3d import euler
 
 from workbench.authoring.source.names import Binding, Project, reaching
-from workbench.authoring.source.text import FUNCTIONS, Scope, SourceFile, arguments, is_starred
-from workbench.authoring.source.trace import DEGREE, Part, Place, Plain, Read, Trace
+from workbench.authoring.source.text import (
+    DEGREE,
+    FUNCTIONS,
+    Part,
+    Place,
+    Plain,
+    Read,
+    Scope,
+    SourceFile,
+    Trace,
+    arguments,
+    is_starred,
+)
 from workbench.core import maniskill_private
 
 _DEPTH = 40
