@@ -124,7 +124,7 @@ def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> 
                 episode,
                 state,
                 pictures=(seen,) if pictures and state % every == 0 else (),
-                others=episode.others_at(state),
+                others=episode.other_entries_at(state),
             ),
         )
     return writer

@@ -59,7 +59,7 @@ def text(entry: OtherEntry | None) -> str | None:
 def check_recorded(episode: Episode, env: int) -> None:
     """What the task of these tests returned, of an episode that began with its reset."""
     assert episode.length == STEPS
-    others: Any = [episode.others_at(state) for state in range(STEPS + 1)]
+    others: Any = [episode.other_entries_at(state) for state in range(STEPS + 1)]
     assert [text(each["phase"]) for each in others] == ["reach"] * 2 + ["push"] * 4
     assert [each["stage"].numbers for each in others] == [2] * 6
     assert [text(each["best"]) or float(each["best"].numbers) for each in others] == [
@@ -170,7 +170,7 @@ def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
     rows = session.view()
     assert rows.problem is None
     read = [read_episode(path) for path in sorted((file.parent / "of_the_page").glob("*.json"))]
-    assert all(text(episode.others_at(2)["phase"]) == "push" for episode in read)
+    assert all(text(episode.other_entries_at(2)["phase"]) == "push" for episode in read)
     assert "progress" in read[0].batch
 
 

@@ -63,7 +63,7 @@ def recorded_version(info: EpisodeInfo) -> str:
 
 
 MOST_NAMED = 4
-LOOK_EVERY = 2.0
+SCAN_SECONDS = 2.0
 """Seconds between two reads of the files."""
 
 
@@ -120,7 +120,7 @@ def changed_on_disk(info: EpisodeInfo) -> str:
 class ChangesOnDisk:
     """`changed_on_disk`, cached for callers that ask many times a second."""
 
-    def __init__(self, look_every: float = LOOK_EVERY) -> None:
+    def __init__(self, look_every: float = SCAN_SECONDS) -> None:
         self._look_every = look_every
         self._known: tuple[str, float, str] | None = None
 

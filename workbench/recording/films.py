@@ -23,7 +23,7 @@ from transforms3d.quaternions import quat2mat
 from workbench.core.cameras.conventions import quaternion_from_axes, quaternion_of, triple, upright
 from workbench.machine.files import new_file, open_regular_file
 from workbench.recording.episode.encoded_pictures import MOST_PIXELS, encode_jpeg
-from workbench.recording.episode.episode import CameraTrack, Episode, box_of_moving, camera_names
+from workbench.recording.episode.episode import CameraTrack, Episode, camera_names, movable_bounds
 from workbench.recording.episode.row import UnreadableRecording
 
 MOST_FRAMES = 100_000
@@ -178,10 +178,10 @@ class FilmPart:
         """Frame `number`. Raises UnreadableRecording when the film cannot be read."""
         with self._taking:
             if self._blobs is None:
-                self._blobs = self._take_out()
+                self._blobs = self._extract()
         return self._blobs[number]
 
-    def _take_out(self) -> list[bytes]:
+    def _extract(self) -> list[bytes]:
         blobs: list[bytes] = []
         size = 0
         try:
@@ -432,7 +432,7 @@ def default_eye(episode: Episode) -> Eye:
             look_at = position + forward
             return Eye(triple(position), triple(look_at), fovy=float(camera.info.fovy))
     assert episode.poses is not None and episode.geometry is not None
-    low, high = box_of_moving(episode.poses, episode.geometry.body_kinds)
+    low, high = movable_bounds(episode.poses, episode.geometry.body_kinds)
     middle = (low + high) / 2
     # The box holds origins of bodies, not their outlines: leave a margin.
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1

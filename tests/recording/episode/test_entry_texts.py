@@ -21,13 +21,13 @@ from tests.recording.verify_rrd import verify_rrd
 from workbench.core.env.evaluate_entries import split_entries
 from workbench.core.env.step_result import OtherEntry
 from workbench.recording.episode.columns import (
-    CUT,
+    CUT_MESSAGE,
     MOST_BYTES,
     TextEntry,
     TextTrack,
     TextWriter,
     entry_at,
-    tracks_of,
+    text_tracks,
 )
 from workbench.recording.episode.document import as_json
 from workbench.recording.reader.read_episode import read_episode
@@ -59,7 +59,7 @@ def test_a_line_is_written_where_a_text_changes() -> None:
     states: list[Others] = [{}, {"a": said("x")}, {"a": said("x")}, {"a": said("y"), "b": said("z")}, {}]
     lines = [writer.changes(state, others) for state, others in enumerate(states)]
     assert [len(found) for found in lines] == [0, 1, 0, 2, 2]
-    tracks = tracks_of([line for found in lines for line in found])
+    tracks = text_tracks([line for found in lines for line in found])
     x, y, z = (TextEntry("str", text, False, True) for text in "xyz")
     assert tracks == {"a": ((1, x), (3, y), (4, None)), "b": ((3, z), (4, None))}
     assert msgspec.convert(as_json(tracks), dict[str, TextTrack]) == tracks
@@ -79,9 +79,9 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
         for line in writer.changes(state, {"clock": said(f"{state:050}"), "a": said("x")})
     ]
     assert sum(len(line[1]) for line in lines) < MOST_BYTES + 400
-    tracks = tracks_of(lines)
+    tracks = text_tracks(lines)
     last_state, last = tracks["clock"][-1]
-    assert last is not None and last.text == CUT and not last.whole and 100 < last_state < 5000
+    assert last is not None and last.text == CUT_MESSAGE and not last.whole and 100 < last_state < 5000
     assert tracks["a"] == ((0, TextEntry("str", "x", False, True)),)
 
 
@@ -100,11 +100,11 @@ def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Mak
     np.testing.assert_array_equal(episode.batch["best"], [np.nan, 0.5, 0.5, np.nan])
     np.testing.assert_array_equal(episode.batch["goal"], [[0, 1]] * 4)
     assert episode.batch["goal"].dtype.kind == "i"
-    assert episode.others_at(0)["best"] == OtherEntry("None", ("None",))
-    assert episode.others_at(1)["best"].numbers == 0.5
-    assert episode.others_at(2)["map"] == OtherEntry("T", ("9",), whole=False)
-    assert episode.others_at(3)["word"] == OtherEntry("list", ("b",), per_env=True)
-    assert "map" not in episode.others_at(3) and "word" not in episode.others_at(2)
+    assert episode.other_entries_at(0)["best"] == OtherEntry("None", ("None",))
+    assert episode.other_entries_at(1)["best"].numbers == 0.5
+    assert episode.other_entries_at(2)["map"] == OtherEntry("T", ("9",), whole=False)
+    assert episode.other_entries_at(3)["word"] == OtherEntry("list", ("b",), per_env=True)
+    assert "map" not in episode.other_entries_at(3) and "word" not in episode.other_entries_at(2)
     entities = read_rrd(files.rrd)
     assert {"/batch/best", "/batch/goal"} <= set(entities)
     log = entities["/logs/evaluate"]["TextLog:text"]
@@ -127,7 +127,12 @@ def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Pat
     (files,) = recover(tmp_path)
     episode = read_episode(files.json)
     assert episode.info.recovered
-    assert [episode.others_at(state)["phase"].texts for state in range(4)] == [("0",), ("0",), ("1",), ("1",)]
+    assert [episode.other_entries_at(state)["phase"].texts for state in range(4)] == [
+        ("0",),
+        ("0",),
+        ("1",),
+        ("1",),
+    ]
 
 
 def test_the_json_that_a_library_reads_stays_small(make_episode: Maker, tmp_path: Path) -> None:
@@ -159,7 +164,7 @@ def test_whatever_evaluate_returns_is_recorded(
         files = writer.finish()
         episode = read_episode(files.json)
     for state, (columns, others) in enumerate(halves):
-        there = episode.others_at(state)
+        there = episode.other_entries_at(state)
         assert columns.keys() <= episode.evaluate.keys() and others.keys() <= there.keys()
         for name, entry in others.items():
             if entry.numbers is None:

@@ -11,11 +11,11 @@ import pytest
 from workbench.recording.episode.row import Facts
 from workbench.recording.library import index as library_index
 from workbench.recording.library.index import LibraryIndex, index_path
-from workbench.recording.reader.scan import Found
+from workbench.recording.reader.scan import RecordingFiles
 
 
-def found(key: str, size: int = 5) -> Found:
-    return Found(key, {".json": size}, {".json": 7})
+def found(key: str, size: int = 5) -> RecordingFiles:
+    return RecordingFiles(key, {".json": size}, {".json": 7})
 
 
 @pytest.fixture

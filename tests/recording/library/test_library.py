@@ -34,7 +34,7 @@ from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.reading import read_rows
-from workbench.recording.reader.scan import Found, scan_folder
+from workbench.recording.reader.scan import RecordingFiles, scan_folder
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -306,7 +306,9 @@ def test_only_what_changed_is_read_again(
     library.refresh()
     read_keys: list[str] = []
 
-    def spy(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[LibraryEntry]]]:
+    def spy(
+        folder: Path, wanted: Iterable[RecordingFiles]
+    ) -> Iterator[tuple[RecordingFiles, list[LibraryEntry]]]:
         wanted = list(wanted)
         read_keys.extend(found.key for found in wanted)
         return read_rows(folder, wanted)
@@ -470,7 +472,7 @@ def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
 def test_rows_are_shown_while_others_are_read_and_from_the_index_before_anything_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.recording.library.library.PUBLISH_EVERY", 0.0)
+    monkeypatch.setattr("workbench.recording.library.library.PUBLISH_SECONDS", 0.0)
     for k in range(5):
         describe(tmp_path, f"r{k}")
         os.utime(tmp_path / f"r{k}.json", ns=(10**18 + k, 10**18 + k))

@@ -136,7 +136,7 @@ def test_pictures_are_handed_over_as_soon_as_there_are_enough(
     """And each time anew: a thread that is woken for each takes longer than the pictures."""
     picture = np.zeros((30, 40), np.int32)
     monkeypatch.setattr(episode_writer, "_pool", None)
-    monkeypatch.setattr(episode_writer, "_TOGETHER_BYTES", 3 * picture.nbytes)
+    monkeypatch.setattr(episode_writer, "_BATCH_BYTES", 3 * picture.nbytes)
     first = episode_writer.encode_async([])
     soons = [first]
     for number in range(7):

@@ -137,7 +137,7 @@ MOST_BYTES = 64 << 10
 """Of one episode's texts."""
 MOST_LINES = MOST_BYTES
 """A line has at least a byte; a recording with more was not written by the workbench."""
-CUT = "not recorded from here on: it changes too often"
+CUT_MESSAGE = "not recorded from here on: it changes too often"
 
 Line = tuple[int, bytes]
 """First state of a text, and its value in the journal. A plain pair: a reader of rows must not import the journal's
@@ -186,7 +186,7 @@ class TextWriter:
             line = _line(state, name, entry)
             if len(line[1]) > self._left:
                 self._cut.add(name)
-                line = _line(state, name, TextEntry(entry.what, CUT, entry.per_env, False))
+                line = _line(state, name, TextEntry(entry.what, CUT_MESSAGE, entry.per_env, False))
             self._left -= len(line[1])
             found.append(line)
         found += [
@@ -200,7 +200,7 @@ def _line(state: int, name: str, entry: TextEntry | None) -> Line:
     return state, json.dumps([name, None if entry is None else astuple(entry)]).encode()
 
 
-def tracks_of(lines: Sequence[Line]) -> dict[str, TextTrack]:
+def text_tracks(lines: Sequence[Line]) -> dict[str, TextTrack]:
     """The tracks of an episode whose journal has these lines."""
     found: dict[str, list[tuple[int, TextEntry | None]]] = {}
     for state, value in lines:

@@ -290,9 +290,9 @@ def as_json(value: object) -> Any:
     return json.loads(json_text(value))
 
 
-def fields_of(words: Struct) -> dict[str, Any]:
+def fields_of(struct: Struct) -> dict[str, Any]:
     """The fields that are set, by their names in the file."""
-    held = ((field.encode_name, getattr(words, field.name)) for field in msgspec.structs.fields(words))
+    held = ((field.encode_name, getattr(struct, field.name)) for field in msgspec.structs.fields(struct))
     return {name: value for name, value in held if value is not UNSET}
 
 

@@ -15,7 +15,7 @@ from workbench.core.camera_data import CameraInfo
 from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import BodyKind, SceneGeometry
 from workbench.recording.episode.columns import TextTrack, entry_at
-from workbench.recording.episode.encoded_pictures import MODALITIES, EncodedPictures, Modality
+from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality
 
 
 def _now() -> str:
@@ -93,7 +93,12 @@ class CameraTrack:
     @property
     def pictures(self) -> dict[Modality, EncodedPictures]:
         """The modalities that it has."""
-        return {m: held for m in MODALITIES if (held := getattr(self, m)) is not None}
+        tracks: dict[Modality, EncodedPictures | None] = {
+            "rgb": self.rgb,
+            "depth": self.depth,
+            "segmentation": self.segmentation,
+        }
+        return {modality: pictures for modality, pictures in tracks.items() if pictures is not None}
 
 
 def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
@@ -175,7 +180,7 @@ class Episode:
         found = {name: self.flag(name) for name in ("success", "fail")}
         return {name: flag for name, flag in found.items() if flag is not None}
 
-    def others_at(self, state: int) -> dict[str, OtherEntry]:
+    def other_entries_at(self, state: int) -> dict[str, OtherEntry]:
         """Entries of ``evaluate()`` in this state that are not in `evaluate`."""
         found: dict[str, OtherEntry] = {}
         for name, values in self.batch.items():
@@ -194,7 +199,7 @@ def _is_nan(value: NDArray | None) -> bool:
     return value is None or (value.dtype.kind == "f" and bool(np.isnan(value).all()))
 
 
-def box_of_moving(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, NDArray]:
+def movable_bounds(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, NDArray]:
     """Lowest and highest corner (3,), in metres, of the positions of movable bodies; the origin if there are none.
 
     Args:

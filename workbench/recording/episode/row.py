@@ -97,7 +97,7 @@ class LibraryRow(Facts):
     name: str
     """Path below the library's folder without suffix, and ``#traj_3`` for a file with several."""
     place: tuple[str, int]
-    """Key of its files (`scan.Found.key`), and its number among the recordings in them."""
+    """Key of its files (`scan.RecordingFiles.key`), and its number among the recordings in them."""
     paths: tuple[Path, ...]
     """Its files, the one to open first. *Delete* takes all of them."""
     size: int

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from workbench.machine.files import NotARegularFile, open_regular_file, read_regular_file
 
 MOST_FILES = 200
-MOST_LOOKED_AT = 5000
+MOST_LISTED_FILES = 5000
 """Files below the task's folder that are considered: it may be a home folder."""
 NAMING = (".urdf", ".xml", ".srdf", ".obj", ".mtl", ".gltf", ".dae")
 """Suffixes of files that name other files."""
@@ -41,14 +41,14 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
     folder = Path(task).parent
     below = {path.relative_to(folder).as_posix(): path for path in _files_below(folder)}
     found: dict[str, str] = {}
-    wanted = sorted(_named(below, _strings(source.values())))
-    while wanted and len(found) < MOST_FILES:
-        name = wanted.pop(0)
+    pending = sorted(_named(below, _strings(source.values())))
+    while pending and len(found) < MOST_FILES:
+        name = pending.pop(0)
         if name in found:
             continue
         try:
             found[name] = hash_of(below[name])
-            wanted += sorted(_named(below, _names_in(below[name])) - {name})
+            pending += sorted(_named(below, _names_in(below[name])) - {name})
         except OSError:  # removed meanwhile, or not readable for the task either
             continue
     return dict(sorted(found.items()))
@@ -119,7 +119,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
         recordings = {name[:-4] for name in names if name.endswith(".rrd")}
         for name in sorted(names):
             looked_at += 1
-            if looked_at > MOST_LOOKED_AT:
+            if looked_at > MOST_LISTED_FILES:
                 return
             stem, suffix = os.path.splitext(name)
             if not name.startswith(".") and suffix not in (".py", ".pyc", ".rrd") and stem not in recordings:

@@ -123,7 +123,7 @@ class _Films:
 
     def add(self, frames: Frames, camera: str) -> tuple[dict[str, Any], form.Stats]:
         """Append an episode; returns its fields in ``meta/episodes`` and its statistics."""
-        wanted, samples = set(form.sampled(len(frames.states)).tolist()), []
+        sampled, samples = set(form.sampled(len(frames.states)).tolist()), []
         if self._film is not None and self._path.stat().st_size >= form.VIDEO_MB * 2**20:
             self.close()
             self._chunk, self._file = form.next_file(self._chunk, self._file)
@@ -137,7 +137,7 @@ class _Films:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 self._film = FilmWriter(self._path, picture.shape, self._fps, ENCODING)
             self._film.add(picture)
-            if index in wanted:
+            if index in sampled:
                 samples.append(picture)
         assert self._film is not None, "an episode has a frame"
         entry = {
@@ -215,8 +215,8 @@ class _Writer:
                 self._films[key] = films = _Films(self._folder, key, self._fps)
                 # On an error: kill ffmpeg. Otherwise `finish` has closed the films before.
                 self._stack.callback(films.close, abandoned=True)
-            said, stats[key] = self._films[key].add(frames, camera)
-            entry |= said
+            camera_entry, stats[key] = self._films[key].add(frames, camera)
+            entry |= camera_entry
         for key, values in self._columns(frames, task_index).items():
             stats[key] = form.stats_of(values)
         for key, of_feature in stats.items():
@@ -306,7 +306,7 @@ class _Writer:
             self._folder / form.STATS,
             {key: {name: value.tolist() for name, value in of.items()} for key, of in stats.items()},
         )
-        _write_json(self._folder / form.OURS, {"episodes": self._from})
+        _write_json(self._folder / form.WORKBENCH_FILE, {"episodes": self._from})
         _write_json(self._folder / form.INFO, self._info())
 
     def _info(self) -> dict[str, Any]:

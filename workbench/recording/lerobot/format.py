@@ -24,7 +24,7 @@ TASKS = "meta/tasks.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-OURS = "meta/workbench.json"
+WORKBENCH_FILE = "meta/workbench.json"
 """Not part of the format: the recordings that the episodes were made from."""
 
 CHUNK_SIZE = 1000
@@ -202,8 +202,8 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     names: dict[str, list[str]] = {}
     sources = _numbers(episode)
     keys = {STATE: choice.state or _default_state(sources), ENVIRONMENT: choice.environment}
-    for feature, wanted in keys.items():
-        chosen = [key for name in wanted for key in _below(sources, name)]
+    for feature, prefixes in keys.items():
+        chosen = [key for name in prefixes for key in _below(sources, name)]
         if chosen:
             columns[feature] = np.concatenate([sources[key][states] for key in chosen], axis=1)
             names[feature] = [part for key in chosen for part in _parts(key, sources[key].shape[1])]

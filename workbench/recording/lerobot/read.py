@@ -48,7 +48,7 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
     info = _info(folder)
     try:
         totals, successes = _of_episodes(Path(folder), info)
-        ours = _ours(folder)
+        ours = _workbench_entries(folder)
         rows = []
         for entry in _entries(folder):
             index = int(entry["episode_index"])
@@ -72,17 +72,17 @@ def _of_episodes(
     folder: Path, info: dict[str, Any]
 ) -> tuple[dict[int, float] | None, dict[int, float] | None]:
     """Sum of rewards and number of frames with success by episode; None if the dataset lacks the feature."""
-    wanted = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
-    if not wanted:
+    features = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
+    if not features:
         return None, None
     data = ds.dataset(_tables(folder / "data"), format="parquet")
     if (frames := data.count_rows()) > MOST_FRAMES:
         raise ValueError(f"it claims {frames:,} frames")
-    table = data.to_table(["episode_index", *wanted])
+    table = data.to_table(["episode_index", *features])
     indices, episode = np.unique(table["episode_index"].to_numpy(), return_inverse=True)
     sums = [
         dict(zip(indices.tolist(), np.bincount(episode, _flat(table[key])).tolist()))
-        if key in wanted
+        if key in features
         else None
         for key in (form.REWARD, form.SUCCESS)
     ]
@@ -121,7 +121,7 @@ def read_lerobot(folder: Path, index: int) -> Episode:
 
 def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: int) -> Episode:
     numbers = {"chunk_index": entry["data/chunk_index"], "file_index": entry["data/file_index"]}
-    file = _inside(folder, _filled(info["data_path"], numbers))
+    file = _path_in(folder, _format_path(info["data_path"], numbers))
     open_regular_file(file).close()
     table = pq.read_table(file, filters=[("episode_index", "=", index)])
     length, features = table.num_rows, info["features"]
@@ -138,7 +138,7 @@ def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: i
     evaluate = {}
     if form.SUCCESS in columns:
         evaluate["success"] = np.concatenate([[False], columns[form.SUCCESS][:, 0].astype(np.bool_)])
-    ours = _ours(folder)
+    ours = _workbench_entries(folder)
     from_ours = ours[index] if index < len(ours) else {}
     return Episode(
         info=EpisodeInfo(
@@ -187,7 +187,7 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
         "file_index": entry[f"videos/{key}/file_index"],
         "video_key": key,
     }
-    film = _inside(folder, _filled(info["video_path"], where))
+    film = _path_in(folder, _format_path(info["video_path"], where))
     part = FilmPart(film, float(entry[f"videos/{key}/from_timestamp"]), length, float(info["fps"]))
     pose = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (length, 1))
     return CameraTrack(
@@ -254,7 +254,7 @@ def _number_type(name: object) -> str:
     return name if isinstance(name, str) and _NUMBER.fullmatch(name) else "O"
 
 
-def _filled(pattern: str, values: dict[str, Any]) -> str:
+def _format_path(pattern: str, values: dict[str, Any]) -> str:
     """``data/chunk-{chunk_index:03d}/...`` with these values; no other feature of ``str.format`` is evaluated."""
 
     def value(found: re.Match[str]) -> str:
@@ -264,16 +264,16 @@ def _filled(pattern: str, values: dict[str, Any]) -> str:
     return _PLACE.sub(value, pattern)
 
 
-def _ours(folder: Path) -> list[dict[str, Any]]:
+def _workbench_entries(folder: Path) -> list[dict[str, Any]]:
     """The recordings of the episodes, if the workbench wrote the dataset."""
     try:
-        found = read_json(Path(folder) / form.OURS)["episodes"]
+        found = read_json(Path(folder) / form.WORKBENCH_FILE)["episodes"]
     except (OSError, ValueError, KeyError, TypeError):
         return []
     return found if isinstance(found, list) and all(isinstance(one, dict) for one in found) else []
 
 
-def _inside(folder: Path, path: str) -> Path:
+def _path_in(folder: Path, path: str) -> Path:
     """Path of a file that the dataset names. Raises ValueError if it is outside the folder."""
     file = (folder / path).resolve()
     if not file.is_relative_to(folder.resolve()):

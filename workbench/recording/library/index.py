@@ -17,7 +17,7 @@ import msgspec
 
 from workbench.machine.user_folder import cache_folder
 from workbench.recording.episode.row import Facts, LibraryEntry, clean_facts
-from workbench.recording.reader.scan import Found
+from workbench.recording.reader.scan import RecordingFiles
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +34,10 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Kept:
+class IndexedFiles:
     """The rows of the files of one name, and the sizes and times at which they were read."""
 
-    found: Found
+    found: RecordingFiles
     rows: tuple[Facts, ...]
 
 
@@ -58,21 +58,21 @@ class LibraryIndex:
         self._database: sqlite3.Connection | None = _open(self._path)
         _remove_oldest(self._path)
 
-    def load(self) -> dict[str, Kept]:
+    def load(self) -> dict[str, IndexedFiles]:
         """Everything in it, by key."""
 
-        def read(database: sqlite3.Connection) -> dict[str, Kept]:
+        def read(database: sqlite3.Connection) -> dict[str, IndexedFiles]:
             kept = {}
             for key, rows in database.execute("SELECT key, rows FROM read"):
                 sizes, times, facts = _ROWS.decode(rows)
-                found = Found(os.fsdecode(key), sizes, times)
-                kept[found.key] = Kept(found, tuple(map(clean_facts, facts)))
+                found = RecordingFiles(os.fsdecode(key), sizes, times)
+                kept[found.key] = IndexedFiles(found, tuple(map(clean_facts, facts)))
             return kept
 
         return self._do(read, {})
 
     def store(
-        self, read: Collection[tuple[Found, Sequence[LibraryEntry]]], gone: Collection[str] = ()
+        self, read: Collection[tuple[RecordingFiles, Sequence[LibraryEntry]]], gone: Collection[str] = ()
     ) -> None:
         """Store what was read, and delete the keys that are `gone`."""
 
@@ -89,16 +89,16 @@ class LibraryIndex:
 
         self._do(write, None)
 
-    def thumbnails(self, wanted: Collection[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
+    def thumbnails(self, places: Collection[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
         """JPEGs of these rows, each a key and the number of the row in its files; rows without one are left out."""
 
         def read(database: sqlite3.Connection) -> dict[tuple[str, int], bytes]:
             found = {}
-            for key in {key for key, _ in wanted}:
+            for key in {key for key, _ in places}:
                 query = "SELECT jpegs FROM pictures WHERE key = ?"
                 for (jpegs,) in database.execute(query, (os.fsencode(key),)):
                     found |= {(key, row): jpeg for row, jpeg in enumerate(_JPEGS.decode(jpegs)) if jpeg}
-            return {place: found[place] for place in wanted if place in found}
+            return {place: found[place] for place in places if place in found}
 
         return self._do(read, {})
 

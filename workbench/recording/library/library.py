@@ -21,7 +21,7 @@ from workbench.recording.episode.row import (
     clean_tags,
     clean_text,
 )
-from workbench.recording.library.index import Kept, LibraryIndex
+from workbench.recording.library.index import IndexedFiles, LibraryIndex
 from workbench.recording.library.trash import (
     Trash,
     TrashError,
@@ -31,16 +31,16 @@ from workbench.recording.library.trash import (
     restore_from_trash,
 )
 from workbench.recording.reader.reading import read_rows
-from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, Scan, key_of, scan_folder
+from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, Scan, key_of, scan_folder
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY = 1.0
+SCAN_SECONDS = 1.0
 """Seconds between two checks of the folders' times."""
 LONGEST_PAUSE = 5.0
-LOOK_THOROUGHLY_EVERY = 30.0
+FULL_SCAN_SECONDS = 30.0
 """Seconds between two checks of every file: writing a file in place does not change its folder's time."""
-PUBLISH_EVERY = 0.3
+PUBLISH_SECONDS = 0.3
 """Seconds between two updates of the table while files are being read."""
 
 
@@ -86,9 +86,9 @@ class Library:
         self._view = LibraryView(reading=(0, 0))
         self._by_id: dict[str, LibraryRow] = {}
         self._scan = Scan(fresh=True)
-        self._thorough_at = -1e9
+        self._full_scan_at = -1e9
         self._index: LibraryIndex | None = LibraryIndex(self.folder) if self.folder.is_dir() else None
-        self._kept: dict[str, Kept] = {} if self._index is None else self._index.load()
+        self._kept: dict[str, IndexedFiles] = {} if self._index is None else self._index.load()
         self._stopping = threading.Event()
         self._asked = threading.Event()
         self._thread: threading.Thread | None = None
@@ -147,7 +147,7 @@ class Library:
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._asked.clear()
             # Scan at most a tenth of the time: a huge folder that is written to would keep the thread busy.
-            self._asked.wait(min(max(LOOK_EVERY, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
+            self._asked.wait(min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
 
     def refresh(self, thorough: bool = True) -> None:
         """Read the files that changed since the last call.
@@ -156,7 +156,7 @@ class Library:
             thorough: check every file, even if no folder's time has changed.
         """
         with self._looking:
-            late = time.monotonic() - self._thorough_at > LOOK_THOROUGHLY_EVERY
+            late = time.monotonic() - self._full_scan_at > FULL_SCAN_SECONDS
             if not (thorough or late) and self._scan.is_unchanged():
                 return
             with self._changing:
@@ -165,7 +165,7 @@ class Library:
                 if self._view.serial == 0 and self._kept:
                     # Rows of the index, shown until the files are checked.
                     self._show(reading=(0, 0))
-            self._thorough_at = time.monotonic()
+            self._full_scan_at = time.monotonic()
             scan = scan_folder(self.folder)
             self._scan = replace(scan, found={})  # `_kept` has the files that were read
             self._read_changed(scan)
@@ -185,7 +185,7 @@ class Library:
             # After an incomplete scan a missing file may exist: the index keeps it.
             forgotten = [] if scan.problem else sorted(gone)
         changed.sort(key=lambda found: found.newest, reverse=True)
-        unsaved: list[tuple[Found, list[LibraryEntry]]] = []
+        unsaved: list[tuple[RecordingFiles, list[LibraryEntry]]] = []
         published = time.monotonic()
         for done, (found, entries) in enumerate(read_rows(self.folder, changed)):
             if self._stopping.is_set():
@@ -193,9 +193,9 @@ class Library:
             with self._changing:
                 if not os.path.lexists(found.paths(self.folder)[0]):
                     continue  # deleted meanwhile
-                self._kept[found.key] = Kept(found, tuple(facts for facts, _ in entries))
+                self._kept[found.key] = IndexedFiles(found, tuple(facts for facts, _ in entries))
                 unsaved.append((found, entries))
-                if time.monotonic() - published > PUBLISH_EVERY:
+                if time.monotonic() - published > PUBLISH_SECONDS:
                     self._save(unsaved, forgotten)
                     unsaved, forgotten = [], []
                     self._show(reading=(done + 1, len(changed)), problem=scan.problem)
@@ -204,7 +204,7 @@ class Library:
             self._save(unsaved, forgotten)
             self._show(reading=None if only is None else before, problem=scan.problem)
 
-    def _save(self, read: list[tuple[Found, list[LibraryEntry]]], gone: list[str]) -> None:
+    def _save(self, read: list[tuple[RecordingFiles, list[LibraryEntry]]], gone: list[str]) -> None:
         if self._index is not None and (read or gone):
             self._index.store(read, gone)
 
@@ -216,7 +216,7 @@ class Library:
                 rows[row.id] = row
         self._publish(rows=tuple(rows.values()), reading=reading, problem=problem)
 
-    def _row(self, found: Found, number: int, facts: Facts, taken: Collection[str]) -> LibraryRow:
+    def _row(self, found: RecordingFiles, number: int, facts: Facts, taken: Collection[str]) -> LibraryRow:
         id = facts.uid if facts.uid.isalnum() and facts.uid.isascii() else ""
         if not id or id in taken:
             # No id of its own, or a copy of another row's recording.
@@ -305,8 +305,8 @@ class Library:
             self._keys_to_delete(ids)
 
     def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
-        wanted = set(ids)
-        keys = {self._row_and_files(id)[1].key for id in wanted}
+        selected = set(ids)
+        keys = {self._row_and_files(id)[1].key for id in selected}
         for key in keys:
             if key.split("/")[-2:] == DATASET_KEY and "/" in key:
                 raise LibraryError(
@@ -314,7 +314,7 @@ class Library:
                     "deleted from here: delete the folder."
                 )
             of_file = {row.id for row in self.rows() if row.place[0] == key}
-            if not wanted >= of_file:
+            if not selected >= of_file:
                 raise LibraryError(
                     f"{clean_text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
                     "select all of them."
@@ -347,7 +347,7 @@ class Library:
             finally:
                 self._publish()
 
-    def _row_and_files(self, id: str) -> tuple[LibraryRow, Found]:
+    def _row_and_files(self, id: str) -> tuple[LibraryRow, RecordingFiles]:
         row = self.row(id)
         kept = None if row is None else self._kept.get(row.place[0])
         if row is None or kept is None:

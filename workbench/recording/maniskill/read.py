@@ -209,13 +209,13 @@ def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
             held[modality] = EncodedPictures(modality, LazyPictures(count, one))
         if held:
             parameters = obs.group(f"sensor_param/{name}")
-            info = _lens(name, size, tuple(held), parameters)
+            info = _camera_info(name, size, tuple(held), parameters)
             pose = _poses(parameters, count)
             tracks.append(CameraTrack(info, np.arange(count), pose, **held))
     return tracks
 
 
-def _lens(
+def _camera_info(
     name: str, size: tuple[int, int], modalities: tuple[str, ...], parameters: H5Group | None
 ) -> CameraInfo:
     height, width = size

@@ -135,12 +135,17 @@ def unpack_episode(
         poses = _checked(poses, "poses", length + 1, bodies, 7).astype(np.float32, copy=False)
     broken_files = list(episode.broken_files)
     many = {
-        name: dict(_rows(getattr(episode, name), length + 1, broken_files))
-        for name in ("evaluate", "env_states", "obs", "batch")
+        name: dict(_rows(columns, length + 1, broken_files))
+        for name, columns in (
+            ("evaluate", episode.evaluate),
+            ("env_states", episode.env_states),
+            ("obs", episode.obs),
+            ("batch", episode.batch),
+        )
     }
     ends = {
-        name: _checked(getattr(episode, name), name, length).astype(np.bool_, copy=False)
-        for name in ("terminated", "truncated")
+        name: _checked(flags, name, length).astype(np.bool_, copy=False)
+        for name, flags in (("terminated", episode.terminated), ("truncated", episode.truncated))
     }
     action = _checked(episode.action, "actions", length, len(episode.action_names))
     _require(sum(map(len, episode.texts.values())) <= MOST_LINES, "too many entries that are no numbers")
@@ -160,10 +165,10 @@ def unpack_episode(
 def _checked(array: NDArray, what: str, *shape: int | None, kinds: str = "biuf") -> NDArray:
     """`array`, if it has this shape (None: any size) and a dtype of these kinds."""
     fits = array.ndim == len(shape) and all(want in (None, size) for want, size in zip(shape, array.shape))
-    wanted = " x ".join("any" if size is None else str(size) for size in shape)
+    shape_text = " x ".join("any" if size is None else str(size) for size in shape)
     _require(
         fits and array.dtype.kind in kinds,
-        f"{what} of shape {array.shape} and type {array.dtype}, not {wanted}",
+        f"{what} of shape {array.shape} and type {array.dtype}, not {shape_text}",
     )
     return array
 
@@ -195,11 +200,13 @@ def _geometry(
     visuals = []
     for visual in read.visuals:
         _require((process, visual.shape) in known, "a visual without a shape")
-        worn = _checked(visual.bodies, "bodies", None, kinds="iu")
-        _require(bool(np.all((0 <= worn) & (worn < bodies))), "a visual of bodies that are not there")
-        none = np.zeros(len(worn), np.int32)
+        bodies_of = _checked(visual.bodies, "bodies", None, kinds="iu")
+        _require(
+            bool(np.all((0 <= bodies_of) & (bodies_of < bodies))), "a visual of bodies that are not there"
+        )
+        none = np.zeros(len(bodies_of), np.int32)
         visuals.append(
-            Visual(visual.name, *known[process, visual.shape], none, worn.astype(np.int32, copy=False))
+            Visual(visual.name, *known[process, visual.shape], none, bodies_of.astype(np.int32, copy=False))
         )
     return replace(bare, num_envs=1, visuals=tuple(visuals))
 

@@ -20,9 +20,9 @@ from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.requests import (
     Answer,
     CloseEpisodes,
-    Ended,
     EpisodeRead,
     FindSources,
+    GetExitCode,
     NewReader,
     OpenEpisode,
     PictureRead,
@@ -37,7 +37,7 @@ from workbench.recording.reader.requests import (
     RowsRead,
     SourcesFound,
 )
-from workbench.recording.reader.scan import Found
+from workbench.recording.reader.scan import RecordingFiles
 
 MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
@@ -63,16 +63,16 @@ def main() -> None:
         message, fds, _, _ = socket.recv_fds(control, LONGEST, 1)
         if not message:
             return
-        wanted = Unpacker().unpack(message, NewReader | Ended)
-        if isinstance(wanted, Ended):
-            _, status = os.waitpid(wanted.pid, 0)
+        request = Unpacker().unpack(message, NewReader | GetExitCode)
+        if isinstance(request, GetExitCode):
+            _, status = os.waitpid(request.pid, 0)
             control.send(pack(os.waitstatus_to_exitcode(status)))
             continue
         fork_server = os.getpid()
         pid = os.fork()
         if pid == 0:
             control.close()
-            _run_reader(socket.socket(fileno=fds[0]), wanted, fork_server)
+            _run_reader(socket.socket(fileno=fds[0]), request, fork_server)
         os.close(fds[0])
         try:
             os.setpgid(pid, pid)  # also here: its group may be killed before the reader has made it
@@ -81,14 +81,14 @@ def main() -> None:
         control.send(pack(pid))
 
 
-def _run_reader(end: socket.socket, wanted: NewReader, fork_server: int) -> None:
+def _run_reader(end: socket.socket, request: NewReader, fork_server: int) -> None:
     try:
         end_with_parent(fork_server)
         os.setpgid(0, 0)
-        if wanted.writes is None:
-            confine(wanted.paths, MOST_MEMORY)
+        if request.writes is None:
+            confine(request.paths, MOST_MEMORY)
         else:
-            confine(wanted.paths, MOST_RECOVERY_MEMORY, [wanted.writes])
+            confine(request.paths, MOST_RECOVERY_MEMORY, [request.writes])
         serve(MessageSocket(end, get_args(Request)))
     finally:
         os._exit(0)
@@ -102,11 +102,11 @@ def serve(line: MessageSocket) -> None:
     reader = _Reader()
     while True:
         try:
-            wanted = line.receive(None)
-            if isinstance(wanted, CloseEpisodes):
-                reader.forget(wanted.opened)
+            request = line.receive(None)
+            if isinstance(request, CloseEpisodes):
+                reader.close_episodes(request.opened)
                 continue
-            line.send_bytes(reader.answer(wanted))
+            line.send_bytes(reader.answer(request))
         except (EOFError, OSError):
             return
 
@@ -117,14 +117,14 @@ class _Reader:
         self._number = 0
         self._shapes: OrderedDict[int, SentShapes] = OrderedDict()
 
-    def forget(self, opened: list[int]) -> None:
+    def close_episodes(self, opened: list[int]) -> None:
         for number in opened:
             self._opened.pop(number, None)
 
-    def answer(self, wanted: Request) -> bytes:
+    def answer(self, request: Request) -> bytes:
         """The packed answer; packing may run out of memory too."""
         try:
-            return pack_message(self._answer(wanted))
+            return pack_message(self._answer(request))
         except UnreadableRecording as error:
             failed = _failed("unreadable", str(error))
         except MemoryError:
@@ -140,71 +140,71 @@ class _Reader:
             failed = _failed("unreadable", f"It cannot be read (rerun's reader gave up: {error}).")
         return pack_message(failed)
 
-    def _answer(self, wanted: Request) -> Answer:
-        if isinstance(wanted, ReadRows):
-            found = Found(os.fsdecode(wanted.key), wanted.sizes, wanted.times)
-            return RowsRead(read_found(wanted.folder, found))
-        if isinstance(wanted, OpenEpisode):
-            return self._open(wanted)
-        if isinstance(wanted, ReadPicture):
-            return self._picture(wanted)
-        if isinstance(wanted, FindSources):
-            return _sources(wanted)
-        if isinstance(wanted, ReadRerunInfo):
-            return _rerun_info(wanted)
-        assert isinstance(wanted, Recover)
+    def _answer(self, request: Request) -> Answer:
+        if isinstance(request, ReadRows):
+            found = RecordingFiles(os.fsdecode(request.key), request.sizes, request.times)
+            return RowsRead(read_found(request.folder, found))
+        if isinstance(request, OpenEpisode):
+            return self._open(request)
+        if isinstance(request, ReadPicture):
+            return self._picture(request)
+        if isinstance(request, FindSources):
+            return _sources(request)
+        if isinstance(request, ReadRerunInfo):
+            return _rerun_info(request)
+        assert isinstance(request, Recover)
         from workbench.recording.writing.finish import recover
 
-        return Recovered([files.rrd.name for files in recover(wanted.folder)])
+        return Recovered([files.rrd.name for files in recover(request.folder)])
 
-    def _open(self, wanted: OpenEpisode) -> EpisodeRead:
+    def _open(self, request: OpenEpisode) -> EpisodeRead:
         from workbench.recording.lerobot.read import read_lerobot
         from workbench.recording.reader.read_episode import read_maniskill, read_without_task
 
-        shapes = self._shapes.setdefault(wanted.sharing, SentShapes())
-        self._shapes.move_to_end(wanted.sharing)
+        shapes = self._shapes.setdefault(request.sharing, SentShapes())
+        self._shapes.move_to_end(request.sharing)
         while len(self._shapes) > MOST_SHARED:
             self._shapes.popitem(last=False)
         source_path = None
-        if wanted.kind == "lerobot":
-            episode = read_lerobot(wanted.path, int(wanted.part))
-        elif wanted.kind == "maniskill":
-            episode = read_maniskill(wanted.path, wanted.part)
+        if request.kind == "lerobot":
+            episode = read_lerobot(request.path, int(request.part))
+        elif request.kind == "maniskill":
+            episode = read_maniskill(request.path, request.part)
         else:
-            episode, source_path = read_without_task(wanted.path, shapes.shapes)
+            episode, source_path = read_without_task(request.path, shapes.shapes)
         self._number += 1
         self._opened[self._number] = episode.cameras
         return pack_episode(episode, source_path, self._number, shapes)
 
-    def _picture(self, wanted: ReadPicture) -> PictureRead | ReadFailed:
-        cameras = self._opened.get(wanted.opened, [])
-        if not 0 <= wanted.camera < len(cameras):
+    def _picture(self, request: ReadPicture) -> PictureRead | ReadFailed:
+        cameras = self._opened.get(request.opened, [])
+        if not 0 <= request.camera < len(cameras):
             return _failed("gone", "That recording is not open.")
-        pictures = cameras[wanted.camera].pictures.get(wanted.modality)
-        if pictures is None or not 0 <= wanted.index < len(pictures):
+        pictures = cameras[request.camera].pictures.get(request.modality)
+        if pictures is None or not 0 <= request.index < len(pictures):
             return _failed("unreadable", "There is no such picture.")
-        if wanted.encoded:
-            return PictureRead(blob=pictures.blob(wanted.index))
-        return PictureRead(pictures[wanted.index])
+        if request.encoded:
+            return PictureRead(blob=pictures.blob(request.index))
+        return PictureRead(pictures[request.index])
 
 
-def _sources(wanted: FindSources) -> SourcesFound:
+def _sources(request: FindSources) -> SourcesFound:
     from workbench.recording.maniskill.read import trajectories
     from workbench.recording.reader.read_episode import sources_in
 
-    if wanted.trajectories:
-        return SourcesFound([Source(wanted.path, name) for name in trajectories(wanted.path)])
-    return SourcesFound(list(sources_in(wanted.path)))
+    if request.trajectories:
+        return SourcesFound([Source(request.path, name) for name in trajectories(request.path)])
+    return SourcesFound(list(sources_in(request.path)))
 
 
-def _rerun_info(wanted: ReadRerunInfo) -> RerunInfo:
+def _rerun_info(request: ReadRerunInfo) -> RerunInfo:
     from workbench.recording.rerun.append_blueprint import blueprint_stream
     from workbench.recording.rerun.private_api import store_id
 
     found = []
     for ask in (store_id, blueprint_stream):
         try:
-            found.append(ask(wanted.path))
+            found.append(ask(request.path))
         except (ValueError, OSError, RuntimeError, AssertionError):
             found.append(None)  # rerun then uses its own layout, at the first step
     return RerunInfo(found[0], found[1])

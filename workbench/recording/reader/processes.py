@@ -18,7 +18,7 @@ from typing import get_args
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack
-from workbench.recording.reader.requests import Answer, CloseEpisodes, Ended, NewReader, Request
+from workbench.recording.reader.requests import Answer, CloseEpisodes, GetExitCode, NewReader, Request
 
 START_SECONDS = 60.0
 """Timeout of the fork server's start, which imports for half a second."""
@@ -67,10 +67,10 @@ class _ForkServer:
         with self._lock:
             self._start()
 
-    def new_reader(self, wanted: NewReader) -> tuple[int, MessageSocket]:
+    def new_reader(self, request: NewReader) -> tuple[int, MessageSocket]:
         """Fork a reader: its process id and socket. Raises OSError."""
         ours, theirs = socket.socketpair()
-        message = pack(wanted)
+        message = pack(request)
         with theirs, self._lock:
             for _ in range(2):
                 control = self._start()
@@ -82,13 +82,13 @@ class _ForkServer:
         ours.close()
         raise OSError("the process that reads recordings cannot be started")
 
-    def ended(self, pid: int) -> int | None:
+    def exit_code(self, pid: int) -> int | None:
         """The exit code of a reader that has ended; None if unknown."""
         with self._lock:
             if self._control is None:
                 return None
             try:
-                self._control.send(pack(Ended(pid)))
+                self._control.send(pack(GetExitCode(pid)))
                 return self._answer(self._control)
             except (OSError, Unreadable):
                 self._end()
@@ -149,12 +149,12 @@ class Reader:
         self._folder, self._writes = Path(folder), writes
         self._allowed: set[Path] = set()
         """Further files: targets of links in the folder."""
-        self._turns = _Turns()
+        self._turns = _FairLock()
         self._pid = 0
         self._line: MessageSocket | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
         """Device and inode of the folder and these files when the present process began."""
-        self._forgotten: deque[tuple[int, int]] = deque()
+        self._closed: deque[tuple[int, int]] = deque()
         self.process = 0
         """Number of the present process; 0 if there is none."""
 
@@ -195,14 +195,14 @@ class Reader:
         answers: list[Answered | ReaderEnded] = []
         again = -1
         """Index of the request that was sent once more."""
-        with self._turns.turn(patience):
+        with self._turns.hold(patience):
             while len(answers) < len(requests):
                 line = self._started()
                 if process is not None and process != self.process:
                     raise WrongProcess
                 begun = len(answers)
                 try:
-                    self._send_forgotten(line)
+                    self._send_closed(line)
                     for request in requests[begun:]:
                         line.send(request)
                     for _ in requests[begun:]:
@@ -220,18 +220,18 @@ class Reader:
 
     def allow(self, paths: Sequence[Path]) -> None:
         """Allow it to read these files too. A new reader starts for new paths, without open episodes."""
-        with self._turns.turn(None):
+        with self._turns.hold(None):
             if not self._allowed.issuperset(paths):
                 self._allowed.update(paths)
                 self._kill()
 
-    def forget(self, process: int, opened: int) -> None:
+    def close_episode(self, process: int, opened: int) -> None:
         """Close an episode with the next request. Does not block: a finalizer may call it on any thread."""
-        self._forgotten.append((process, opened))
+        self._closed.append((process, opened))
 
     def close(self) -> None:
         """End it; the next request starts a new one."""
-        with self._turns.turn(None):
+        with self._turns.hold(None):
             self._kill()
 
     def _started(self) -> MessageSocket:
@@ -242,15 +242,15 @@ class Reader:
         if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
         if self._line is None:
-            wanted = NewReader(list(paths), self._writes)
-            self._pid, self._line = fork_server.new_reader(wanted)
+            request = NewReader(list(paths), self._writes)
+            self._pid, self._line = fork_server.new_reader(request)
             self.process, self._there = next(self._numbers), there
         return self._line
 
-    def _send_forgotten(self, line: MessageSocket) -> None:
+    def _send_closed(self, line: MessageSocket) -> None:
         gone = []
-        while self._forgotten:
-            process, opened = self._forgotten.popleft()
+        while self._closed:
+            process, opened = self._closed.popleft()
             if process == self.process:
                 gone.append(opened)
         if gone:
@@ -271,13 +271,13 @@ class Reader:
             return None
         self._line.end.close()
         self._line, self.process = None, 0
-        # With its children. The fork server reaps it in `ended`, so the id cannot have been reused.
+        # With its children. The fork server reaps it in `exit_code`, so the id cannot have been reused.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
-        return fork_server.ended(self._pid)
+        return fork_server.exit_code(self._pid)
 
 
-class _Turns:
+class _FairLock:
     """A fair lock, first come, first served: Python's own may return to the thread that released it."""
 
     def __init__(self) -> None:
@@ -285,7 +285,7 @@ class _Turns:
         self._waiting: deque[object] = deque()
 
     @contextlib.contextmanager
-    def turn(self, patience: float | None) -> Iterator[None]:
+    def hold(self, patience: float | None) -> Iterator[None]:
         """Raises ReaderBusy."""
         me = object()
         with self._changed:

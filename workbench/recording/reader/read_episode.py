@@ -82,8 +82,8 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
     broken_files: list[BrokenFile] = []
-    beside, not_json = _read_description(there.get(".json"))
-    files = {} if beside is None else beside.files or {}
+    in_json, not_json = _read_description(there.get(".json"))
+    files = {} if in_json is None else in_json.files or {}
     table = states = None
     if ".rrd" in there:
         try:
@@ -91,20 +91,20 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
             table = RerunTable(there[".rrd"], shapes)
         except (OSError, ValueError, RuntimeError) as error:
             lost = "its 3-D scene, its pictures and what evaluate() said are missing"
-            broken_files.append(_unread(there[".rrd"], error, lost))
+            broken_files.append(_broken_file(there[".rrd"], error, lost))
     if ".h5" in there:
         try:
             check(there[".h5"], files)
             states = _read_states(there[".h5"])
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-            broken_files.append(_unread(there[".h5"], error, "its env states are missing"))
+            broken_files.append(_broken_file(there[".h5"], error, "its env states are missing"))
     if table is None and states is None and broken_files:
         raise UnreadableRecording(" ".join(broken.sentence for broken in broken_files))
     if not_json is not None and table is not None:
         broken_files.append(
-            _unread(there[".json"], not_json, "its tags, its note and the place of its task are missing")
+            _broken_file(there[".json"], not_json, "its tags, its note and the place of its task are missing")
         )
-    description = beside or _description(there.get(".json"), not_json, table, path)
+    description = in_json or _description(there.get(".json"), not_json, table, path)
     try:
         episode = _episode(description, table)
         if states is not None:
@@ -119,7 +119,7 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
     return episode, description.source_path or None
 
 
-def _unread(file: Path, error: Exception, lost: str) -> BrokenFile:
+def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
     why = " ".join(str(error).split()).removeprefix(f"Failed to read RRD file at {file}: ")
     why = why if len(why) <= 160 else why[:159] + "\u2026"
     return BrokenFile(file.name, f"was cut short or changed ({why}): {lost}.")

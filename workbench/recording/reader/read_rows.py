@@ -35,7 +35,7 @@ from workbench.recording.episode.row import (
     unix_seconds,
 )
 from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
-from workbench.recording.reader.scan import DATASET_KEY, NOTES, Found, broken
+from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, broken
 
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
@@ -47,7 +47,7 @@ _LARGEST_PICTURE = 4096
 """Pixels of the longer side of a picture that a thumbnail is made of."""
 
 
-def read_found(folder: Path, found: Found) -> list[LibraryEntry]:
+def read_found(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
     """The recordings in these files: none, one, or one per trajectory.
 
     A broken file becomes a row that states the problem, so that it is found. A ``.json`` that is something else gives
@@ -62,13 +62,13 @@ def read_found(folder: Path, found: Found) -> list[LibraryEntry]:
     if NOTES in found.sizes:
         notes = read_notes(found.path(folder, NOTES))
         entries = [
-            (facts if facts.kind == "workbench" else _noted(facts, notes), picture)
+            (facts if facts.kind == "workbench" else _with_notes(facts, notes), picture)
             for facts, picture in entries
         ]
     return entries
 
 
-def _read(folder: Path, found: Found) -> list[LibraryEntry]:
+def _read(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
     if ".json" in found.sizes:
         try:
             document = read_document(found.path(folder, ".json"))
@@ -92,16 +92,16 @@ def _read(folder: Path, found: Found) -> list[LibraryEntry]:
     return []
 
 
-def _broken(found: Found, what: str) -> LibraryEntry:
+def _broken(found: RecordingFiles, what: str) -> LibraryEntry:
     return broken(found, f"{Path(found.key).name}{next(iter(found.sizes))} {what}.")
 
 
-def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts:
+def _with_notes(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts:
     tags, note = notes.get(facts.trajectory or "", ((), ""))
     return replace(facts, tags=tags, note=note)
 
 
-def _workbench_entry(found: Found, document: Document) -> LibraryEntry:
+def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
     name = Path(found.key).name
     lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
     problem = f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None
@@ -167,7 +167,7 @@ def _thumbnail(encoded: object) -> bytes | None:
         return None
 
 
-def _maniskill_entries(folder: Path, found: Found, document: Document) -> list[LibraryEntry]:
+def _maniskill_entries(folder: Path, found: RecordingFiles, document: Document) -> list[LibraryEntry]:
     """One row per episode of ManiSkill's ``RecordEpisode``, which made its demonstrations too."""
     name = Path(found.key).name
     written = found.newest / 1e9
@@ -223,7 +223,7 @@ def _episode_or_problem(document: Document, number: int) -> EpisodeJson | str:
         return str(error)
 
 
-def _lerobot_entries(folder: Path, found: Found) -> list[LibraryEntry]:
+def _lerobot_entries(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
     """One row per episode of a LeRobot dataset; its key is ``meta/info``."""
     # Imported late: Arrow starts threads, which must not exist when a reader is forked.
     from workbench.recording.lerobot.read import lerobot_rows
@@ -275,7 +275,7 @@ def _last_picture(group: H5Group) -> bytes | None:
     return None
 
 
-def _rrd_only(folder: Path, found: Found) -> LibraryEntry:
+def _rrd_only(folder: Path, found: RecordingFiles) -> LibraryEntry:
     # Imported late: rerun takes half a second.
     from workbench.recording.rerun.read import read_properties
 

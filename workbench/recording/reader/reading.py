@@ -40,7 +40,7 @@ from workbench.recording.reader.requests import (
     RowsRead,
     SourcesFound,
 )
-from workbench.recording.reader.scan import NOTES, Found, broken
+from workbench.recording.reader.scan import NOTES, RecordingFiles, broken
 from workbench.recording.writing.publish import RecordingError
 
 ROW_SECONDS = 30.0
@@ -78,19 +78,23 @@ def stop_reading() -> None:
     fork_server.end()
 
 
-def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[LibraryEntry]]]:
+def read_rows(
+    folder: Path, found_files: Iterable[RecordingFiles]
+) -> Iterator[tuple[RecordingFiles, list[LibraryEntry]]]:
     """The recordings in these files of a library's folder, each with its thumbnail; problems become rows.
 
     Raises:
         OSError: no reader can be started.
     """
-    wanted = list(wanted)
+    found_files = list(found_files)
     reader = _reader(folder, episodes=False)
-    reader.allow(_link_targets(path for found in wanted for path in found.paths(folder)))
-    for begin in range(0, len(wanted), _AT_ONCE):
-        some = wanted[begin : begin + _AT_ONCE]
-        asked = [ReadRows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some]
-        answers = reader.ask_all(asked, ROW_SECONDS)
+    reader.allow(_link_targets(path for found in found_files for path in found.paths(folder)))
+    for begin in range(0, len(found_files), _AT_ONCE):
+        some = found_files[begin : begin + _AT_ONCE]
+        requests = [
+            ReadRows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some
+        ]
+        answers = reader.ask_all(requests, ROW_SECONDS)
         for found, answer in zip(some, answers, strict=True):
             yield found, _entries(found, answer)
 
@@ -119,14 +123,14 @@ def read_recording(
     """
     path = Path(path).absolute()
     folder = folder or (path if kind == "lerobot" else path.parent)
-    beside = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
+    files = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
     reader = _reader(folder, episodes=True)
-    reader.allow(_link_targets(beside))
+    reader.allow(_link_targets(files))
     shapes = SharedShapes() if shapes is None else shapes
     sharing, known = _shapes.of(shapes)
-    wanted = OpenEpisode(kind, path, part, sharing)
-    read, process = _request(reader, wanted, EpisodeRead, path.name)
-    opened = _OpenEpisode(reader, wanted, process, read.opened, path.name)
+    request = OpenEpisode(kind, path, part, sharing)
+    read, process = _request(reader, request, EpisodeRead, path.name)
+    opened = _OpenEpisode(reader, request, process, read.opened, path.name)
     try:
         episode = unpack_episode(read, opened.picture, process, shapes, known)
     except InvalidEpisode as error:
@@ -153,8 +157,8 @@ def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
     path = Path(path).absolute()
     reader = _reader(path.parent, episodes=True)
     reader.allow(_link_targets([path]))
-    told, _ = _request(reader, ReadRerunInfo(path), RerunInfo, path.name)
-    return told.store, told.blueprint
+    info, _ = _request(reader, ReadRerunInfo(path), RerunInfo, path.name)
+    return info.store, info.blueprint
 
 
 def recover_confined(folder: Path) -> tuple[Path, ...]:
@@ -236,7 +240,7 @@ def _link_targets(paths: Iterable[Path]) -> list[Path]:
     return [Path(os.path.realpath(path)) for path in paths if os.path.islink(path)]
 
 
-def _entries(found: Found, answered: Answered | ReaderEnded) -> list[LibraryEntry]:
+def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[LibraryEntry]:
     answer = answered.answer if isinstance(answered, Answered) else answered
     if isinstance(answer, RowsRead):
         return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
@@ -277,11 +281,11 @@ def _request(
 class _OpenEpisode:
     """An episode that is open in a reader while its pictures may be read."""
 
-    def __init__(self, reader: Reader, wanted: OpenEpisode, process: int, opened: int, name: str) -> None:
-        self._reader, self._wanted, self._name = reader, wanted, name
+    def __init__(self, reader: Reader, request: OpenEpisode, process: int, opened: int, name: str) -> None:
+        self._reader, self._request, self._name = reader, request, name
         self._lock = threading.Lock()
         self._failed: OSError | None = None
-        self._is_open_in(process, opened)
+        self._set_opened(process, opened)
 
     def picture(self, camera: int, modality: Modality, index: int, encoded: bool) -> PictureRead:
         """Raises OSError; ReaderBusy while another recording is being opened."""
@@ -300,18 +304,18 @@ class _OpenEpisode:
 
     def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
         for _ in range(2):
-            wanted = ReadPicture(self._number, camera, modality, index, encoded)
+            request = ReadPicture(self._number, camera, modality, index, encoded)
             try:
-                return self._reader.ask(wanted, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
+                return self._reader.ask(request, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
             except WrongProcess:
                 # Another request has ended the process.
-                read, process = _request(self._reader, self._wanted, EpisodeRead, self._name)
-                self._is_open_in(process, read.opened)
+                read, process = _request(self._reader, self._request, EpisodeRead, self._name)
+                self._set_opened(process, read.opened)
         raise ReaderEnded("ended the process that reads recordings")
 
-    def _is_open_in(self, process: int, opened: int) -> None:
+    def _set_opened(self, process: int, opened: int) -> None:
         self._process, self._number = process, opened
-        weakref.finalize(self, self._reader.forget, process, opened).atexit = False
+        weakref.finalize(self, self._reader.close_episode, process, opened).atexit = False
 
 
 # --- recordings by path ------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ class NewReader(msgspec.Struct, tag=True):
     """Folder that it may write to."""
 
 
-class Ended(msgspec.Struct, tag=True):
+class GetExitCode(msgspec.Struct, tag=True):
     """A reader was killed or has ended. Answered by its exit code (`os.waitstatus_to_exitcode`)."""
 
     pid: int
@@ -34,7 +34,7 @@ class ReadRows(msgspec.Struct, frozen=True):
 
     folder: Path
     key: bytes
-    """Bytes, since it may be invalid UTF-8; with `sizes` and `times` a `scan.Found`."""
+    """Bytes, since it may be invalid UTF-8; with `sizes` and `times` a `scan.RecordingFiles`."""
     sizes: dict[str, int]
     times: dict[str, int]
 

@@ -16,14 +16,14 @@ NOTES = ".notes"
 recording's."""
 DATASET_KEY = ["meta", "info"]
 """How the key of a LeRobot dataset ends."""
-SETTLES = 3.0
+SETTLE_SECONDS = 3.0
 """Seconds in which a folder may change again within one tick of its time, or a recording get its other files."""
 MOST_ENTRIES = 500_000
 """Names that are listed: the folder may be a home folder."""
 
 
 @dataclass(frozen=True)
-class Found:
+class RecordingFiles:
     """The files of one name; unequal after any of them was written, added or removed."""
 
     key: str
@@ -45,7 +45,7 @@ class Found:
         return tuple(self.path(folder, suffix) for suffix in self.sizes)
 
 
-def broken(found: Found, problem: str) -> LibraryEntry:
+def broken(found: RecordingFiles, problem: str) -> LibraryEntry:
     """The row of files that cannot be read."""
     kind = "rrd only" if found.sizes.keys() <= {".rrd", NOTES} else "maniskill"
     return Facts(kind, written=found.newest / 1e9, problem=clean_text(problem, 500)), None
@@ -65,7 +65,7 @@ class Scan:
     would be missed: a folder with a recent time counts as changed (`fresh`).
     """
 
-    found: dict[str, Found] = field(default_factory=dict)
+    found: dict[str, RecordingFiles] = field(default_factory=dict)
     """By key."""
     folders: dict[str, int] = field(default_factory=dict)
     """Every scanned folder, and its time in nanoseconds."""
@@ -120,11 +120,11 @@ def scan_folder(folder: Path) -> Scan:
         group = _group(key, stats)
         if group is None:
             continue
-        if ".json" not in group.sizes and ".h5" in group.sizes and now - group.newest < SETTLES * 1e9:
+        if ".json" not in group.sizes and ".h5" in group.sizes and now - group.newest < SETTLE_SECONDS * 1e9:
             waits = True  # its .json may be published next
             continue
         found[key] = group
-    fresh = waits or any(now - at < SETTLES * 1e9 for at in folders.values())
+    fresh = waits or any(now - at < SETTLE_SECONDS * 1e9 for at in folders.values())
     return Scan(found, folders, fresh, problem)
 
 
@@ -137,11 +137,11 @@ def _add(names: dict[str, dict[str, os.stat_result]], below: str, entry: os.DirE
     names.setdefault(below + entry.name[: -len(suffix)], {})[suffix] = found
 
 
-def _group(key: str, stats: dict[str, os.stat_result]) -> Found | None:
+def _group(key: str, stats: dict[str, os.stat_result]) -> RecordingFiles | None:
     if not any(suffix in stats for suffix in SUFFIXES):
         return None  # notes of removed files
     order = [suffix for suffix in (*SUFFIXES, NOTES) if suffix in stats]
-    return Found(
+    return RecordingFiles(
         key,
         {suffix: stats[suffix].st_size for suffix in order},
         {suffix: stats[suffix].st_mtime_ns for suffix in order},

@@ -83,7 +83,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     if cameras:
         yield _classes(episode.segmentation)
     for (camera, entity), kind in zip(cameras, ids):
-        yield from _lens(camera, entity, kind)
+        yield from _pinhole(camera, entity, kind)
     yield from _series(numbers)
     timed = TimedChunks(episode.info.control_dt)
     yield _log(timed, EVENTS, events(episode))
@@ -210,13 +210,13 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     # Values that rerun's mesh lacks, for reading the scene back. Typed, because rerun applies the type of the first value
     # in the process to all: after a colour of integers every other would be truncated to 0 or 1.
     material = visual.material
-    said = rr.AnyValues(
+    extras = rr.AnyValues(
         visual=visual.name,
         base_color=pa.array(material.base_color, pa.float64()),
         metallic=pa.array([material.metallic], pa.float64()),
         roughness=pa.array([material.roughness], pa.float64()),
     )
-    return static_chunk(entity, mesh, said)
+    return static_chunk(entity, mesh, extras)
 
 
 def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
@@ -244,7 +244,7 @@ def _classes(segmentation: Mapping[int, str]) -> Chunk:
     return static_chunk(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
 
 
-def _lens(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]:
+def _pinhole(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]:
     info = camera.info
     if _never_moves(camera.pose):
         translation, quaternion = optical_pose(camera.pose[:1])
@@ -350,7 +350,7 @@ def rising_edges(values: NDArray[np.bool_]) -> list[int]:
 
 def _texts(episode: Episode) -> list[tuple[int, str, str]]:
     """Changes of the entries that are not numbers."""
-    said = [
+    lines = [
         (
             state,
             "INFO",
@@ -359,7 +359,7 @@ def _texts(episode: Episode) -> list[tuple[int, str, str]]:
         for name, track in episode.texts.items()
         for state, entry in track
     ]
-    return sorted(said, key=lambda line: line[0])
+    return sorted(lines, key=lambda line: line[0])
 
 
 def _log(timed: TimedChunks, entity: str, lines: Sequence[tuple[int, str, str]]) -> Chunk:

@@ -54,7 +54,7 @@ class RerunTable:
         self._alone: dict[str, IndexedChunk] = {}
         """The static chunk of each entity with exactly one."""
         store = RrdReader(path).store()
-        self._look(index_of(store, STEP))
+        self._scan_index(index_of(store, STEP))
         for chunk in self._chunks(store):
             batch = chunk.to_record_batch()
             steps = None
@@ -70,7 +70,7 @@ class RerunTable:
                 elif len(column) and column[len(column) - 1].is_valid:
                     self._static[key] = column[len(column) - 1].values
 
-    def _look(self, index: Sequence[IndexedChunk]) -> None:
+    def _scan_index(self, index: Sequence[IndexedChunk]) -> None:
         """Find the chunks in the index that need not be read."""
         several = set()
         for place in index:
@@ -84,7 +84,7 @@ class RerunTable:
         for entity in several:
             del self._alone[entity]
         for entity, place in self._alone.items():
-            known = self._shapes.known(_mark(place))
+            known = self._shapes.known(_content_key(place))
             if known is not None:
                 self._known[entity] = known
 
@@ -159,9 +159,9 @@ class RerunTable:
         for body, entity in enumerate(entities):
             number = 0
             while (
-                worn := self._visual_at(f"{entity}/{number}", f"{bare.body_names[body]}/{number}")
+                visual := self._visual_at(f"{entity}/{number}", f"{bare.body_names[body]}/{number}")
             ) is not None:
-                name, mesh, material = worn
+                name, mesh, material = visual
                 visuals.setdefault(name, (mesh, material, []))[2].append(body)
                 number += 1
         return replace(
@@ -182,7 +182,7 @@ class RerunTable:
         name = str(self._one(entity, "visual", default))
         mesh, material = self._shapes.shared(mesh, self._material(entity))
         if entity in self._alone and (entity, "visual") in self._static:
-            self._shapes.learn(_mark(self._alone[entity]), name, mesh, material)
+            self._shapes.learn(_content_key(self._alone[entity]), name, mesh, material)
         return name, mesh, material
 
     def _mesh(self, entity: str) -> Mesh | None:
@@ -230,7 +230,7 @@ def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int
     return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 
 
-def _mark(place: IndexedChunk) -> tuple[bytes, int, int]:
+def _content_key(place: IndexedChunk) -> tuple[bytes, int, int]:
     """Key of a chunk's content. Rerun's ids are unique; the sizes guard against manipulated files."""
     return (place.id, place.end - place.begin, place.unpacked)
 

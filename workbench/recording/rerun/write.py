@@ -22,7 +22,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.episode.description import describe
 from workbench.recording.episode.document import fields_of, json_text
-from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_text, box_of_moving
+from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_text, movable_bounds
 from workbench.recording.rerun.append_blueprint import BlueprintBytes, add_blueprint, encode_blueprint
 from workbench.recording.rerun.chunks import STEP, property_chunk, static_chunk
 from workbench.recording.rerun.layout import (
@@ -268,7 +268,7 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
 def _eye(episode: Episode) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Eye and target, which frame the movable bodies. By default rerun frames the whole scene, with 100 m of ground."""
     assert episode.poses is not None and episode.geometry is not None
-    low, high = box_of_moving(episode.poses[0], episode.geometry.body_kinds)
+    low, high = movable_bounds(episode.poses[0], episode.geometry.body_kinds)
     # Rounded, so that episodes of a scene share one cached blueprint.
     middle = np.round((low + high).astype(np.float64) / 2, 1)
     direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)

@@ -17,7 +17,7 @@ from workbench.core.camera_data import CameraInfo, CameraKind, Picture
 from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.columns import TEXT, Layout, TextWriter
-from workbench.recording.episode.encoded_pictures import MODALITIES, Modality, encode
+from workbench.recording.episode.encoded_pictures import Modality, encode
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.writing.finish import EpisodeFiles as EpisodeFiles
 from workbench.recording.writing.finish import make_files
@@ -195,14 +195,17 @@ class EpisodeWriter:
         """Modalities by camera, and the journal's entries."""
         seen: dict[int, tuple[Modality, ...]] = {}
         for picture in pictures:
-            seen[self._check(picture, seen)] = _modalities_of(picture)
+            seen[self._check(picture, seen)] = tuple(_arrays_of(picture))
         items: list[JournalItem] = []
-        for (index, modalities), picture in zip(seen.items(), pictures):
+        for index, picture in zip(seen, pictures):
             pose = np.asarray(picture.pose, dtype=np.float32).tobytes()
             items.append(JournalEntry(f"camera/{index}", self._states, pose))
             items.append(
                 encode_async(
-                    [(f"picture/{index}/{m}", self._states, m, getattr(picture, m)) for m in modalities]
+                    [
+                        (f"picture/{index}/{m}", self._states, m, pixels)
+                        for m, pixels in _arrays_of(picture).items()
+                    ]
                 )
             )
         return seen, items
@@ -214,10 +217,11 @@ class EpisodeWriter:
         if index in seen:
             raise ValueError(f"camera {picture.camera} gave two pictures of one state.")
         info = self._header.cameras[index]
-        given = _modalities_of(picture)
-        for modality in given:
-            self._check_numbers(info.name, modality, getattr(picture, modality))
-            shape = getattr(picture, modality).shape
+        arrays = _arrays_of(picture)
+        given = tuple(arrays)
+        for modality, pixels in arrays.items():
+            self._check_numbers(info.name, modality, pixels)
+            shape = pixels.shape
             if shape[:2] != (info.height, info.width):
                 raise ValueError(
                     f"camera {info.name} gave a {modality} picture of {shape[1]} x {shape[0]}, "
@@ -246,8 +250,13 @@ class EpisodeWriter:
         )
 
 
-def _modalities_of(picture: Picture) -> tuple[Modality, ...]:
-    return tuple(modality for modality in MODALITIES if getattr(picture, modality) is not None)
+def _arrays_of(picture: Picture) -> dict[Modality, NDArray]:
+    arrays: dict[Modality, NDArray | None] = {
+        "rgb": picture.rgb,
+        "depth": picture.depth,
+        "segmentation": picture.segmentation,
+    }
+    return {modality: pixels for modality, pixels in arrays.items() if pixels is not None}
 
 
 # --- pictures encoded on threads ---------------------------------------------------------------
@@ -255,7 +264,7 @@ def _modalities_of(picture: Picture) -> tuple[Modality, ...]:
 
 MOST_PENDING_BYTES = 8 << 20
 """Limit of pictures that wait for a thread: a few hundredths of a second of work, which a killed process loses."""
-_TOGETHER_BYTES = 1 << 20
+_BATCH_BYTES = 1 << 20
 """Pictures that are submitted together. Waking a thread at every step for one small picture costs the step as much as
 encoding it, and with cold caches it takes three times as long (measured)."""
 
@@ -312,7 +321,7 @@ class _EncoderPool:
                 self._bytes += pending.size
                 self._gathered.append(pending)
                 self._gathered_bytes += pending.size
-            enough = self._gathered_bytes >= _TOGETHER_BYTES
+            enough = self._gathered_bytes >= _BATCH_BYTES
         if full:
             pending.make()
         if full or enough:

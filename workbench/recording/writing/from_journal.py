@@ -21,7 +21,7 @@ from workbench.recording.episode.columns import (
     TEXT,
     assemble,
     layout_type,
-    tracks_of,
+    text_tracks,
 )
 from workbench.recording.episode.document import CameraJson, json_text
 from workbench.recording.episode.encoded_pictures import MODALITIES, EncodedPictures, LazyPictures, Modality
@@ -173,7 +173,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
         env_states=named(STATE),
         obs=named(OBS),
         batch=named(BATCH),
-        texts=tracks_of(texts),
+        texts=text_tracks(texts),
     )
 
 

@@ -108,7 +108,7 @@ class Journal:
             full = self._waiting_bytes > _BATCH_BYTES
         for item in items:
             if not isinstance(item, JournalEntry):
-                item.add_done_callback(self._weigh)
+                item.add_done_callback(self._count_bytes)
         if full:
             self.write()  # an error is raised by the next `append`: this state is queued
 
@@ -138,7 +138,7 @@ class Journal:
                 self._waiting_bytes -= sum(map(_size, entries))
             self._error = error
 
-    def _weigh(self, made: Future[list[JournalEntry]]) -> None:
+    def _count_bytes(self, made: Future[list[JournalEntry]]) -> None:
         if not made.cancelled() and made.exception() is None:
             with self._lock:
                 self._waiting_bytes += sum(map(_size, made.result()))
@@ -153,7 +153,7 @@ class Journal:
         It is not synced: files replace it at once. Entries that could not be written are tried again; raises OSError if
         they fail again.
         """
-        _journal_thread.forget(self)
+        _journal_thread.remove(self)
         self._error = None
         self._flush(lambda _: None)
         if self._error is not None:
@@ -174,7 +174,7 @@ class Journal:
 
     def close(self) -> None:
         """Close and unlock the file."""
-        _journal_thread.forget(self)
+        _journal_thread.remove(self)
         with self._writing:
             self._closer()
 
@@ -242,7 +242,7 @@ class _JournalThread:
                 self._thread = threading.Thread(target=self._run, name="episode-journals", daemon=True)
                 self._thread.start()
 
-    def forget(self, journal: Journal) -> None:
+    def remove(self, journal: Journal) -> None:
         with self._changed:
             self._journals.discard(journal)
             self._changed.notify()

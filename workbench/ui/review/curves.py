@@ -178,7 +178,7 @@ def step_of(episode: Episode, state: int) -> StepResult:
         evaluate={name: values[state : state + 1] for name, values in episode.evaluate.items()},
         poses=np.zeros((1, 0, 7), np.float32) if episode.poses is None else episode.poses[state : state + 1],
         action=episode.action[before : before + 1] if state else None,
-        others=episode.others_at(state),
+        others=episode.other_entries_at(state),
     )
 
 
