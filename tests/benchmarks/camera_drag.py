@@ -85,7 +85,7 @@ def main(options: Options) -> None:
             began = time.perf_counter()
             for k in range(count):
                 time.sleep(max(0.0, began + k / RATE - time.perf_counter()))
-                session.studio.place(BASE, at(start, 100 + k), hand=1)
+                session.studio.place(BASE, at(start, 100 + k), control=1)
             last = time.perf_counter()
             wait(session, at(start, 100 + count - 1))
             lag = time.perf_counter() - last

@@ -16,12 +16,12 @@ from workbench.authoring.camera_source.cameras import RunHooks
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.camera_data import CallSite, CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.edit_state import copy, not_as_written, plan
-from workbench.session.cameras.file_edits import StudioFile
+from workbench.session.cameras.edit_state import copy, difference_text, plan
+from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.selection import StudioCameras
-from workbench.session.cameras.view import Wish, Writing
+from workbench.session.cameras.view import EditRequest, EditState
 from workbench.session.live.session import Session
-from workbench.ui.cameras.write_to_file import writing_html
+from workbench.ui.cameras.write_to_file import edit_html
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -56,19 +56,19 @@ def session(task_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     session.close()
 
 
-def planned(session: Session) -> Writing:
-    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
-    assert view.studio.writing.stage == "planned", view.studio.writing.message
-    return view.studio.writing
+def planned(session: Session) -> EditState:
+    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
+    return view.studio.edit_state
 
 
-def written(session: Session, stage: str = "checked") -> Writing:
+def written(session: Session, stage: str = "checked") -> EditState:
     planned(session)
     session.studio.file.write()
     ended = ("checked", "mismatch", "refused")
-    view = wait_until(session, said(lambda s: s.writing.stage in ended), "the check")
-    assert view.studio.writing.stage == stage, view.studio.writing.message
-    return view.studio.writing
+    view = wait_until(session, said(lambda s: s.edit_state.stage in ended), "the check")
+    assert view.studio.edit_state.stage == stage, view.studio.edit_state.message
+    return view.studio.edit_state
 
 
 def there(session: Session, key: CameraKey) -> CameraSettings:
@@ -91,24 +91,24 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
-    studio.file.plan(Wish("add", ("human", "side"), new))
+    studio.file.plan(EditRequest("add", ("human", "side"), new))
     assert written(session).message == f"side is in {task_file.name}, and the env has it."
     assert not differences(there(session, ("human", "side")), new, close=3e-4), "but for what is rounded"
     assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
     # What is not written yet is in the copy, and stays with the original.
     away = replace(new, position=(0.61, 0.1, 0.7))
     studio.place(("human", "side"), away)
-    studio.file.plan(Wish("duplicate", ("human", "side"), name="other"))
+    studio.file.plan(EditRequest("duplicate", ("human", "side"), name="other"))
     assert "a copy of side" in written(session).message
     assert names(session) == ["render_camera", "side", "other"]
     assert ("human", "side") in moved(session.view())
     assert camera(session, ("human", "other")).now.position == away.position
-    studio.file.plan(Wish("rename", ("human", "side"), name="front"))
+    studio.file.plan(EditRequest("rename", ("human", "side"), name="front"))
     assert written(session).message == f"side is front in {task_file.name} now."
     assert names(session) == ["render_camera", "front", "other"]
     assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
     for name in ("front", "other"):
-        studio.file.plan(Wish("remove", ("human", name)))
+        studio.file.plan(EditRequest("remove", ("human", name)))
         assert f"{name} is no longer in" in written(session).message
     assert names(session) == ["render_camera"] and task_file.read_text().count(
         "CameraConfig("
@@ -121,18 +121,18 @@ def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_i
 ) -> None:
     studio = session.studio
     new = replace(there(session, ("human", "render_camera")), position=(0.5, 0.2, 0.6))
-    studio.file.plan(Wish("add", ("human", "side"), new))
+    studio.file.plan(EditRequest("add", ("human", "side"), new))
     assert planned(session).message.startswith("This adds side to")
-    view = wait_until(session, said(lambda s: s.writing.picture is not None), "its picture")
-    picture = view.studio.writing.picture
+    view = wait_until(session, said(lambda s: s.edit_state.picture is not None), "its picture")
+    picture = view.studio.edit_state.picture
     assert picture.rgb.shape == (new.height, new.width, 3) and picture.rgb.std() > 5
     assert [c.key[1] for c in view.studio.cameras] == ["base_camera", "render_camera"], "it is there already"
     studio.place(BASE, replace(there(session, BASE), fov=0.9))
-    studio.file.plan(Wish("edit", BASE))
-    other = said(lambda s: (s.writing.what, s.writing.stage) == ("edit", "planned"))
+    studio.file.plan(EditRequest("edit", BASE))
+    other = said(lambda s: (s.edit_state.what, s.edit_state.stage) == ("edit", "planned"))
     view = wait_until(session, other, "the other plan")
-    assert view.studio.writing.message.startswith("side was not added. This changes base_camera in")
-    assert view.studio.writing.picture is None
+    assert view.studio.edit_state.message.startswith("side was not added. This changes base_camera in")
+    assert view.studio.edit_state.picture is None
     studio.back_to_file(BASE)
     studio.file.drop_plan()
 
@@ -143,23 +143,25 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     studio, texts = session.studio, [task_file.read_text()]
     for fov in (0.9, 0.95):
         studio.place(BASE, replace(there(session, BASE), fov=fov))
-        studio.file.plan(Wish("edit", BASE))
+        studio.file.plan(EditRequest("edit", BASE))
         written(session)
         texts.append(task_file.read_text())
-    studio.file.plan(Wish("remove", BASE))
+    studio.file.plan(EditRequest("remove", BASE))
     planned(session)
     studio.file.drop_plan()
     for wanted in (texts[1], texts[0]):
-        wait_until(session, said(lambda s: s.writing.stage == "checked"), "the change that can be taken back")
+        wait_until(
+            session, said(lambda s: s.edit_state.stage == "checked"), "the change that can be taken back"
+        )
         studio.file.undo_write()
         wait_until(
             session,
-            said(lambda s: s.writing.stage == "undone" and not s.writing.loading),
+            said(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
             "the file of before",
         )
         assert task_file.read_text() == wanted
         studio.file.drop_plan()
-    wait_until(session, said(lambda s: s.writing.stage == "none"), "nothing left")
+    wait_until(session, said(lambda s: s.edit_state.stage == "none"), "nothing left")
     studio.back_to_file(BASE)
 
 
@@ -168,7 +170,9 @@ def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Sessi
     elsewhere = CallSite("/site-packages/robots/wristcam.py", 20, "WristCam._sensor_configs")
     info = replace(camera(session, BASE).info, site=elsewhere, mount="panda/camera_link")
     for task in (view.task, replace(view.task, source_files=())):
-        found = plan(task, info, Wish("edit", BASE, replace(there(session, BASE), fov=0.9)), asking(session))
+        found = plan(
+            task, info, EditRequest("edit", BASE, replace(there(session, BASE), fov=0.9)), asking(session)
+        )
         assert found.stage == "refused" and not found.can_copy and "wristcam.py, line 20" in found.message
         assert 'mount=self.robot.links_map["camera_link"],' in found.snippet
 
@@ -203,19 +207,21 @@ class Inherits(PushCubeEnv):
         wanted = replace(info.settings, position=(0.4, 0.1, 0.9), fov=1.2)
 
         # A class with such a hook of its own is told whose the camera is, and gets the text for it.
-        refused = plan(replace(before, class_name="Far"), info, Wish("edit", BASE, wanted), asking(session))
+        refused = plan(
+            replace(before, class_name="Far"), info, EditRequest("edit", BASE, wanted), asking(session)
+        )
         assert refused.stage == "refused" and "base_camera is made by PushCubeEnv" in refused.message
         assert "the _default_sensor_configs of Far (task.py) returns it" in refused.message
         assert refused.snippet.startswith("CameraConfig(")
         # An installed task is not written: the whole hook is there to be copied.
         installed = replace(before, source_files=(), file="/site-packages/their_task.py")
-        refused = plan(installed, info, Wish("edit", BASE, wanted), asking(session))
+        refused = plan(installed, info, EditRequest("edit", BASE, wanted), asking(session))
         assert refused.stage == "refused" and "it is made by PushCubeEnv" in refused.message
         assert "def _default_sensor_configs(self):" in refused.snippet
         assert 'cameras["base_camera"] = CameraConfig(' in refused.snippet
 
         session.studio.place(BASE, wanted)
-        session.studio.file.plan(Wish("edit", BASE))
+        session.studio.file.plan(EditRequest("edit", BASE))
         notes = planned(session).edit.notes
         assert "base_camera is made by PushCubeEnv, from which Inherits inherits" in notes[0]
         assert written(session).message == "base_camera is written to task.py, and the new env has it."
@@ -226,7 +232,10 @@ class Inherits(PushCubeEnv):
         }
         # From now on it is the task's own, and changed where it stands.
         again = plan(
-            task, camera(session, BASE).info, Wish("edit", BASE, replace(wanted, fov=0.8)), asking(session)
+            task,
+            camera(session, BASE).info,
+            EditRequest("edit", BASE, replace(wanted, fov=0.8)),
+            asking(session),
         )
         assert again.stage == "planned" and again.edit.diff.count("\n+ ") == 1, again.message
     finally:
@@ -239,13 +248,13 @@ class Inherits(PushCubeEnv):
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.9))
-    studio.file.plan(Wish("edit", BASE))
+    studio.file.plan(EditRequest("edit", BASE))
     written(session)
     edited = task_file.read_text() + "# more\n"
     task_file.write_text(edited)
     studio.file.undo_write()
-    view = wait_until(session, said(lambda s: s.writing.message.startswith("Not done")), "why not")
-    assert "was edited since" in view.studio.writing.message and view.studio.writing.stage == "checked"
+    view = wait_until(session, said(lambda s: s.edit_state.message.startswith("Not done")), "why not")
+    assert "was edited since" in view.studio.edit_state.message and view.studio.edit_state.stage == "checked"
     assert task_file.read_text() == edited
     studio.file.drop_plan()
     task_file.write_text(before)
@@ -257,7 +266,7 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.7))
-    studio.file.plan(Wish("edit", BASE))
+    studio.file.plan(EditRequest("edit", BASE))
     message = written(session, "mismatch").message
     assert (
         "base_camera is not what was written (fov: 0.8, not 0.7)" in message
@@ -266,7 +275,9 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
     assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
     studio.file.undo_write()
     wait_until(
-        session, said(lambda s: s.writing.stage == "undone" and not s.writing.loading), "the file of before"
+        session,
+        said(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
+        "the file of before",
     )
     assert task_file.read_text() == before
     studio.back_to_file(BASE)
@@ -281,9 +292,9 @@ def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_
 ) -> None:
     before = task_file.read_text()
     session.studio.place(BASE, replace(there(session, BASE), fov=fov))
-    session.studio.file.plan(Wish("edit", BASE))
-    view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
-    assert why in view.studio.writing.message and f"fov={fov}" in view.studio.writing.snippet
+    session.studio.file.plan(EditRequest("edit", BASE))
+    view = wait_until(session, said(lambda s: s.edit_state.stage == "refused"), "the refusal")
+    assert why in view.studio.edit_state.message and f"fov={fov}" in view.studio.edit_state.snippet
     assert task_file.read_text() == before and there(session, BASE).fov == 1.0
     session.studio.file.drop_plan()
     session.studio.back_to_file(BASE)
@@ -307,7 +318,7 @@ def test_what_the_constructor_sets_is_edited_there_and_the_batch_stands_as_it_st
     step = view.step
     wanted = replace(there(session, BASE), position=(0.45, 0.1, 0.7))
     session.studio.place(BASE, wanted)
-    session.studio.file.plan(Wish("edit", BASE))
+    session.studio.file.plan(EditRequest("edit", BASE))
     planned(session)
     assert session.view().step is step, "asking moved the batch"
     assert written(session).message.startswith("base_camera is written")
@@ -324,15 +335,15 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.4))
-    studio.file.plan(Wish("edit", BASE))
+    studio.file.plan(EditRequest("edit", BASE))
     planned(session)
     studio.file.write()
-    view = wait_until(session, said(lambda s: "does not load" in s.writing.message), "the failure")
-    assert "take it back if that is the reason" in view.studio.writing.message
+    view = wait_until(session, said(lambda s: "does not load" in s.edit_state.message), "the failure")
+    assert "take it back if that is the reason" in view.studio.edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
     studio.file.undo_write()
-    wait_until(session, lambda v: v.problem is None and v.studio.writing.stage == "undone", "it back")
+    wait_until(session, lambda v: v.problem is None and v.studio.edit_state.stage == "undone", "it back")
     assert task_file.read_text() == before
 
 
@@ -340,11 +351,11 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
     session: Session, task_file: Path, tmp_path: Path
 ) -> None:
     task = session.view().task
-    wish = Wish("add", ("human", "side"), there(session, ("human", "render_camera")))
-    assert not plan(task, None, wish, asking(session)).can_copy, "it can be edited where it is"
+    request = EditRequest("add", ("human", "side"), there(session, ("human", "render_camera")))
+    assert not plan(task, None, request, asking(session)).can_copy, "it can be edited where it is"
     task_file.chmod(0o444)
     try:
-        refused = plan(task, None, wish, asking(session))
+        refused = plan(task, None, request, asking(session))
         assert refused.can_copy and "is read-only" in refused.message
         file, told = copy(task, tmp_path)
         assert file == tmp_path / task_file.name and "MyWorkbenchPushCube-v1" in told.message
@@ -352,7 +363,7 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
         helper = tmp_path / "helper.py"
         helper.touch()
         with_helper = replace(task, source_files=(*task.source_files, str(helper)))
-        assert not plan(with_helper, None, wish, asking(session)).can_copy
+        assert not plan(with_helper, None, request, asking(session)).can_copy
         file, told = copy(replace(task, file=str(tmp_path / "gone.py")), tmp_path)
         assert file is None and told.message.startswith("Not copied: gone.py cannot be read")
     finally:
@@ -364,16 +375,16 @@ def test_what_was_not_done_is_said_until_something_else_happens(session: Session
     edit = SourceEdit("/author/task.py", "a = 1\n", "a = 2\n", (), None)
     for stage in ("written", "undone"):
         asker = session.studio.file._asker
-        writing = StudioFile(
+        edit_state = FileEdits(
             StudioCameras(), lambda: None, lambda *_: None, asker, lambda: None, session.past.shown_moment
         )
         message = "Not done: task.py was edited since the camera was written into it."
-        writing.view = Writing(stage, Wish("edit", key, None), edit, "", message, loading=True)
-        writing.failed_to_load()
-        assert "does not load" in writing.view.message and "Not done" not in writing.view.message
-        html = writing_html(writing.view, stale=False)
+        edit_state.view = EditState(stage, EditRequest("edit", key, None), edit, "", message, loading=True)
+        edit_state.failed_to_load()
+        assert "does not load" in edit_state.view.message and "Not done" not in edit_state.view.message
+        html = edit_html(edit_state.view, stale=False)
         assert "edited since" not in html and "does not load" in html
-        writing.close()
+        edit_state.close()
 
 
 def test_what_is_not_as_written_is_said_with_both_numbers() -> None:
@@ -381,8 +392,8 @@ def test_what_is_not_as_written_is_said_with_both_numbers() -> None:
     other = CameraSettings(
         (0, 0, 2), (0, 1, 0, 0), None, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), 65, 49, 0.02, 9.0, "rt"
     )
-    assert not_as_written(wanted, wanted) == ""
-    assert not_as_written(wanted, other).split("; ") == [
+    assert difference_text(wanted, wanted) == ""
+    assert difference_text(wanted, other).split("; ") == [
         "position: (0, 0, 2), not (0, 0, 1)",
         "orientation: (0, 1, 0, 0), not (1, 0, 0, 0)",
         "fov: None, not 0.5",

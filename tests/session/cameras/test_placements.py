@@ -27,12 +27,12 @@ def opened(*said: CameraSettings, mount: str | None = None) -> StudioCameras:
         cameras.task = description(geometry, (info,))
         cameras.placements.loaded({KEY: settings})
         cameras.drawn = step_of(poses), 1
-        cameras.all_as_shown()
+        cameras.all_cameras()
     return cameras
 
 
 def shown(cameras: StudioCameras) -> StudioCamera:
-    (found,) = cameras.all_as_shown()
+    (found,) = cameras.all_cameras()
     return found
 
 
@@ -70,7 +70,7 @@ def test_how_far_one_looks_that_was_not_moved_is_set_too_and_is_no_placement() -
     assert not cameras.placements.place(KEY, replace(FILE, distance=0.2))
     found = shown(cameras)
     assert found.now is not None and found.now.distance == 0.2
-    assert not found.moved and cameras.placements.undo_words is None
+    assert not found.moved and cameras.placements.undo_label is None
 
 
 def test_without_a_target_in_the_file_it_looks_at_the_ground_and_moved_it_goes_on_to_look_so_far() -> None:
@@ -153,11 +153,11 @@ def test_what_was_taken_back_can_be_made_again_until_something_else_is_done() ->
     placements = opened(FILE).placements
     moved, other = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
     assert placements.undo() is None and placements.redo() is None
-    assert (placements.undo_words, placements.redo_words) == (None, None)
+    assert (placements.undo_label, placements.redo_label) == (None, None)
     placements.place(KEY, moved)
-    assert (placements.undo_words, placements.redo_words) == ("moved base_camera", None)
+    assert (placements.undo_label, placements.redo_label) == ("moved base_camera", None)
     placements.undo()
-    assert (placements.undo_words, placements.redo_words) == (None, "moved base_camera")
+    assert (placements.undo_label, placements.redo_label) == (None, "moved base_camera")
     placements.place(KEY, other)
     assert placements.redo() is None and placements.now(KEY) == other
 
@@ -165,13 +165,13 @@ def test_what_was_taken_back_can_be_made_again_until_something_else_is_done() ->
 def test_a_placement_that_is_out_of_the_file_again_is_a_step_of_undo_and_one_made_since_stays() -> None:
     written, since = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
     placements = opened(FILE, written, FILE).placements
-    assert placements.taken_back(KEY, written, FILE) and placements.now(KEY) == FILE
-    assert placements.undo_words == "took back the change of base_camera"
+    assert placements.edit_undone(KEY, written, FILE) and placements.now(KEY) == FILE
+    assert placements.undo_label == "took back the change of base_camera"
     placements.undo()
     assert placements.now(KEY) == written
     placements.place(KEY, since)
-    assert not placements.taken_back(KEY, written, FILE)
-    assert placements.now(KEY) == since and placements.undo_words == "moved base_camera"
+    assert not placements.edit_undone(KEY, written, FILE)
+    assert placements.now(KEY) == since and placements.undo_label == "moved base_camera"
 
 
 def test_a_camera_that_there_is_not_cannot_be_exported() -> None:

@@ -17,8 +17,8 @@ from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.core.cameras.conventions import target_of
 from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.file_edits import StudioFile
-from workbench.session.cameras.view import StudioView, Wish
+from workbench.session.cameras.file_edits import FileEdits
+from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
@@ -53,12 +53,14 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
         wait_until(session, lambda view: view.task is not None, "the first load")
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
-        session.studio.file.plan(Wish("edit", BASE))
-        refused = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
+        session.studio.file.plan(EditRequest("edit", BASE))
+        refused = wait_until(session, said(lambda s: s.edit_state.stage == "refused"), "the refusal")
         session.studio.file.copy_task()
-        planned = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
+        planned = wait_until(session, said(lambda s: s.edit_state.stage == "planned"), "the plan in the copy")
         session.studio.file.write()
-        ended = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+        ended = wait_until(
+            session, said(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
+        )
         session.studio.file.drop_plan()
         yield session, Copied(folder, refused, planned, ended)
     finally:
@@ -110,7 +112,7 @@ def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_
 ) -> None:
     start = camera(session, BASE).now
     for k in range(30):
-        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), hand=1)
+        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), control=1)
     rest = replace(start, position=(0.29, 0.0, 0.8))
     view = wait_until(session, seen_from(BASE, rest), "the picture from there")
     assert moved(view) == {BASE} and view.studio.undo == "moved base_camera"
@@ -144,19 +146,21 @@ def test_size_and_lens_change_the_live_camera_and_the_observation(session: Sessi
 
 def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
     start = camera(session, BASE).now
-    session.studio.set_quick_scale(0.25)
+    session.studio.set_preview_scale(0.25)
     there = replace(start, position=(0.31, 0.02, 0.55))
     session.studio.place(BASE, there)
 
     def looked(view: SessionView) -> bool:
-        session.studio.look()  # as the page does
-        picture = view.studio.quick
+        session.studio.draw_preview()  # as the page does
+        picture = view.studio.preview
         return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
 
     view = wait_until(session, looked, "the look from there")
     size = (start.width, start.height)
-    assert view.studio.quick.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.quick.rgb.std() > 5
-    depth, bodies = view.studio.quick.depth, view.studio.quick.segmentation
+    assert (
+        view.studio.preview.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.preview.rgb.std() > 5
+    )
+    depth, bodies = view.studio.preview.depth, view.studio.preview.segmentation
     assert depth is not None and bodies is not None
     assert (
         depth.shape == bodies.shape == (size[1] // 4, size[0] // 4)
@@ -164,9 +168,9 @@ def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alon
         and np.ptp(bodies) > 0
     )
     assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
-    session.studio.set_quick_scale(1.0)
+    session.studio.set_preview_scale(1.0)
     view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
-    assert view.studio.quick is None
+    assert view.studio.preview is None
 
 
 def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
@@ -206,24 +210,26 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     task_file.write_bytes(before)
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
-    studio.file.plan(Wish("edit", BASE))
-    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
-    assert view.studio.writing.stage == "planned", view.studio.writing.message
-    assert task_file.read_bytes() == before and "+" in view.studio.writing.edit.diff
+    studio.file.plan(EditRequest("edit", BASE))
+    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
+    assert task_file.read_bytes() == before and "+" in view.studio.edit_state.edit.diff
     studio.file.write()
-    view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
-    assert view.studio.writing.stage == "checked", view.studio.writing.message
+    view = wait_until(session, said(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check")
+    assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
-    assert now.now == now.info.settings and not differences(now.now, view.studio.writing.edit.settings)
-    assert task_file.read_bytes() == view.studio.writing.edit.new_text.encode()
+    assert now.now == now.info.settings and not differences(now.now, view.studio.edit_state.edit.settings)
+    assert task_file.read_bytes() == view.studio.edit_state.edit.new_text.encode()
     studio.file.undo_write()
-    view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    view = wait_until(
+        session, said(lambda s: "as it was before." in s.edit_state.message), "the file of before"
+    )
     assert task_file.read_bytes() == before
     task_file.write_bytes(saved)
     # Taken back is the placement too, and one step of undo brings it again.
     assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
-    assert view.studio.writing.message.endswith(
+    assert view.studio.edit_state.message.endswith(
         "base_camera stands as it says; Undo puts it where you placed it."
     )
     wait_until(session, seen_from(BASE, start), "the camera where the file has it")
@@ -240,7 +246,7 @@ def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_mad
     (hook,) = (line for line in good.splitlines(keepends=True) if "def _default_sensor_configs(" in line)
     asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
     studio = session.studio
-    file = StudioFile(
+    file = FileEdits(
         studio._cameras,
         lambda: None,
         lambda *_: None,
@@ -254,12 +260,12 @@ def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_mad
         wait_until(session, lambda v: asks in v.task.source[str(task_file)], "the version with it")
         studio.place(BASE, replace(camera(session, BASE).now, fov=1.2))
         waits.touch()
-        file.plan(Wish("edit", BASE))
+        file.plan(EditRequest("edit", BASE))
         until(lambda: file.view.stage == "refused", "the end of waiting")
         assert "the task did not answer" in file.view.message
         waits.unlink()
-        studio.file.plan(Wish("edit", BASE))
-        wait_until(session, said(lambda v: v.writing.stage == "planned"), "the plan of who waits longer")
+        studio.file.plan(EditRequest("edit", BASE))
+        wait_until(session, said(lambda v: v.edit_state.stage == "planned"), "the plan of who waits longer")
         studio.file.drop_plan()
     finally:
         waits.unlink(missing_ok=True)
@@ -274,13 +280,13 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio, before = session.studio, task_file.read_text()
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
     studio.place(BASE, there)
-    studio.file.plan(Wish("remove", BASE))
-    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
-    assert view.studio.writing.stage == "planned", view.studio.writing.message
+    studio.file.plan(EditRequest("remove", BASE))
+    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
     studio.file.write()
-    wait_until(session, said(lambda s: s.writing.stage == "checked"), "the version without it")
+    wait_until(session, said(lambda s: s.edit_state.stage == "checked"), "the version without it")
     studio.file.undo_write()
-    wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    wait_until(session, said(lambda s: "as it was before." in s.edit_state.message), "the file of before")
     assert task_file.read_text() == before
     assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
     wait_until(session, seen_from(BASE, there), "the camera where it was placed")
@@ -321,12 +327,12 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
 
 def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
     session.studio.reports.measure()
-    report = settled(session, lambda s: s.looked.report_of == BASE, "the judgement").looked.report
+    report = settled(session, lambda s: s.results.report_of == BASE, "the judgement").results.report
     assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
     session.studio.reports.make_sheet()
-    sheet = settled(session, lambda s: len(s.looked.sheet) == 2, "the pictures of all envs").looked.sheet
+    sheet = settled(session, lambda s: len(s.results.sheet) == 2, "the pictures of all envs").results.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
     # Turned to the sky.
     start = camera(session, BASE).now
@@ -334,10 +340,12 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     session.studio.place(BASE, away)
     assert session.view().studio.report_stale
     session.studio.reports.measure()
-    studio = settled(session, lambda s: s.looked.report is not report, "the judgement of the placement")
-    assert studio.looked.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
+    studio = settled(session, lambda s: s.results.report is not report, "the judgement of the placement")
+    assert (
+        studio.results.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
+    )
     session.studio.reports.compare(start)
-    pair = settled(session, lambda s: s.looked.compared is not None, "the comparison").looked.compared
+    pair = settled(session, lambda s: s.results.compared is not None, "the comparison").results.compared
     assert pair is not None
     here, there = pair
     assert np.allclose(here.pose[3:], away.quaternion) and np.allclose(there.pose[3:], start.quaternion)
@@ -348,15 +356,17 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     start_over(session, 0)
     step(session, 4)
     session.studio.reports.measure_steps()
-    studio = settled(session, lambda s: len(s.looked.report_moments) == 5, "five moments")
-    assert [moment.step for moment in studio.looked.report_moments] == [0, 1, 2, 3, 4]
-    assert {moment.env for moment in studio.looked.report_moments} == {0} == set(studio.looked.report.envs)
-    (cube,) = studio.looked.report.wanted_objects(("cube",))
+    studio = settled(session, lambda s: len(s.results.report_moments) == 5, "five moments")
+    assert [moment.step for moment in studio.results.report_moments] == [0, 1, 2, 3, 4]
+    assert {moment.env for moment in studio.results.report_moments} == {0} == set(studio.results.report.envs)
+    (cube,) = studio.results.report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.past.seek(studio.looked.report_moments[2].serial)
+    session.past.seek(studio.results.report_moments[2].serial)
     assert session.view().step.elapsed_steps[0] == 2
     session.studio.reports.measure_steps(2)
-    moments = settled(session, lambda s: len(s.looked.report_moments) == 2, "its ends").looked.report_moments
+    moments = settled(
+        session, lambda s: len(s.results.report_moments) == 2, "its ends"
+    ).results.report_moments
     assert [moment.step for moment in moments] == [0, 4], (
         "of the whole episode, also where a moment in it is shown"
     )
@@ -364,7 +374,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
     session.past.seek(None)
     session.studio.reports.measure_steps()
-    settled(session, lambda s: len(s.looked.report_moments) == 1, "the episode that has just begun")
+    settled(session, lambda s: len(s.results.report_moments) == 1, "the episode that has just begun")
 
 
 def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
@@ -375,7 +385,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
     beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
     session.studio.place(BASE, beside)
     session.studio.reports.pick(0.5, 0.5)
-    picked = settled(session, lambda s: s.looked.picked is not None, "the pixel").looked.picked
+    picked = settled(session, lambda s: s.results.picked is not None, "the pixel").results.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
     assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
 
@@ -384,26 +394,28 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     studio = session.studio
     studio.reports.measure(3)
     assert session.view().studio.progress is not None
-    found = settled(session, lambda s: s.looked.report_seeds == 3, "three seeds")
+    found = settled(session, lambda s: s.results.report_seeds == 3, "three seeds")
     assert (
-        len(found.looked.report.envs) == 3 and found.looked.report_of == BASE and not found.looked.measuring
+        len(found.results.report.envs) == 3
+        and found.results.report_of == BASE
+        and not found.results.measuring
     )
     studio.reports.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
-    offered = settled(session, lambda s: len(s.looked.suggestions) > 0, "suggestions").looked.suggestions
+    offered = settled(session, lambda s: len(s.results.suggestions) > 0, "suggestions").results.suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
     studio.take_suggestion(0)
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
     studio.reports.measure(500)
     wait_until(
         session,
-        said(lambda s: s.looked.measuring and s.looked.report is not None),
+        said(lambda s: s.results.measuring and s.results.report is not None),
         "what is known, as from before",
     )
     wait_until(
         session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
     studio.reports.stop()
-    wait_until(session, said(lambda s: s.progress is None and not s.looked.measuring), "its end")
+    wait_until(session, said(lambda s: s.progress is None and not s.results.measuring), "its end")
     studio.reports.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
     wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
 
@@ -454,13 +466,13 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
 ) -> None:
     _, copied = opened
     view = copied.refused
-    assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
+    assert view.studio.edit_state.can_copy and "is installed" in view.studio.edit_state.message
     view, file = copied.planned, copied.folder / "push_cube_2.py"
-    assert view.task.file == str(file) == view.studio.writing.edit.file
+    assert view.task.file == str(file) == view.studio.edit_state.edit.file
     assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
     assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
-    assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This changes")
+    assert view.studio.edit_state.message.startswith(f"This is your copy of the task, {file}. This changes")
     assert moved(view) == {BASE}, "the placement is lost"
     view = copied.ended
-    assert view.studio.writing.stage == "checked", view.studio.writing.message
+    assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
     assert (copied.folder / "push_cube.py").read_text() == "somebody's own"

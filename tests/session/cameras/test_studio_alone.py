@@ -18,10 +18,10 @@ from workbench.core.cameras.report import OfferedPlacement
 from workbench.jobs.pool import Answer
 from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.machine.processes.wire import Call
-from workbench.session.cameras.file_edits import StudioFile
+from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.studio import CameraStudio
-from workbench.session.cameras.view import StudioView, Wish, Writing
+from workbench.session.cameras.view import EditRequest, EditState, StudioView
 from workbench.session.history.history import ShownMoment
 from workbench.session.live.live_state import LiveState, SharedState
 from workbench.session.live.timeline import TimeTravel
@@ -153,8 +153,8 @@ TASK_TEXT = '''from mani_skill.utils.registration import register_env
 class PushEnv:
     """Nothing but a place."""
 '''
-PLANNED = Wish("edit", KEY, FILE)
-ADDED = Wish("add", ("human", "side"), FILE)
+PLANNED = EditRequest("edit", KEY, FILE)
+ADDED = EditRequest("add", ("human", "side"), FILE)
 
 
 class OfAFile:
@@ -172,9 +172,9 @@ class OfAFile:
         self.asked: list[Call] = []
         self.answers = True
         self.asker = Asker(self._hear)
-        self.studio = StudioFile(
+        self.studio = FileEdits(
             self.cameras,
-            self._note,
+            self._notify,
             lambda file, name: self.opened.append((file, name)),
             self.asker,
             lambda: self.load,
@@ -183,7 +183,7 @@ class OfAFile:
         self.studio.folder = folder
         folder.mkdir()
 
-    def _note(self) -> None:
+    def _notify(self) -> None:
         self.notes += 1
 
     def _hear(self, request: Request) -> None:
@@ -202,21 +202,21 @@ class OfAFile:
         until(lambda: self.asked, "the worker being asked")
         return self.asked[0]
 
-    def looks(self, wish: Wish) -> None:
+    def looks(self, request: EditRequest) -> None:
         with self.cameras.lock:
             """It was submitted whole."""
-        self.studio._look(wish, FILE)
+        self.studio._draw_new(request, FILE)
 
-    def writes(self, wish: Wish = PLANNED) -> Writing:
+    def writes(self, request: EditRequest = PLANNED) -> EditState:
         edit = SourceEdit(str(self.file), TASK_TEXT, TASK_TEXT + "\n", (), FILE)
-        self.studio.view = Writing("planned", wish, edit)
+        self.studio.view = EditState("planned", request, edit)
         self.studio.write()
         until(lambda: self.studio.view.stage == "written", "the change in the file")
         assert self.file.read_text() == TASK_TEXT + "\n"
         return self.studio.view
 
     def copies(self, can: bool = True) -> None:
-        self.studio.view = Writing("refused", PLANNED, can_copy=can)
+        self.studio.view = EditState("refused", PLANNED, can_copy=can)
         self.studio.copy_task()
 
 
@@ -238,7 +238,7 @@ def test_what_is_written_or_refused_is_told_to_the_page(written: OfAFile) -> Non
 
 
 def test_that_there_is_no_picture_of_a_camera_to_be_added_is_said(written: OfAFile) -> None:
-    written.studio._later(written.looks, ADDED)
+    written.studio._run_later(written.looks, ADDED)
     until(lambda: written.notes, "the page being told")
     said = "There is no picture of the new camera: nothing can be drawn here."
     assert written.cameras.problem == said and written.studio.view.picture is None
@@ -276,7 +276,7 @@ def test_what_is_asked_for_after_the_end_is_not_begun(written: OfAFile) -> None:
     written.studio.close()
     written.studio.plan(PLANNED)
     written.studio.write()
-    assert written.studio.view == Writing()
+    assert written.studio.view == EditState()
 
 
 def test_the_end_ends_what_waits_for_the_worker_and_waits_until_that_is_told(written: OfAFile) -> None:
@@ -301,7 +301,7 @@ def test_what_is_not_begun_at_the_end_is_left(written: OfAFile) -> None:
     written.waits_for_the_worker()
     written.studio.plan(PLANNED)
     written.studio.close()
-    assert written.studio.view.wish == ADDED
+    assert written.studio.view.request == ADDED
 
 
 def test_what_was_refused_is_planned_in_the_copy_when_that_is_loaded_and_only_once(written: OfAFile) -> None:
@@ -315,20 +315,20 @@ def test_what_was_refused_is_planned_in_the_copy_when_that_is_loaded_and_only_on
             written.cameras.task = replace(written.task, file=file, source_files=(file,))
             studio.plan_in_copy(written.cameras.task)
     until(lambda: studio.view.stage == "refused", "the answer in the copy")
-    assert studio.view.wish == PLANNED
+    assert studio.view.request == PLANNED
     assert studio.view.message.startswith(f"This is your copy of the task, {copy}.")
     until(lambda: written.notes == 3, "the page being told: of the copy, the wish and the answer")
     with written.cameras.lock:
         studio.plan_in_copy(written.cameras.task)
     studio.plan(ADDED)
-    until(lambda: studio.view.wish == ADDED and studio.view.stage == "refused", "the next answer")
+    until(lambda: studio.view.request == ADDED and studio.view.stage == "refused", "the next answer")
     assert written.notes <= 5, "a plan that nobody asked for"
 
 
 def test_a_removed_camera_that_comes_back_stands_where_it_was_placed(written: OfAFile) -> None:
     placed = written.cameras.placements.placed
     placed[KEY] = MOVED
-    written.writes(Wish("remove", KEY, MOVED))
+    written.writes(EditRequest("remove", KEY, MOVED))
     without = replace(written.task, cameras=(), source={str(written.file): TASK_TEXT + "\n"})
     with written.cameras.lock:
         assert written.studio.loaded(without) == {KEY}

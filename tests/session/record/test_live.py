@@ -143,8 +143,8 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
 
     def measured() -> tuple[tuple[int, ...], ObjectSummary]:
         view = wait_until(session, lambda view: view.studio.progress is None, "the judgement")
-        report = view.studio.looked.report
-        assert report is not None and view.studio.looked.report_seeds == 60 and not view.studio.problem
+        report = view.studio.results.report
+        assert report is not None and view.studio.results.report_seeds == 60 and not view.studio.problem
         return report.envs, report.wanted_objects(("cube",))[0].summary()
 
     def search() -> None:
@@ -152,7 +152,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
 
     def found() -> list[tuple[float, CameraSettings]]:
         view = wait_until(session, lambda view: view.studio.progress is None, "the search")
-        return [(offer.score, offer.settings) for offer in view.studio.looked.suggestions]
+        return [(offer.score, offer.settings) for offer in view.studio.results.suggestions]
 
     def is_at_it(view: SessionView) -> bool:
         return view.studio.progress is not None and view.studio.progress.done > 0

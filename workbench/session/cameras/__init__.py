@@ -1,1 +1,1 @@
-"""The camera studio: cameras placed by hand, judged, and written into the file."""
+"""The camera studio: places cameras, measures what they see, and writes them into the file."""

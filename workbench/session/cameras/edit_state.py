@@ -1,12 +1,4 @@
-"""The way of a camera's change into the author's file: planned, shown, written, reloaded, compared, taken back.
-
-What was written is believed only when it was seen: the reload builds the camera anew, and the config that comes out
-is compared number by number with what the edit was to say. A difference is told as the error that it is.
-
-Plans are made of the files as they are on disk at that moment, since that is what is edited; the worker runs them, and
-what comes of the plan, and if they say something else of the camera than the env has, the plan is refused. None of
-this runs on the page's thread, and nothing here is thread-safe.
-"""
+"""Plans a camera's edit of the author's file, and checks the reloaded camera against it."""
 
 from __future__ import annotations
 
@@ -23,7 +15,7 @@ from workbench.authoring.loading.modules import read_exactly
 from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraSettings, differences, setting_text
 from workbench.jobs.task import TaskDescription
-from workbench.session.cameras.view import Change, Wish, Writing
+from workbench.session.cameras.view import Change, EditRequest, EditState
 
 SENTENCES: dict[Change, tuple[str, str, str]] = {
     "edit": ("This changes {old} in {file}.", "{old} is written to {file}, and the new env has it.", ""),
@@ -40,29 +32,33 @@ SENTENCES: dict[Change, tuple[str, str, str]] = {
     ),
     "remove": ("This takes {old} out of {file}.", "{old} is no longer in {file}.", "{old} was not removed."),
 }
-"""Of a change: what it would do, what it did, and what becomes of it when another plan comes in its place."""
+"""By change: what it would do, what it did, and the message when another plan replaces it."""
 PLANNED, DONE, LEFT = range(3)
+"""Index into an entry of `SENTENCES`."""
 
 
-def said(wish: Wish, when: int, file: str = "") -> str:
-    """The sentence of `SENTENCES`."""
-    return SENTENCES[wish.what][when].format(old=wish.key[1], new=wish.result[1], file=file)
+def change_text(request: EditRequest, when: int, file: str = "") -> str:
+    """The sentence of `SENTENCES` about a change."""
+    return SENTENCES[request.what][when].format(old=request.key[1], new=request.result[1], file=file)
 
 
-def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: RunHooks) -> Writing:
-    """The edit that fulfils a wish, or why there is none.
+def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, run: RunHooks) -> EditState:
+    """The edit of the files on disk for a request, or why there is none.
+
+    The worker runs the edited files too; a plan whose camera does not come out as requested is refused. Not thread-safe,
+    and too slow for the page's thread.
 
     Args:
-        info: of the live camera; None where one is added.
+        info: of the live camera; None if one is added.
         run: asks the worker.
     """
-    placed = None if wish.what == "remove" else wish.settings
-    text = "" if placed is None else snippet(wish.result[1], placed)
-    elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
+    placed = None if request.what == "remove" else request.settings
+    text = "" if placed is None else snippet(request.result[1], placed)
+    owner_text = "" if request.what == "add" or info is None else _owner_text(task, info)
     try:
         texts = _texts(task)
-        if elsewhere and info is not None:
-            edit = _made_of_a_parents(task, texts, info, wish, elsewhere, run)
+        if owner_text and info is not None:
+            edit = _override_edit(task, texts, info, request, owner_text, run)
         elif not task.source_files:
             where = "" if task.file is None else f" ({task.file})"
             raise RefusedEdit(
@@ -71,141 +67,152 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: RunHoo
                 text,
             )
         else:
-            edit = _made(task, texts, info, wish, run)
+            edit = _own_edit(task, texts, info, request, run)
         blocked = next(filter(None, (why_not_writable(change.file) for change in edit.changes)), None)
         if blocked is not None:
             raise RefusedEdit(blocked, text)
     except RefusedEdit as refused:
-        can_copy = not elsewhere and _could_be_copied(task)
+        can_copy = not owner_text and _can_be_copied(task)
         ways = (
             " You can copy the text below into the file yourself." if refused.snippet and not can_copy else ""
         )
-        if elsewhere and info is not None and (not task.source_files or _is_a_robots(info)):
+        if owner_text and info is not None and (not task.source_files or _is_robot_camera(info)):
             ways = " The text below is for a class of your own that inherits from it."
         message = f"Not written: {refused.reason}.{ways}"
-        return Writing("refused", wish, None, refused.snippet, message, can_copy)
-    message = f"{said(wish, PLANNED, edit.names)} Nothing is written yet."
-    return Writing("planned", wish, edit, message=message)
+        return EditState("refused", request, None, refused.snippet, message, can_copy)
+    message = f"{change_text(request, PLANNED, edit.names)} Nothing is written yet."
+    return EditState("planned", request, edit, message=message)
 
 
-def _made_elsewhere(task: TaskDescription, info: CameraInfo) -> str:
-    """Why neither the task's file nor a copy of it holds this camera; empty where one of them may."""
+def _owner_text(task: TaskDescription, info: CameraInfo) -> str:
+    """Why neither the task's file nor a copy of it holds this camera; empty if one of them may."""
     own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
     if info.site is None or Path(info.site.file).resolve() in own:
         return ""
     owner = info.site.function.rpartition(".")[0] or "another file"
-    brings = "the robot brings it, by" if _is_a_robots(info) else "it is made by"
+    brings = "the robot brings it, by" if _is_robot_camera(info) else "it is made by"
     return f"{info.name} is not the task's own: {brings} {owner} ({info.site.file}, line {info.site.line})"
 
 
-def _is_a_robots(info: CameraInfo) -> bool:
+def _is_robot_camera(info: CameraInfo) -> bool:
     return info.site is not None and info.site.function.rpartition(".")[2] == "_sensor_configs"
 
 
-def _made_of_a_parents(
-    task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str, run: RunHooks
+def _override_edit(
+    task: TaskDescription,
+    texts: dict[str, str],
+    info: CameraInfo,
+    request: EditRequest,
+    owner_text: str,
+    run: RunHooks,
 ) -> SourceEdit:
-    """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
-    if wish.settings is None or wish.what == "remove":
-        raise RefusedEdit(elsewhere)
-    (kind, _), (_, uid), site = wish.key, wish.result, info.site
+    """Edit that adds a hook to the task's own class to replace an inherited camera; refused with the hook as snippet."""
+    if request.settings is None or request.what == "remove":
+        raise RefusedEdit(owner_text)
+    (kind, _), (_, uid), site = request.key, request.result, info.site
     assert site is not None
     link = (info.mount or "").partition("/")[2]
-    robot = "self.robot" if _is_a_robots(info) else "self.agent.robot"
+    robot = "self.robot" if _is_robot_camera(info) else "self.agent.robot"
     more = [f'mount={robot}.links_map["{link}"]'] if link else []
     if site.function.rpartition(".")[2] not in HOOK_OF.values():
-        raise RefusedEdit(elsewhere, snippet(uid, wish.settings, more=more))
-    whole = members.override_text(kind, uid, wish.settings, more)
-    if wish.what != "edit" or task.file is None or task.file not in texts:
-        raise RefusedEdit(elsewhere, whole)
+        raise RefusedEdit(owner_text, snippet(uid, request.settings, more=more))
+    whole = members.override_text(kind, uid, request.settings, more)
+    if request.what != "edit" or task.file is None or task.file not in texts:
+        raise RefusedEdit(owner_text, whole)
     if info.varies:
         reason = (
-            f"{elsewhere}; the task's own code moves it besides, so one pose in the file would not place it"
+            f"{owner_text}; the task's own code moves it besides, so one pose in the file would not place it"
         )
         raise RefusedEdit(reason, whole)
-    return members.plan_override(texts, task.file, task.class_name, kind, uid, wish.settings, site, run, more)
+    return members.plan_override(
+        texts, task.file, task.class_name, kind, uid, request.settings, site, run, more
+    )
 
 
-def _could_be_copied(task: TaskDescription) -> bool:
-    """Whether the task's file is one that is not to be edited, and is all that the task is made of."""
+def _can_be_copied(task: TaskDescription) -> bool:
+    """Whether the task consists of one file, and that may not be edited."""
     if task.file is None or len(task.source_files) > 1:
         return False
     return not task.source_files or why_not_writable(task.file) is not None
 
 
-def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
-    """Copy the task's file into a folder; the copy, or None, and what is said of it."""
+def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, EditState]:
+    """Copy the task's file into a folder; returns the copy, or None, and the new state."""
     if task.file is None:
-        return None, Writing("refused", message="Not copied: the task has no file.")
+        return None, EditState("refused", message="Not copied: the task has no file.")
     try:
         made = copy_task(Path(task.file), folder)
     except CannotCopy as reason:
-        return None, Writing("refused", message=f"Not copied: {reason}.")
+        return None, EditState("refused", message=f"Not copied: {reason}.")
     named = ", ".join(f"{new} for {old}" for old, new in made.ids)
     ids = f" It registers {named}." if named else ""
-    return made.file, Writing(message=f"The task is copied to {made.file}, which is being opened.{ids}")
+    return made.file, EditState(message=f"The task is copied to {made.file}, which is being opened.{ids}")
 
 
-def _made(
-    task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish, run: RunHooks
+def _own_edit(
+    task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, request: EditRequest, run: RunHooks
 ) -> SourceEdit:
-    kind, uid = wish.key
-    if wish.what == "add":
-        assert wish.settings is not None
+    kind, uid = request.key
+    if request.what == "add":
+        assert request.settings is not None
         file = task.file or task.source_files[0]
-        return members.plan_add(texts, file, task.class_name, wish.key, wish.settings, run)
+        return members.plan_add(texts, file, task.class_name, request.key, request.settings, run)
     if info is None or info.settings is None:
         raise RefusedEdit(f"there is no {kind} camera {uid!r} whose settings are known")
-    if wish.what == "remove":
-        return members.plan_remove(texts, wish.key, run)
-    if wish.what == "rename":
-        return members.plan_rename(texts, wish.key, wish.name, info.settings, run)
-    if wish.what == "duplicate":
-        return members.plan_duplicate(texts, wish.key, wish.name, info.settings, run)
-    assert wish.settings is not None
+    if request.what == "remove":
+        return members.plan_remove(texts, request.key, run)
+    if request.what == "rename":
+        return members.plan_rename(texts, request.key, request.name, info.settings, run)
+    if request.what == "duplicate":
+        return members.plan_duplicate(texts, request.key, request.name, info.settings, run)
+    assert request.settings is not None
     if info.varies:
         raise RefusedEdit(
             f"the task's own code moves {uid!r} (it is randomised, or moved after it was made), so one pose in the "
             "file would not place it",
-            snippet(uid, wish.settings),
+            snippet(uid, request.settings),
         )
-    return plan_edit(texts, wish.key, info.settings, wish.settings, run)
+    return plan_edit(texts, request.key, info.settings, request.settings, run)
 
 
 def _texts(task: TaskDescription) -> dict[str, str]:
-    """The author's files as they are on disk, with the line ends that they have. Raises RefusedEditEdit."""
+    """The author's files on disk, with their own line ends. Raises RefusedEdit."""
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
             texts[path] = read_exactly(path)[1]
         except (OSError, SyntaxError) as error:
-            said = error.msg if isinstance(error, SyntaxError) else error.strerror
-            raise RefusedEdit(f"{path} cannot be read: {said}") from error
+            reason = error.msg if isinstance(error, SyntaxError) else error.strerror
+            raise RefusedEdit(f"{path} cannot be read: {reason}") from error
     return texts
 
 
-def was_before(edit: SourceEdit) -> str:
+def restored_text(edit: SourceEdit) -> str:
     return "is as it was" if len(edit.changes) == 1 else "are as they were"
 
 
-def mismatch(wish: Wish, infos: Mapping[CameraKey, CameraInfo], wanted: CameraSettings | None) -> str:
-    kind, name = wish.result
-    info = infos.get(wish.result)
-    if wish.what == "remove":
+def mismatch(
+    request: EditRequest, infos: Mapping[CameraKey, CameraInfo], wanted: CameraSettings | None
+) -> str:
+    """How the cameras of the reloaded env differ from the request; empty if they do not. The reload builds the camera from
+    the file, so only this proves that the edit is right."""
+    kind, name = request.result
+    info = infos.get(request.result)
+    if request.what == "remove":
         return f"The new env still has the {kind} camera {name}." if info is not None else ""
     if info is None or info.settings is None:
         return f"The new env has no {kind} camera {name}."
-    if wish.what == "rename" and wish.key in infos:
-        return f"The new env still has the {kind} camera {wish.key[1]}."
-    numbers = "" if wanted is None else not_as_written(wanted, info.settings)
+    if request.what == "rename" and request.key in infos:
+        return f"The new env still has the {kind} camera {request.key[1]}."
+    numbers = "" if wanted is None else difference_text(wanted, info.settings)
     return f"The new env's {name} is not what was written ({numbers})." if numbers else ""
 
 
-def not_as_written(wanted: CameraSettings, now: CameraSettings) -> str:
-    """The numbers that are not as wanted, with both; empty where all are."""
+def difference_text(wanted: CameraSettings, now: CameraSettings) -> str:
+    """The settings that differ, with both values; empty if none does."""
 
-    def said(settings: CameraSettings, what: str) -> str:
+    def value(settings: CameraSettings, what: str) -> str:
         return setting_text(vars(settings)["quaternion" if what == "orientation" else what])
 
-    apart = differences(wanted, now)
-    return "; ".join(f"{what}: {said(now, what)}, not {said(wanted, what)}" for what in apart)
+    differing = differences(wanted, now)
+    return "; ".join(f"{what}: {value(now, what)}, not {value(wanted, what)}" for what in differing)

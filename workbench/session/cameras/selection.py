@@ -1,13 +1,4 @@
-"""The cameras of the version that runs, how each of them is placed, and which one the page works on.
-
-It is what placing, judging and writing have in common: each asks here for a camera by its key, and whether it can be
-placed at all. Not thread-safe: whoever asks holds `lock`.
-
-What was placed by hand can be undone and made again. A step keeps the whole settings of one camera before and after, so
-it can be taken back whatever happened to the file meanwhile. What belongs to one gesture, the hundred positions of a
-drag, is one step. When a version comes in, what was placed and not written stays, except where the file says something
-new of that very camera: the author wrote that, so it counts, and the placement is one step of undo away.
-"""
+"""Cameras of the running version, their placements with undo, and the selected one."""
 
 from __future__ import annotations
 
@@ -29,85 +20,91 @@ from workbench.session.cameras.view import StudioCamera
 
 _MOST_STEPS = 500
 NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
-"""Metres in front of the eye at which the target of a camera is put that has none yet."""
+"""Metres in front of the eye: limits and default of the target of a camera without one."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One change of one camera."""
+    """One undoable change of one camera."""
 
     key: CameraKey
     before: CameraSettings
     after: CameraSettings
-    words: str
-    hand: object = None
-    """What made it."""
+    label: str
+    """Text such as ``moved base_camera``."""
+    control: object = None
+    """Id of the control that made it."""
     at: float = 0.0
-    """Seconds, of `time.monotonic`."""
+    """Seconds of `time.monotonic`."""
 
 
 class Placements:
-    """See the module's text."""
+    """Placements of cameras, with undo and redo.
+
+    A step holds a camera's whole settings before and after, so it can be undone even if the file changed since. A gesture
+    (a drag has a hundred positions) is one step. A new version keeps unwritten placements, except of cameras whose
+    settings changed in the file: the author wrote these, so they count, and Undo brings the placement back.
+    """
 
     def __init__(self) -> None:
-        self.said: dict[CameraKey, CameraSettings] = {}
-        """What the loaded version says."""
+        self.in_file: dict[CameraKey, CameraSettings] = {}
+        """Settings of the loaded version."""
         self.placed: dict[CameraKey, CameraSettings] = {}
-        """How cameras stand that were placed otherwise; what is put or taken here is no step of undo."""
+        """Settings of cameras that differ from the file; a direct change of this dict is no step of undo."""
         self._done: list[Step] = []
         self._undone: list[Step] = []
 
     def now(self, key: CameraKey) -> CameraSettings | None:
-        """None for a camera that there is not, or whose config cannot be said in settings."""
-        return self.placed.get(key, self.said.get(key))
+        """A camera's present settings; None if it is missing, or settings cannot describe its config."""
+        return self.placed.get(key, self.in_file.get(key))
 
     @property
-    def undo_words(self) -> str | None:
-        return self._done[-1].words if self._done else None
+    def undo_label(self) -> str | None:
+        return self._done[-1].label if self._done else None
 
     @property
-    def redo_words(self) -> str | None:
-        return self._undone[-1].words if self._undone else None
+    def redo_label(self) -> str | None:
+        return self._undone[-1].label if self._undone else None
 
     def place(
         self,
         key: CameraKey,
         settings: CameraSettings,
-        hand: object = None,
+        control: object = None,
         pause: float = math.inf,
-        words: str = "",
+        label: str = "",
     ) -> bool:
-        """False if there is no such camera, or it stands so already; `hand` and `pause` as in `CameraStudio.place`."""
+        """Place a camera; `control` and `pause` as in `CameraStudio.place`. False if it is missing or nothing changes."""
         before, now = self.now(key), time.monotonic()
         if before is None:
             return False
         last = self._done[-1] if self._done and self._done[-1].key == key else None
         if not differences(before, settings):
-            # How far it looks is no step of its own.
-            aimed = self.aim(key, settings.distance)
+            # The distance of the target is no step of its own.
+            aimed = self.set_distance(key, settings.distance)
             if last is not None:
                 self._done[-1] = replace(last, after=aimed)
             return False
-        if last is not None and hand is not None and last.hand == hand and now - last.at <= pause:
+        if last is not None and control is not None and last.control == control and now - last.at <= pause:
             before = last.before
             self._done.pop()
-        words = words or _in_words(key, before, settings)
-        self._note(Step(key, before, settings, words, hand, now))
+        label = label or _step_label(key, before, settings)
+        self._add_step(Step(key, before, settings, label, control, now))
         self._put(key, settings)
         return True
 
-    def aim(self, key: CameraKey, distance: float | None) -> CameraSettings:
-        """A camera as it is now, looking so far."""
-        held = self.placed if key in self.placed else self.said
+    def set_distance(self, key: CameraKey, distance: float | None) -> CameraSettings:
+        """Set the distance of a camera's target in metres; returns the new settings."""
+        held = self.placed if key in self.placed else self.in_file
         held[key] = replace(held[key], distance=distance)
         return held[key]
 
-    def _note(self, step: Step) -> None:
+    def _add_step(self, step: Step) -> None:
         self._done = [*self._done[-_MOST_STEPS + 1 :], step]
         self._undone.clear()
 
     def undo(self) -> Step | None:
-        """The step that was taken back."""
+        """Undo a step; returns it, or None if there is none."""
         if not self._done:
             return None
         step = self._done.pop()
@@ -116,15 +113,16 @@ class Placements:
         return step
 
     def redo(self) -> Step | None:
+        """Redo a step; returns it, or None if there is none."""
         if not self._undone:
             return None
         step = self._undone.pop()
-        self._done.append(replace(step, hand=None))
+        self._done.append(replace(step, control=None))
         self._put(step.key, step.after)
         return step
 
     def refused(self, key: CameraKey) -> None:
-        """It could not be placed so: it is as it was before that."""
+        """The worker refused the camera's newest placement: restore the one before."""
         last = self._done[-1] if self._done else None
         if last is not None and last.key == key:
             self._done.pop()
@@ -132,70 +130,71 @@ class Placements:
         else:
             self.placed.pop(key, None)
 
-    def taken_back(self, key: CameraKey, written: CameraSettings, said: CameraSettings) -> bool:
-        """The file says again what it said before a placement was written to it: the camera stands as that says, and
-        the placement is one step of undo away. False, and nothing is done, if it was placed elsewhere since.
+    def edit_undone(self, key: CameraKey, written: CameraSettings, in_file: CameraSettings) -> bool:
+        """A placement was written to the file and taken out again: use the file's settings, and let Undo bring the
+        placement back. False, without a change, if the camera was placed elsewhere since.
 
         Args:
-            written: what was taken out of the file.
-            said: what it says now.
+            written: the settings that were taken out of the file.
+            in_file: the file's settings now.
         """
         placed = self.placed.get(key)
         if placed is not None and differences(placed, written):
             return False
         self.placed.pop(key, None)
-        if differences(written, said):
-            self._note(Step(key, written, said, f"took back the change of {key[1]}"))
+        if differences(written, in_file):
+            self._add_step(Step(key, written, in_file, f"took back the change of {key[1]}"))
         return True
 
     def rename(self, key: CameraKey, new: CameraKey) -> None:
-        """What is known of one camera is from now on of the other."""
+        """Move a camera's placements and steps to another key."""
         if key in self.placed:
             self.placed[new] = self.placed.pop(key)
-        if key in self.said:
-            self.said[new] = self.said[key]
+        if key in self.in_file:
+            self.in_file[new] = self.in_file[key]
         for steps in (self._done, self._undone):
             steps[:] = [replace(s, key=new) if s.key == key else s for s in steps]
 
     def loaded(
-        self, said: Mapping[CameraKey, CameraSettings], own: frozenset[CameraKey] = frozenset()
+        self, in_file: Mapping[CameraKey, CameraSettings], own: frozenset[CameraKey] = frozenset()
     ) -> tuple[CameraKey, ...]:
-        """A version runs, whose cameras are these.
+        """Take the cameras of a new version.
 
         Args:
-            own: cameras that the studio itself changed in the file: nothing of theirs is dropped.
+            in_file: their settings.
+            own: cameras that the studio itself changed in the file: their placements stay.
 
         Returns:
-            cameras whose placement was dropped, since the file says something new of them.
+            Cameras whose placement was dropped, since the file has new settings.
         """
-        # Where the file names no target, a camera looks as far as it did.
-        far = {key: now.distance for key in said if (now := self.now(key)) is not None}
-        said = {key: s if s.distance else replace(s, distance=far.get(key)) for key, s in said.items()}
-        before, self.said = self.said, dict(said)
+        # A camera without a target in the file keeps its distance.
+        far = {key: now.distance for key in in_file if (now := self.now(key)) is not None}
+        in_file = {key: s if s.distance else replace(s, distance=far.get(key)) for key, s in in_file.items()}
+        before, self.in_file = self.in_file, dict(in_file)
         dropped: list[CameraKey] = []
         for key, placed in list(self.placed.items()):
-            if key not in said:
+            if key not in in_file:
                 del self.placed[key]
-            elif not differences(placed, said[key]):
+            elif not differences(placed, in_file[key]):
                 del self.placed[key]
-            elif key not in own and key in before and differences(before[key], said[key]):
+            elif key not in own and key in before and differences(before[key], in_file[key]):
                 del self.placed[key]
                 dropped.append(key)
-                words = f"took {key[1]} from the file"
-                self._done.append(Step(key, placed, said[key], words))
+                label = f"took {key[1]} from the file"
+                self._done.append(Step(key, placed, in_file[key], label))
         for steps in (self._done, self._undone):
-            steps[:] = [step for step in steps if step.key in said]
+            steps[:] = [step for step in steps if step.key in in_file]
         return tuple(dropped)
 
     def _put(self, key: CameraKey, settings: CameraSettings) -> None:
-        file = self.said.get(key)
+        file = self.in_file.get(key)
         if file is not None and not differences(file, settings):
             self.placed.pop(key, None)
         else:
             self.placed[key] = settings
 
 
-_IN_WORDS = (
+_STEP_LABELS = (
     ({"position"}, "moved {}"),
     ({"orientation"}, "turned {}"),
     ({"position", "orientation"}, "moved and turned {}"),
@@ -204,16 +203,16 @@ _IN_WORDS = (
     ({"width", "height", "intrinsic"}, "changed the size of {}"),
     ({"shader_pack"}, "changed the shader of {}"),
 )
-"""What a step is called of which no more is changed than this."""
+"""Labels of steps that change no more than these settings; the first match counts."""
 
 
-def _in_words(key: CameraKey, before: CameraSettings, after: CameraSettings) -> str:
+def _step_label(key: CameraKey, before: CameraSettings, after: CameraSettings) -> str:
     changed = set(differences(before, after))
-    return next((words for most, words in _IN_WORDS if changed <= most), "changed {}").format(key[1])
+    return next((label for most, label in _STEP_LABELS if changed <= most), "changed {}").format(key[1])
 
 
 def usual_distance(pose: ArrayLike) -> float:
-    """How far before a camera (7,) its target is put: where it looks at the height 0 of its env, if that is near."""
+    """Default distance in metres from a camera's pose (7,) to its target: where its axis meets z = 0, if that is near."""
     p = np.asarray(pose, np.float64)
     forward = axes_of(p[3:])[0]
     distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else USUAL
@@ -221,27 +220,29 @@ def usual_distance(pose: ArrayLike) -> float:
 
 
 class StudioCameras:
+    """The cameras, placements and selection that all parts of the studio share. Callers hold `lock`."""
+
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.task: TaskDescription | None = None
         self.selected: CameraKey | None = None
         self.placements = Placements()
         self.problem = ""
-        """What went wrong last, for the reader."""
+        """Message about the last failure."""
         self.drawn: tuple[StepResult | None, int] = (None, 0)
-        """What was shown last: the step and the selected env."""
+        """The step and the selected env that were shown last."""
 
     def info(self, key: CameraKey) -> CameraInfo | None:
         return None if self.task is None else self.task.camera(key)
 
-    def asked_for(self) -> StudioCamera | None:
-        """The selected camera, if there is one. What went wrong before something was asked of it is over."""
+    def selected_camera(self) -> StudioCamera | None:
+        """The selected camera, if any, for a new request; clears `problem`."""
         info = None if self.selected is None else self.info(self.selected)
         self.problem = ""
-        return None if info is None else self._as_shown(info)
+        return None if info is None else self._studio_camera(info)
 
     def refusal(self, key: CameraKey) -> str | None:
-        """Why a camera cannot be placed; None where it can."""
+        """Why a camera cannot be placed; None if it can."""
         info = self.info(key)
         if info is None:
             return f"there is no {key[0]} camera {key[1]}"
@@ -252,24 +253,24 @@ class StudioCameras:
         return None
 
     def mount_pose(self, info: CameraInfo) -> NDArray[np.float32] | None:
-        """(7,) of the body that a camera rides on, in the env's frame, at the moment that was shown last."""
+        """(7,) pose of the camera's mount in the env's frame, at the moment shown last; None without one."""
         step, env = self.drawn
         if info.mount is None or self.task is None or step is None:
             return None
         names = self.task.geometry.body_names
         if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
-            return None  # another version is coming in
+            return None  # the step is of another version
         return step.poses[env, names.index(info.mount)]
 
-    def all_as_shown(self) -> tuple[StudioCamera, ...]:
-        """For the page, at the moment that was shown last."""
-        return () if self.task is None else tuple(self._as_shown(info) for info in self.task.cameras)
+    def all_cameras(self) -> tuple[StudioCamera, ...]:
+        """All cameras, at the moment shown last."""
+        return () if self.task is None else tuple(self._studio_camera(info) for info in self.task.cameras)
 
-    def _as_shown(self, info: CameraInfo) -> StudioCamera:
+    def _studio_camera(self, info: CameraInfo) -> StudioCamera:
         key, mount = info.key, self.mount_pose(info)
         now = self.placements.now(key)
         if now is not None and now.distance is None and (mount is None) == (info.mount is None):
-            now = self.placements.aim(key, usual_distance(pose_in_env(now, mount)))
+            now = self.placements.set_distance(key, usual_distance(pose_in_env(now, mount)))
         return StudioCamera(
             key=key,
             info=info,
@@ -280,7 +281,7 @@ class StudioCameras:
         )
 
     def to_export(self, key: CameraKey) -> calibration_files.CameraToExport:
-        """Raises ValueError with a sentence where there is no such camera."""
+        """A camera as placed, for export. Raises ValueError if there is none, with a message for the reader."""
         info, now = self.info(key), self.placements.now(key)
         if info is None or now is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} whose settings are known")

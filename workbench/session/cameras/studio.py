@@ -1,18 +1,4 @@
-"""The camera studio: cameras placed by hand, judged over the batch, and written into the author's file.
-
-The page calls the methods here, on any thread; each returns at once. What comes of them is in `StudioView`.
-
-A placement is known in three places: here (with its undo), in the worker's live cameras, and in the end in the
-author's file. What is here counts: after every version that comes in the worker is told again, so that neither a
-reload nor the end of a worker moves a camera. What is in the file counts more, when the author changed it there.
-
-A camera's picture may also be taken for a look only, by a camera beside the env's with the same lens
-(`core.cameras.temporary`): one of 1280 x 720 takes long to draw where there is no GPU, one of 64 x 64 shows a person
-little, and giving the env's camera another size would change the observation that the task and a policy get. And one that
-is about to be added is not there yet, while whether it stands well is seen in its picture alone.
-
-Here is how a camera comes to stand somewhere; what is asked about it there is `reports`, the way into the file `file`.
-"""
+"""The camera studio: places cameras, and holds their reports and file edits."""
 
 from __future__ import annotations
 
@@ -28,23 +14,31 @@ from workbench.core.camera_data import CameraKey, CameraSettings, Picture, diffe
 from workbench.core.cameras.conventions import Convention, Direction, relative_to, with_pose
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
-from workbench.session.cameras.file_edits import StudioFile
+from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.reports import CameraReports
 from workbench.session.cameras.selection import Step, StudioCameras
 from workbench.session.cameras.view import StudioView
-from workbench.session.history.history import Shown
+from workbench.session.history.history import ShownPast
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load, PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.protocol.questions import DrawCamera
 
-IN_A_QUICK_LOOK = ("rgb", "depth", "segmentation")
-Sight = tuple[StepResult | None, DrawCamera]
-"""A moment, and what of it is looked at."""
+PREVIEW_MODALITIES = ("rgb", "depth", "segmentation")
+Previewed = tuple[StepResult | None, DrawCamera]
+"""A step and the question that draws it."""
 
 
 class CameraStudio:
-    """See the module's text."""
+    """Places cameras and previews them. All methods are thread-safe and return at once; `view` has the results.
+
+    A placement is here (with undo), in the worker's live cameras, and at last in the author's file. The one here counts:
+    after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If the author
+    changed the camera in the file, the file counts.
+
+    A preview is drawn by a temporary camera with the same lens (`core.cameras.temporary`): 1280 x 720 takes long without a
+    GPU, 64 x 64 shows little, and another size of the env's camera would change the observation.
+    """
 
     def __init__(
         self,
@@ -52,17 +46,17 @@ class CameraStudio:
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        past: Shown,
+        past: ShownPast,
         load: Callable[[], Load | None],
         open_file: Callable[[Path, str], None],
     ) -> None:
         """
         Args:
-            send, asker: tell and ask the worker that plays.
-            background: asks the other.
-            on_change: called, on any thread, when `view` has something new.
-            past: says which moment the page shows.
-            load: how another worker gets the version that runs; None while there is none.
+            send, asker: send requests to, and ask the worker that plays.
+            background: asks the background process.
+            on_change: called, on any thread, when `view` has changed.
+            past: gives the shown moment.
+            load: returns the running version for another worker; None while there is none.
             open_file: opens a class of another file.
         """
         self._send, self._on_change = send, on_change
@@ -70,120 +64,122 @@ class CameraStudio:
         self._cameras = StudioCameras()
         self._lock = self._cameras.lock
         self._asker = asker
-        self.file = StudioFile(self._cameras, self._note, open_file, asker, load, self._shown)
+        self.file = FileEdits(self._cameras, self._notify, open_file, asker, load, self._shown)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
-        self.reports = CameraReports(self._cameras, asker, background, self._note, past, load)
-        self._looking = JobLane("studio-quick-look", self._note, self._look_failed)
-        self._quick_scale = 1.0
-        self._quick: Picture | None = None
-        self._quick_problem = ""
-        self._looked: Sight | None = None
-        """What was looked at last."""
+        self.reports = CameraReports(self._cameras, asker, background, self._notify, past, load)
+        self._preview_lane = JobLane("studio-quick-look", self._notify, self._preview_failed)
+        self._preview_scale = 1.0
+        self._preview: Picture | None = None
+        self._preview_problem = ""
+        self._previewed: Previewed | None = None
+        """The last preview."""
 
     # --- placing -------------------------------------------------------------------------------------
 
     def select(self, key: CameraKey | None) -> None:
-        """Choose the camera that the page works on."""
+        """Select the camera that the page works on."""
         with self._lock:
             self._cameras.selected = (
                 key if key is None or self._cameras.info(key) is not None else self._cameras.selected
             )
-        self._note()
+        self._notify()
 
     def place(
-        self, key: CameraKey, settings: CameraSettings, hand: object = None, pause: float = math.inf
+        self, key: CameraKey, settings: CameraSettings, control: object = None, pause: float = math.inf
     ) -> None:
-        """Place a camera, live. Of placements faster than the worker only the newest is made.
+        """Place a camera, live. If placements come faster than the worker takes them, only the newest is made.
 
         Args:
-            hand: what places it; calls by the same one, one behind the other, are one step of undo (a drag).
-            pause: seconds after the last of them from which on it is another step.
+            hand: id of the control; successive calls with the same one are one step of undo (a drag).
+            pause: seconds without a call after which a new step begins.
         """
         with self._lock:
             why_not = self._cameras.refusal(key) or why_no_camera(settings)
             self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-            moved = not why_not and self._cameras.placements.place(key, settings, hand, pause)
-        self.ask_for([key] if moved else [])
+            moved = not why_not and self._cameras.placements.place(key, settings, control, pause)
+        self.send_placements([key] if moved else [])
 
     def undo(self) -> None:
-        """Take the last step back."""
+        """Undo the last step."""
         self._step(self._cameras.placements.undo)
 
     def redo(self) -> None:
-        """Make the step again that was taken back last."""
+        """Redo the step that was undone last."""
         self._step(self._cameras.placements.redo)
 
     def _step(self, move: Callable[[], Step | None]) -> None:
         with self._lock:
             step = move()
             self._cameras.problem = ""
-        self.ask_for([] if step is None else [step.key])
+        self.send_placements([] if step is None else [step.key])
 
     def back_to_file(self, key: CameraKey) -> None:
-        """Place a camera as the file says."""
+        """Place a camera as in the file."""
         with self._lock:
-            file = self._cameras.placements.said.get(key)
+            file = self._cameras.placements.in_file.get(key)
             moved = file is not None and self._cameras.placements.place(
-                key, file, words=f"put {key[1]} back to the file"
+                key, file, label=f"put {key[1]} back to the file"
             )
-        self.ask_for([key] if moved else [])
+        self.send_placements([key] if moved else [])
 
     def take_suggestion(self, index: int) -> None:
-        """Place the camera as suggested."""
-        looked = self.reports.looked
-        key = looked.suggestions_of
-        if key is None or not 0 <= index < len(looked.suggestions):
+        """Place the camera as in a suggestion."""
+        results = self.reports.results
+        key = results.suggestions_of
+        if key is None or not 0 <= index < len(results.suggestions):
             return
-        found = looked.suggestions[index].settings
+        found = results.suggestions[index].settings
         with self._lock:
             now = self._cameras.placements.now(key)
         if now is not None:
             self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
 
-    def set_quick_scale(self, scale: float) -> None:
-        """Look through the chosen camera in a picture of so much of its own size; 1 for that itself. Never written."""
+    def set_preview_scale(self, scale: float) -> None:
+        """Show the selected camera at this factor of its own size; 1 for its own picture. Never written to the file."""
         with self._lock:
-            self._quick_scale, self._quick, self._looked = scale, None, None
-        self._note()
+            self._preview_scale, self._preview, self._previewed = scale, None, None
+        self._notify()
 
-    def look(self) -> None:
-        """Take another quick look, if there is something new to be looked at and none is being taken."""
+    def draw_preview(self) -> None:
+        """Draw another preview, if something changed since the last and none is being drawn."""
         with self._lock:
             key, (step, env) = self._cameras.selected, self._cameras.drawn
             now = None if key is None else self._cameras.placements.now(key)
-            if self._quick_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
+            if self._preview_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
                 return
-            question = DrawCamera(key, now, env, IN_A_QUICK_LOOK, scale=self._quick_scale)
-            seen = self._looked is not None and self._looked[0] is step and self._looked[1] == question
-            if seen or self._looking.progress is not None:
+            question = DrawCamera(key, now, env, PREVIEW_MODALITIES, scale=self._preview_scale)
+            seen = (
+                self._previewed is not None and self._previewed[0] is step and self._previewed[1] == question
+            )
+            if seen or self._preview_lane.progress is not None:
                 return
-            self._looked, self._quick_problem = (step, question), ""
+            self._previewed, self._preview_problem = (step, question), ""
 
         question = replace(question, poses=self._shown().of(env))
 
         def work(job: Job) -> None:
             picture = self._asker.ask(job.check, question)
             with self._lock:
-                self._quick = picture
+                self._preview = picture
 
-        self._looking.start("a quick look", work)
+        self._preview_lane.start("a quick look", work)
 
-    def _look_failed(self, job: Job, failure: JobFailed) -> None:
-        """The last picture stays; the next change looks again."""
+    def _preview_failed(self, job: Job, failure: JobFailed) -> None:
+        """The last preview stays; the next change draws again."""
         with self._lock:
-            self._quick_problem = f"The quick look failed: {failure}."
+            self._preview_problem = f"The quick look failed: {failure}."
 
-    # --- in other words --------------------------------------------------------------------------------
+    # --- calibration files -----------------------------------------------------------------------------
 
     def export(self, keys: Sequence[CameraKey], form: Literal["json", "opencv", "ros"]) -> str:
-        """The cameras as they are placed, at the shown moment of the selected env, as the text of a file.
+        """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
 
-        ROS's form is one file a camera: of several, one document after the other.
+        ROS's format has one camera a file; several become YAML documents in one text.
 
         Raises:
-            ValueError: one of them is not there, or cannot be said; a sentence for the reader.
+            ValueError: a camera is missing or cannot be exported; the message is for the reader.
         """
         with self._lock:
             cameras = [self._cameras.to_export(key) for key in keys]
@@ -202,12 +198,12 @@ class CameraStudio:
         convention: Convention | None,
         metres_per_unit: float = 1.0,
     ) -> None:
-        """Place a camera as a calibration says: in the env's frame, or in its mount's if it is mounted.
+        """Place a camera by a calibration: a pose in the env's frame, or in its mount's if it is mounted.
 
-        Our own JSON says itself which pose is which; of anything else the person says it.
+        Our own JSON contains direction and convention; for all else they are arguments.
 
         Raises:
-            ValueError: with a sentence for the reader.
+            ValueError: with a message for the reader.
         """
         with self._lock:
             info, now = self._cameras.info(key), self._cameras.placements.now(key)
@@ -226,53 +222,57 @@ class CameraStudio:
             pose = relative_to(mount, pose)  # ours is of the env's frame
         self.place(key, with_pose(now, pose))
 
-    # --- what the page reads ---------------------------------------------------------------------------
+    # --- reading ---------------------------------------------------------------------------------------
 
     def view(self, step: StepResult | None, env: int) -> StudioView:
-        """
+        """The studio's part of `SessionView`.
+
         Args:
             step: of the shown moment.
             env: the selected one.
         """
-        looked, progress = self.reports.looked, self.reports.progress
+        results, progress = self.reports.results, self.reports.progress
         with self._lock:
             self._cameras.drawn = step, env
-            quick = self._quick
-            measured = None if looked.report_of is None else self._cameras.placements.now(looked.report_of)
-            was = looked.report_settings
-            # Not what is rounded away when it is written.
+            preview = self._preview
+            measured = None if results.report_of is None else self._cameras.placements.now(results.report_of)
+            was = results.report_settings
+            # Rounding when it was written does not count.
             moved = measured is None or was is None or bool(differences(measured, was, close=3e-4))
             return StudioView(
-                cameras=self._cameras.all_as_shown(),
-                looked=looked,
-                report_stale=looked.report is not None and (moved or looked.outdated),
-                quick_scale=self._quick_scale,
-                quick=quick if quick and (quick.key, quick.env) == (self._cameras.selected, env) else None,
+                cameras=self._cameras.all_cameras(),
+                results=results,
+                report_stale=results.report is not None and (moved or results.outdated),
+                preview_scale=self._preview_scale,
+                preview=preview
+                if preview and (preview.key, preview.env) == (self._cameras.selected, env)
+                else None,
                 progress=progress,
                 selected=self._cameras.selected,
-                undo=self._cameras.placements.undo_words,
-                redo=self._cameras.placements.redo_words,
-                writing=self.file.view,
-                problem=self._cameras.problem or looked.problem or self._quick_problem,
+                undo=self._cameras.placements.undo_label,
+                redo=self._cameras.placements.redo_label,
+                edit_state=self.file.view,
+                problem=self._cameras.problem or results.problem or self._preview_problem,
                 serial=self._serial,
             )
 
-    # --- what the session tells ------------------------------------------------------------------------
+    # --- events, from the session ----------------------------------------------------------------------
 
     def loaded(self, task: TaskDescription, level: ReloadLevel | None) -> tuple[CameraKey, ...]:
-        """A version runs, and what was written is compared with it. To be told under the session's lock: calls nobody.
+        """A version runs: update cameras and placements, and compare it with a written edit. Called under the session's
+        lock; sends nothing.
 
         Args:
-            level: how it came in; None for the first.
+            level: of its reload; None for the first version.
 
         Returns:
-            the cameras to `ask_for` then, so that the worker's stand where they are placed.
+            The cameras whose placement has to be sent to the worker, by `send_placements`.
         """
         with self._lock:
             self._cameras.task = task
-            said = {c.key: c.settings for c in task.cameras if c.settings is not None}
+            in_file = {c.key: c.settings for c in task.cameras if c.settings is not None}
             own = self.file.loaded(task)
-            dropped = self._cameras.placements.loaded(said, own)
+            dropped = self._cameras.placements.loaded(in_file, own)
             self.file.plan_in_copy(task)
             self._cameras.problem = ""
             if dropped:
@@ -286,27 +286,27 @@ class CameraStudio:
                 self._cameras.selected = None
             self._serial += 1
             if level not in ("same", "cameras"):
-                self.reports.outdate()
-            # The dropped ones too: their placement may have been on its way while the version came in. And those that
-            # were changed here: taken back, one stands as the file says, which a version that is the same does not tell.
-            asked = (*self._cameras.placements.placed, *dropped, *(own & said.keys()))
-            return tuple(dict.fromkeys(asked))
+                self.reports.mark_outdated()
+            # Dropped ones too: their placement may have been on its way during the load. And edited ones: after an edit
+            # was taken out again the version may count as the same, so the worker's camera would stay where it was.
+            to_send = (*self._cameras.placements.placed, *dropped, *(own & in_file.keys()))
+            return tuple(dict.fromkeys(to_send))
 
     def interrupted(self) -> None:
-        """The file was saved, or the worker is gone: what is under way is about what there was before."""
+        """Cancel all jobs: the file was saved, or the worker is gone."""
         self.reports.stop()
-        self._looking.stop()
-        self._looked = None
+        self._preview_lane.stop()
+        self._previewed = None
         self.file.stop()
 
     def failed_to_load(self) -> None:
-        """A version does not load; the one before goes on."""
+        """A version failed to load; the one before continues."""
         with self._lock:
             self.file.failed_to_load()
-        self._note()
+        self._notify()
 
     def placed_cameras(self) -> tuple[PlaceCamera, ...]:
-        """What is to be asked of another worker, so that its cameras stand where they are placed."""
+        """All placements, as requests to another worker."""
         with self._lock:
             return tuple(
                 PlaceCamera(key, settings) for key, settings in self._cameras.placements.placed.items()
@@ -316,7 +316,7 @@ class CameraStudio:
         """The worker's answer to a placement.
 
         Args:
-            task: with the camera as it is now.
+            task: with the camera's new info.
         """
         again = False
         with self._lock:
@@ -326,27 +326,27 @@ class CameraStudio:
                 again = event.settings is not None
             else:
                 self._cameras.task = task
-        self.ask_for([event.key] if again else [])
+        self.send_placements([event.key] if again else [])
 
     def close(self) -> None:
-        """Wait for what is being written."""
+        """Cancel all jobs, and wait for a running edit."""
         self.reports.close()
-        self._looking.close()
+        self._preview_lane.close()
         self.file.close()
 
-    # --- small things ----------------------------------------------------------------------------------
+    # --- sending ---------------------------------------------------------------------------------------
 
-    def ask_for(self, keys: Sequence[CameraKey]) -> None:
-        """Ask the worker to place these cameras as they are placed now."""
-        # What is asked for is read and sent in one go, or of two threads the one that read first might send last.
+    def send_placements(self, keys: Sequence[CameraKey]) -> None:
+        """Send the present placements of these cameras to the worker."""
+        # Read and sent under one lock: otherwise, of two threads, the older placement might be sent last.
         with self._asking:
             with self._lock:
                 requests = [PlaceCamera(key, self._cameras.placements.placed.get(key)) for key in keys]
             for request in requests:
                 self._send(request)
-        self._note()
+        self._notify()
 
-    def _note(self) -> None:
+    def _notify(self) -> None:
         with self._lock:
             self._serial += 1
         self._on_change()

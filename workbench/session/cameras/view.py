@@ -1,7 +1,4 @@
-"""What the page reads of the camera studio: immutable, a part of `SessionView`.
-
-Everything here is plain data and numpy. What can be done is in `camera_studio`.
-"""
+"""Snapshot of the camera studio, a part of `SessionView`."""
 
 from __future__ import annotations
 
@@ -18,9 +15,9 @@ if TYPE_CHECKING:
     from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.session.process.job_lane import JobProgress
 
-WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
-"""``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what
-was written. ``mismatch``: it has something else. ``undone``: taken back out of the file."""
+EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
+"""``planned``: shown, not written. ``written``: in the file, before its reload. ``checked``: the new env's camera equals the
+edit. ``mismatch``: it does not. ``undone``: taken out of the file."""
 
 
 Change = Literal["edit", "add", "duplicate", "rename", "remove"]
@@ -28,22 +25,22 @@ Change = Literal["edit", "add", "duplicate", "rename", "remove"]
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What is to be written."""
+class EditRequest:
+    """A requested change of a camera in the file."""
 
     what: Change
     key: CameraKey
     """The camera that is changed, copied, renamed or removed, or the one that is added."""
     settings: CameraSettings | None = None
-    """What it is to have, or has where it is removed; None for as it is placed when it is asked for."""
+    """New settings (its present ones if it is removed); None for its placement at the time of the request."""
     name: str = ""
     """The new name."""
     about: str = ""
-    """What is said beside its plan, for the reader."""
+    """A note that is shown with the plan."""
 
     @property
     def result(self) -> CameraKey:
-        """The camera that the file has when it is done."""
+        """The camera that the file has afterwards."""
         return (self.key[0], self.name) if self.name else self.key
 
 
@@ -53,44 +50,43 @@ class StudioCamera:
 
     key: CameraKey
     info: CameraInfo
-    """Of the live camera; its `settings` are what the file says."""
+    """Of the live camera; its `settings` are those of the file."""
     now: CameraSettings | None
-    """As it is placed; equal to ``info.settings`` while it is untouched. None only where that is None."""
+    """As placed; equal to ``info.settings`` without a placement. None only if that is None."""
     moved: bool
-    """It is placed otherwise than the file says."""
+    """Its placement differs from the file."""
     mount_pose: NDArray[np.float32] | None
-    """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None: it stands still in the
-    env's frame."""
+    """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None for a camera without a mount."""
     refused: str = ""
-    """Why it cannot be placed, as a sentence; empty where it can."""
+    """Why it cannot be placed, as a sentence; empty if it can."""
 
 
 @dataclass(frozen=True)
-class Writing:
-    """How far a change is on its way into the file. One at a time."""
+class EditState:
+    """State of the edit of the file; there is one at a time."""
 
-    stage: WritingStage = "none"
-    wish: Wish | None = None
+    stage: EditStage = "none"
+    request: EditRequest | None = None
     edit: SourceEdit | None = None
     snippet: str = ""
-    """Of what was refused: what the author can copy into the file themselves."""
+    """Code for a refused edit, which the author can copy into the file."""
     message: str = ""
     """One sentence or two: what happened, and what to do next."""
     can_copy: bool = False
-    """Refused since the file is not the user's to edit, and a copy of it would be: see `StudioFile.copy_task`."""
+    """Refused because the file must not be edited, while a copy could be: see `FileEdits.copy_task`."""
     picture: Picture | None = None
-    """What the camera would see whose addition is planned, once it was looked."""
+    """Preview of a camera that is to be added, once it is drawn."""
     loading: bool = False
-    """It is in the file, or out of it again, and the version with that has not come in yet."""
+    """The file has changed, and that version is not loaded yet."""
 
     @property
     def what(self) -> Change:
-        return "edit" if self.wish is None else self.wish.what
+        return "edit" if self.request is None else self.request.what
 
 
 @dataclass(frozen=True)
-class Picked:
-    """What a pixel of a picture shows."""
+class PickedPixel:
+    """What a probed pixel shows."""
 
     key: CameraKey
     env: int
@@ -110,7 +106,7 @@ class Picked:
 
 @dataclass(frozen=True)
 class MeasuredMoment:
-    """Which moment of which env's episode an entry of a report over steps is of."""
+    """The moment and env of an entry of a report over steps."""
 
     serial: int
     env: int
@@ -119,35 +115,35 @@ class MeasuredMoment:
 
 
 @dataclass(frozen=True)
-class Looked:
-    """What came of looking at the cameras, by now."""
+class StudioResults:
+    """Results of `CameraReports` so far."""
 
     report: CameraReport | None = None
-    """Of the last judgement."""
+    """The newest one."""
     report_of: CameraKey | None = None
     report_settings: CameraSettings | None = None
-    """How the camera stood when it was judged."""
+    """The camera's settings when it was measured."""
     report_seeds: int = 0
-    """Fresh episodes that it is of; 0 for the envs at the moment that was shown."""
+    """Number of fresh episodes; 0 for a report over the envs at the shown moment."""
     report_moments: tuple[MeasuredMoment, ...] = ()
-    """Where it is of an episode's steps: which one each of ``report.envs`` is; empty for all others."""
+    """Of a report over steps: the moment of each of ``report.envs``; else empty."""
     outdated: bool = False
-    """The report is of a version that was."""
+    """The report is of an earlier version."""
     measuring: bool = False
-    """Another judgement is under way, of which nothing is known yet."""
+    """A new report is being made and has no numbers yet."""
     suggestions: tuple[OfferedPlacement, ...] = ()
     """Best first."""
     suggestions_of: CameraKey | None = None
     compared: tuple[Picture, Picture] | None = None
-    """The camera as it is placed, and as `CameraStudio.compare` was told."""
-    picked: Picked | None = None
+    """The camera as placed, and with the settings given to `CameraReports.compare`."""
+    picked: PickedPixel | None = None
     sheet: tuple[Picture, ...] = ()
-    """The selected camera's picture in every env, worst first where it was judged."""
+    """The selected camera's picture in every env, worst first if there is a report over them."""
     problem: str = ""
-    """Why the last question was not answered, as a sentence."""
+    """Why the last job failed, as a sentence."""
 
     def report_over_envs(self, key: CameraKey) -> CameraReport | None:
-        """The report, if it is of this camera and of the envs at one moment."""
+        """The report, if it is of this camera and over the envs at one moment."""
         return (
             self.report if (self.report_of, self.report_seeds, self.report_moments) == (key, 0, ()) else None
         )
@@ -155,24 +151,26 @@ class Looked:
 
 @dataclass(frozen=True)
 class StudioView:
+    """Immutable; plain data and numpy."""
+
     cameras: tuple[StudioCamera, ...] = ()
     selected: CameraKey | None = None
     undo: str | None = None
-    """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
+    """What `CameraStudio.undo` would undo, as text (``moved base_camera``); None if there is nothing."""
     redo: str | None = None
-    writing: Writing = Writing()
-    looked: Looked = Looked()
-    """What came of looking at the cameras."""
+    edit_state: EditState = EditState()
+    results: StudioResults = StudioResults()
+    """Reports, suggestions, pictures."""
     report_stale: bool = False
-    """The camera was moved since it was judged, or another version runs."""
-    quick_scale: float = 1.0
-    """Other than 1: the chosen camera is looked through in a picture of so much of its own size."""
-    quick: Picture | None = None
-    """That picture, while there is one."""
+    """The camera was moved since it was measured, or another version runs."""
+    preview_scale: float = 1.0
+    """Size of the preview relative to the camera's own; 1 for no preview."""
+    preview: Picture | None = None
+    """The preview, while there is one."""
     progress: JobProgress | None = None
-    """None while nothing runs in the background."""
+    """None while no job runs."""
     problem: str = ""
-    """What went wrong last, or was decided over the author's head, as a sentence."""
+    """The last failure, or a placement that was dropped, as a sentence."""
     serial: int = 0
     """Grows with every change of anything but `StudioCamera.mount_pose`."""
 
@@ -187,6 +185,6 @@ class StudioView:
 
     @property
     def placeable(self) -> StudioCamera | None:
-        """The selected camera, if it can be placed: then it is known how it is."""
+        """The selected camera, if it can be placed; its `now` is not None then."""
         chosen = self.chosen
         return None if chosen is None or chosen.now is None or chosen.refused else chosen

@@ -144,7 +144,7 @@ class ShownMoment:
         return None if self.poses is None else self.poses[env]
 
 
-class Shown(Protocol):
+class ShownPast(Protocol):
     """Gives the moments that the page shows."""
 
     def shown_moment(self) -> ShownMoment:

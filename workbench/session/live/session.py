@@ -385,7 +385,7 @@ class Session:
             self.rescorer.forget()
         self.versions.follow(event.task, stale)
         self._send_settings()
-        self.studio.ask_for(placed)
+        self.studio.send_placements(placed)
         if recording:
             self._continue_recording(event, recording, one_each)
         with self._lock:

@@ -339,7 +339,7 @@ class TimeTravel:
             return timeline.history.segment_at(self._env, timeline.at)
 
     def shown_moment(self) -> ShownMoment:
-        """See `Shown`."""
+        """See `ShownPast`."""
         with self._lock:
             s = self._state
             shown = None if s.timeline is None else s.timeline.shown
@@ -347,7 +347,7 @@ class TimeTravel:
             return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
 
     def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
-        """See `Shown`."""
+        """See `ShownPast`."""
         with self._lock:
             s = self._state
             if s.timeline is None or not len(s.timeline.history):

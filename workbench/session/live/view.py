@@ -42,7 +42,7 @@ class ShownCameras:
     can_render: bool = True
     placed: CameraKey | None = None
     """The camera that is placed by hand."""
-    quick: bool = False
+    preview: bool = False
     """That camera is shown in another size than its own."""
 
 
@@ -118,7 +118,7 @@ class SessionView:
             self.picture_milliseconds,
             task.can_render,
             studio.selected,
-            studio.quick_scale != 1.0,
+            studio.preview_scale != 1.0,
         )
 
     @property

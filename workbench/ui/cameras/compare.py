@@ -76,7 +76,7 @@ class CameraCompare:
                 )
             other = camera.info.settings if choice == FILE else self._kept[camera.key]
             self._asked = (camera.key, camera.now, other, choice)
-            self._pair.asked(self._session.view().studio.looked.compared)
+            self._pair.asked(self._session.view().studio.results.compared)
             self._session.studio.reports.compare(other)
 
     def draw(self, view: SessionView) -> None:
@@ -88,7 +88,7 @@ class CameraCompare:
         kept = None if camera is None else self._kept.get(camera.key)
         back = camera is not None and kept is not None and kept != camera.now
         self._take.visible = back
-        both = studio.looked.compared
+        both = studio.results.compared
         mine = camera is not None and both is not None and both[0].key == camera.key
         now = None if camera is None else camera.now
         self._pair.draw(studio.progress, both if mine else None, now, lambda _: self._html(both, camera))

@@ -12,7 +12,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
-from workbench.session.cameras.studio import IN_A_QUICK_LOOK
+from workbench.session.cameras.studio import PREVIEW_MODALITIES
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView, ShownCameras
 from workbench.session.protocol.messages import CameraRequest
@@ -211,7 +211,7 @@ class CamerasPanel:
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
         """The ticked modalities; for a camera that is being placed also what the Studio shows, in full size."""
         wanted = camera.wanted()
-        if seen.quick or key != seen.placed:
+        if seen.preview or key != seen.placed:
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 
@@ -275,13 +275,13 @@ class StudioPicture:
     def draw(self, view: SessionView) -> None:
         studio, key = view.studio, view.studio.selected
         chosen = studio.chosen
-        quick = studio.quick_scale != 1.0
+        preview = studio.preview_scale != 1.0
         gives = (COLOUR,) if chosen is None else modalities_of(chosen.info)
-        self.kinds = tuple(kind for kind in gives if not quick or kind in IN_A_QUICK_LOOK)
+        self.kinds = tuple(kind for kind in gives if not preview or kind in PREVIEW_MODALITIES)
         picture = None if key is None else view.pictures.get(key)
-        if quick:
-            picture = studio.quick
-            self._session.studio.look()
+        if preview:
+            picture = studio.preview
+            self._session.studio.draw_preview()
         # The last picture stays until the next comes; another camera's does not.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)

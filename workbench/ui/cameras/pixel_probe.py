@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.cameras.view import Picked, StudioCamera
+from workbench.session.cameras.view import PickedPixel, StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.scene.env_grid import line_set, view_label
@@ -75,15 +75,15 @@ class CameraPick:
         self._label.draw(picked.body or "", place)
 
 
-def picked_here(view: SessionView) -> Picked | None:
+def picked_here(view: SessionView) -> PickedPixel | None:
     """The pick, if it is of the selected camera and env."""
-    picked = view.studio.looked.picked
+    picked = view.studio.results.picked
     if picked is None or picked.key != view.studio.selected or picked.env != view.selected_env:
         return None
     return picked
 
 
-def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
+def pane_html(camera: StudioCamera, picked: PickedPixel | None, press: str) -> str:
     width, height = _size(camera)
     return render("camera_pane", press=press, aspect=f"{width / height:.6f}", picked=picked)
 

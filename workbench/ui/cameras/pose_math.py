@@ -227,21 +227,21 @@ class Placing:
     def frame(self, camera: StudioCamera) -> Frame:
         return Frame(camera.mount_pose, self.offset)
 
-    def place(self, key: CameraKey, settings: CameraSettings, hand: object, pause: float = PAUSE) -> None:
-        """Place it live; `hand` and `pause` as in `CameraStudio.place`.
+    def place(self, key: CameraKey, settings: CameraSettings, control: object, pause: float = PAUSE) -> None:
+        """Place it live; `control` and `pause` as in `CameraStudio.place`.
 
         Raises:
             ValueError: it is too far away for any task.
         """
         if not all(abs(x) <= FARTHEST for x in settings.position):
             raise ValueError(f"A camera stands within {FARTHEST:g} m of the origin.")
-        self._session.studio.place(key, settings, hand, pause)
+        self._session.studio.place(key, settings, control, pause)
 
-    def change(self, hand: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
-        """Apply `change` to the chosen camera; `hand` as in `place`.
+    def change(self, control: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
+        """Apply `change` to the chosen camera; `control` as in `place`.
 
         Raises:
             ValueError: no camera is chosen, or it cannot be placed so.
         """
         camera, now, frame = self.require()
-        self.place(camera.key, change(now, frame), hand)
+        self.place(camera.key, change(now, frame), control)

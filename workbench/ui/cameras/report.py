@@ -71,7 +71,7 @@ class CameraReportPanel:
     # --- requests ------------------------------------------------------------------------------------
 
     def _ask(self) -> None:
-        self._report.asked(self._session.view().studio.looked.report)
+        self._report.asked(self._session.view().studio.results.report)
         over = self._over.value
         if over == STEPS:
             self._session.studio.reports.measure_steps(self._steps.value)
@@ -79,18 +79,18 @@ class CameraReportPanel:
             self._session.studio.reports.measure(self._resets.value if over == FRESH else 0)
 
     def _ask_for_sheet(self) -> None:
-        self._pictures.asked(self._session.view().studio.looked.sheet)
+        self._pictures.asked(self._session.view().studio.results.sheet)
         self._session.studio.reports.make_sheet()
 
     def _show_moment(self, position: int) -> None:
-        moments = self._session.view().studio.looked.report_moments
+        moments = self._session.view().studio.results.report_moments
         if position < len(moments):
             self._session.show(moments[position].env, moments[position].serial)
 
     def _use(self, plane: str) -> None:
         studio = self._session.view().studio
-        camera, report = studio.placeable, studio.looked.report
-        if camera is None or camera.now is None or report is None or studio.looked.report_of != camera.key:
+        camera, report = studio.placeable, studio.results.report
+        if camera is None or camera.now is None or report is None or studio.results.report_of != camera.key:
             return
         near = report.depth.suggested_near if plane == "near" else camera.now.near
         far = report.depth.suggested_far if plane == "far" else camera.now.far
@@ -108,25 +108,25 @@ class CameraReportPanel:
         self._draw_sheet(view, camera)
 
     def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
-        looked = studio.looked
-        report = looked.report if camera is not None and looked.report_of == camera.key else None
+        results = studio.results
+        report = results.report if camera is not None and results.report_of == camera.key else None
 
         def html(new: bool) -> str:
             assert camera is not None and report is not None, "drawn only then"
             return self._report_html(studio, camera, report, new)
 
-        told = studio.report_stale, looked.measuring, None if camera is None else camera.now
+        told = studio.report_stale, results.measuring, None if camera is None else camera.now
         self._report.draw(studio.progress, report, told, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
         """The table of objects, the depth histogram and fitting planes; `new`: scroll it into view."""
-        looked, depth, lens = studio.looked, report.depth, camera.now or camera.info
+        results, depth, lens = studio.results, report.depth, camera.now or camera.info
         moments = [
             {
                 "words": f"step {moment.step}",
                 "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
             }
-            for i, moment in enumerate(looked.report_moments)
+            for i, moment in enumerate(results.report_moments)
         ]
         planes = []
         for name, now, better in (
@@ -145,7 +145,7 @@ class CameraReportPanel:
             )
         count = len(report.envs)
         over = (
-            counted(count, "fresh reset") if looked.report_seeds else f"{counted(count, 'env')} as they are"
+            counted(count, "fresh reset") if results.report_seeds else f"{counted(count, 'env')} as they are"
         )
         unit = "envs"
         if moments:
@@ -158,7 +158,7 @@ class CameraReportPanel:
         return render(
             "camera_report",
             stale=studio.report_stale,
-            before=looked.measuring,
+            before=results.measuring,
             new=new,
             over=over,
             how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
@@ -175,10 +175,10 @@ class CameraReportPanel:
         )
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
-        looked, env = view.studio.looked, view.selected_env
-        sheet = looked.sheet
+        results, env = view.studio.results, view.selected_env
+        sheet = results.sheet
         mine = camera is not None and bool(sheet) and sheet[0].key == camera.key
-        report = None if camera is None else looked.report_over_envs(camera.key)
+        report = None if camera is None else results.report_over_envs(camera.key)
         told = id(report), env
         self._pictures.draw(
             view.studio.progress,

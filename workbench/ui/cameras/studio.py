@@ -181,7 +181,7 @@ class StudioPanel(PagePart[SessionView]):
             self._facts.content = self._facts_of(chosen, view)
         if camera is not None:
             self._tools.content = self._tools_of(camera, studio)
-            self._handles.content = self._handles_of(studio.quick_scale)
+            self._handles.content = self._handles_of(studio.preview_scale)
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
@@ -222,9 +222,9 @@ class StudioPanel(PagePart[SessionView]):
             hint=IN_ITS_EYE if self._in_its_eye else "",
             problem=view.studio.problem,
             took=f"{view.picture_milliseconds:.0f}"
-            if view.picture_milliseconds and view.studio.quick_scale == 1.0
+            if view.picture_milliseconds and view.studio.preview_scale == 1.0
             else "",
-            quick=_quick_words(camera, view.studio.quick_scale),
+            quick=_quick_words(camera, view.studio.preview_scale),
         )
 
     def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
@@ -281,7 +281,7 @@ class StudioPanel(PagePart[SessionView]):
             Toggle(
                 "Shows", "What the picture above is of.", kinds, self._picture.shows, self._picture.show_kind
             ),
-            Toggle("Size", SIZE, SCALES, scale, self._session.studio.set_quick_scale),
+            Toggle("Size", SIZE, SCALES, scale, self._session.studio.set_preview_scale),
         )
         rows = [
             [

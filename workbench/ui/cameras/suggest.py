@@ -125,7 +125,7 @@ class CameraSuggest:
         with refusals_told(event.client):
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
-            self._offers.asked(self._session.view().studio.looked.suggestions)
+            self._offers.asked(self._session.view().studio.results.suggestions)
             self._session.studio.reports.suggest(wanted, *self._bounds(), self._resets.value)
 
     # --- drawing -------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ class CameraSuggest:
         self._draw_bounds(camera)
         self._draw_names(view)
         now = None if camera is None else camera.now
-        offered = studio.looked.suggestions if studio.looked.suggestions_of == studio.selected else ()
+        offered = studio.results.suggestions if studio.results.suggestions_of == studio.selected else ()
         self._offers.draw(studio.progress, offered, now, lambda new: self._offers_html(offered, now, new))
 
     def _draw_mounted(self, camera: StudioCamera | None) -> None:

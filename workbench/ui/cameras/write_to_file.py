@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraKind, CameraSettings
 from workbench.core.cameras.conventions import axes_of, intrinsic_of, pose_of, vertical_fov
-from workbench.session.cameras.file_edits import MADE
-from workbench.session.cameras.view import StudioView, Wish, Writing
+from workbench.session.cameras.file_edits import IN_FILE
+from workbench.session.cameras.view import EditRequest, EditState, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.cameras.pose_math import Placing, rounded
@@ -28,7 +28,7 @@ from workbench.ui.widgets.templates import render
 
 LEAVE, CLOSE = "Leave the file as it is", "Close"
 MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
-NOTHING = Writing()
+NOTHING = EditState()
 
 
 class CameraChange:
@@ -56,48 +56,48 @@ class CameraChange:
         self._undo.on_click(lambda _: session.studio.file.undo_write())
         self._copy.on_click(lambda _: session.studio.file.copy_task())
         self._drop.on_click(lambda _: session.studio.file.drop_plan())
-        self._drawn: tuple[Writing, bool, bool] | None = None
+        self._drawn: tuple[EditState, bool, bool] | None = None
 
-    def draw(self, writing: Writing, stale: bool) -> None:
-        """Show the stage of a change; a `Writing` without stage and message hides all.
+    def draw(self, edit_state: EditState, stale: bool) -> None:
+        """Show the stage of a change; a `EditState` without stage and message hides all.
 
         Args:
             stale: the camera was moved since the change was planned.
         """
-        stage = writing.stage
-        self._text.visible = stage != "none" or bool(writing.message)
-        self._copy.visible = writing.can_copy
+        stage = edit_state.stage
+        self._text.visible = stage != "none" or bool(edit_state.message)
+        self._copy.visible = edit_state.can_copy
         self._write.visible = stage == "planned" and not stale
         self._drop.visible = stage not in ("none", "written")
-        self._undo.visible = stage in MADE
-        name = "" if writing.edit is None else writing.edit.names
+        self._undo.visible = stage in IN_FILE
+        name = "" if edit_state.edit is None else edit_state.edit.names
         self._drop.label = LEAVE if stage == "planned" else CLOSE
         self._write.label = f"Write it to {name}" if name else "Write it"
-        new = self.arrival.just_came(writing if stage != "none" else None)
-        if self._drawn is None or self._drawn[0] is not writing or self._drawn[1:] != (stale, new):
-            self._drawn = writing, stale, new
-            self._text.content = writing_html(writing, stale, element_id(self._drop) if new else "")
+        new = self.arrival.just_came(edit_state if stage != "none" else None)
+        if self._drawn is None or self._drawn[0] is not edit_state or self._drawn[1:] != (stale, new):
+            self._drawn = edit_state, stale, new
+            self._text.content = edit_html(edit_state, stale, element_id(self._drop) if new else "")
 
 
-def writing_html(writing: Writing, stale: bool, scroll_to: str = "") -> str:
+def edit_html(edit_state: EditState, stale: bool, scroll_to: str = "") -> str:
     """The stage of a change, as HTML.
 
     Args:
         scroll_to: id of the element to scroll into view.
     """
-    edit, planned = writing.edit, writing.stage == "planned"
-    seen = writing.picture.rgb if planned and writing.picture is not None else None
-    files = [] if edit is None or writing.stage == "undone" else edit.changes
+    edit, planned = edit_state.edit, edit_state.stage == "planned"
+    seen = edit_state.picture.rgb if planned and edit_state.picture is not None else None
+    files = [] if edit is None or edit_state.stage == "undone" else edit.changes
     return render(
         "camera_writing",
-        message="The camera was moved since: show the change again." if stale else writing.message,
-        mood="warn" if stale else MOODS.get(writing.stage, "plain"),
-        about=writing.wish.about if planned and writing.wish is not None else "",
+        message="The camera was moved since: show the change again." if stale else edit_state.message,
+        mood="warn" if stale else MOODS.get(edit_state.stage, "plain"),
+        about=edit_state.request.about if planned and edit_state.request is not None else "",
         picture="" if seen is None else data_address(seen, PREVIEW),
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
-        folded=writing.stage in MADE,
-        notes=() if edit is None or writing.stage == "undone" else edit.notes,
-        snippet=writing.snippet,
+        folded=edit_state.stage in IN_FILE,
+        notes=() if edit is None or edit_state.stage == "undone" else edit.notes,
+        snippet=edit_state.snippet,
         scroll_to=scroll_to,
     )
 
@@ -158,7 +158,7 @@ class WriteToFile:
     ) -> None:
         self._session, self._placing, self._from_viewer = session, placing, from_viewer
         gui = server.gui
-        self._named: Writing | None = None
+        self._named: EditState | None = None
         """The last change after which the field for a name was emptied."""
         with above:
             # Disabled, not hidden: coming with the first movement it would push the controls below away.
@@ -185,14 +185,14 @@ class WriteToFile:
     def _plan_write(self) -> None:
         camera = self._placing.camera
         if camera is not None:
-            self._ask(Wish("edit", camera.key))
+            self._ask(EditRequest("edit", camera.key))
 
-    def _ask(self, wish: Wish) -> None:
+    def _ask(self, request: EditRequest) -> None:
         """Ask for a plan. Notes the place first: the answer may come at once."""
         self._say("")
-        change = self._change if wish.what == "edit" else self._member_change
-        change.arrival.asked(self._session.view().studio.writing)
-        self._session.studio.file.plan(wish)
+        change = self._change if request.what == "edit" else self._member_change
+        change.arrival.asked(self._session.view().studio.edit_state)
+        self._session.studio.file.plan(request)
 
     def _on_member(self, event: viser.GuiEvent) -> None:
         try:
@@ -216,15 +216,15 @@ class WriteToFile:
             if kind == "sensor":
                 settings, words = first_place(settings, names, places)
             settings = replace(settings, distance=distance_to(settings, places))
-            self._ask(Wish("add", key, settings, about=words))
+            self._ask(EditRequest("add", key, settings, about=words))
         elif chosen is None:
             raise ValueError("Choose the camera first.")
         elif what == REMOVE:
-            self._ask(Wish("remove", chosen.key))
+            self._ask(EditRequest("remove", chosen.key))
         elif what in (DUPLICATE, RENAME):
             name = self._checked_name(view.studio, chosen.key[0], chosen.key[1] if what == DUPLICATE else "")
             change = "duplicate" if what == DUPLICATE else "rename"
-            self._ask(Wish(change, chosen.key, name=name))
+            self._ask(EditRequest(change, chosen.key, name=name))
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
         """The typed name, or a free one like `like`.
@@ -248,30 +248,30 @@ class WriteToFile:
     # --- drawing ---------------------------------------------------------------------------------------
 
     def draw(self, studio: StudioView) -> None:
-        chosen, writing = studio.chosen, studio.writing
+        chosen, edit_state = studio.chosen, studio.edit_state
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
-        of_members = writing.what != "edit"
+        of_members = edit_state.what != "edit"
         # Hidden while "Write it" is shown: a second press must not write a diff that was not read.
-        can_plan = can_place and (writing.stage != "planned" or stale or of_members)
-        wants_plan = can_plan and chosen is not None and chosen.moved and writing.stage != "written"
+        can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
+        wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
         self._plan.visible = can_plan
         self._plan.disabled = not wants_plan
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
-            change.draw(writing if here else NOTHING, stale and here)
-        if writing.stage == "checked" and of_members and writing is not self._named:
-            self._named = writing
+            change.draw(edit_state if here else NOTHING, stale and here)
+        if edit_state.stage == "checked" and of_members and edit_state is not self._named:
+            self._named = edit_state
             self._name.value = ""  # it is taken now
         self._with_chosen.visible = chosen is not None
 
 
 def is_stale(studio: StudioView) -> bool:
     """Whether the camera was moved since its change was planned."""
-    wish = studio.writing.wish
-    if studio.writing.stage != "planned" or wish is None or wish.what == "add":
+    request = studio.edit_state.request
+    if studio.edit_state.stage != "planned" or request is None or request.what == "add":
         return False
-    camera = studio.camera(wish.key)
-    return camera is not None and camera.now != wish.settings
+    camera = studio.camera(request.key)
+    return camera is not None and camera.now != request.settings
 
 
 def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
