@@ -109,7 +109,7 @@ def test_every_suggestion_can_be_taken_and_none_that_is_not_there(one: Alone) ->
     seen: Any = None  # nobody looks at it here
     offers = tuple(OfferedPlacement(there, (0, 0, 0), 1.0, "", seen, seen) for there in (best, other))
     one.studio.take_suggestion(0)
-    one.studio.reports._know(suggestions=offers, suggestions_of=KEY)
+    one.studio.reports._update(suggestions=offers, suggestions_of=KEY)
     for index in (-1, 2):
         one.studio.take_suggestion(index)
     assert one.sent == []
@@ -120,7 +120,7 @@ def test_every_suggestion_can_be_taken_and_none_that_is_not_there(one: Alone) ->
 
 def test_a_report_is_stale_once_the_camera_was_moved_or_another_version_came(one: Alone) -> None:
     report = cast(Any, object())
-    one.studio.reports._know(report=report, report_of=KEY, report_settings=FILE, outdated=False)
+    one.studio.reports._update(report=report, report_of=KEY, report_settings=FILE, outdated=False)
     assert not one.view().report_stale
     one.studio.place(KEY, MOVED)
     assert one.view().report_stale
@@ -133,7 +133,7 @@ def test_a_report_is_stale_once_the_camera_was_moved_or_another_version_came(one
 
 
 def test_of_what_went_wrong_what_was_asked_last_is_said_first(one: Alone) -> None:
-    one.studio.reports._know(problem="There is nothing to be seen.")
+    one.studio.reports._update(problem="There is nothing to be seen.")
     assert one.view().problem == "There is nothing to be seen."
     one.studio.place(("sensor", "nothing"), MOVED)
     assert "there is no sensor camera nothing" in one.view().problem
