@@ -84,7 +84,7 @@ class ScriptedWorker:
     def interrupt(self) -> None:
         """It is never at anything."""
 
-    def ran(self) -> None:
+    def reset_deaths(self) -> None:
         """It never dies."""
 
     def replace(self) -> None:
