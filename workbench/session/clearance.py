@@ -180,24 +180,24 @@ class Clearances:
         """Whether there is a person to ask."""
         return self._ask is not None
 
-    def clear(self, wanted: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
+    def clear(self, code: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
         """What to open for it; asks if need be, and waits for the answer.
 
         Raises:
             NotCleared: it may not run.
         """
-        (cleared,) = self.clear_all([wanted], stopped)
+        (cleared,) = self.clear_all([code], stopped)
         if isinstance(cleared, NotCleared):
             raise cleared
         return cleared
 
     def clear_all(
-        self, wanted: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
+        self, codes: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
     ) -> list[TaskName | NotCleared]:
         """The same for several; each text is asked about once."""
-        decisions = [self._without_asking(one) for one in wanted]
+        decisions = [self._without_asking(one) for one in codes]
         to_ask: dict[str, tuple[CodeToRun, _Undecided]] = {}
-        for one, decision in zip(wanted, decisions):
+        for one, decision in zip(codes, decisions):
             if isinstance(decision, _Undecided):
                 to_ask.setdefault(decision.content.hash, (one, decision))
         refused: dict[str, NotCleared] = {}
@@ -215,7 +215,7 @@ class Clearances:
             else:
                 self._store.trust_once(undecided.content, code.followed)
         cleared: list[TaskName | NotCleared] = []
-        for one, decision in zip(wanted, decisions):
+        for one, decision in zip(codes, decisions):
             if not isinstance(decision, _Undecided):
                 cleared.append(decision)
             elif decision.content.hash in refused:
@@ -243,24 +243,24 @@ class Clearances:
             f"({', '.join(named[:3])}), which it may only with --trust on the command line"
         )
 
-    def _without_asking(self, wanted: CodeToRun) -> TaskName | NotCleared | _Undecided:
+    def _without_asking(self, code: CodeToRun) -> TaskName | NotCleared | _Undecided:
         """The decision, if it needs no question."""
-        made = made_here(wanted.info)
-        if (why := self.refused_arguments(wanted.info, made)) is not None:
+        made = made_here(code.info)
+        if (why := self.refused_arguments(code.info, made)) is not None:
             return NotCleared(why, trust_helps=True)
-        if wanted.recorded_text:
+        if code.recorded_text:
             try:
-                content = recorded_content(wanted.info)
+                content = recorded_content(code.info)
             except NoRecordedSource as error:
                 return NotCleared(str(error))
             trusted = made is not MadeHere.NO
         else:
-            reference = wanted.reference
+            reference = code.reference
             if isinstance(reference, str):
                 return reference
             if reference.file is None:
                 return _registered(reference)
-            if made is MadeHere.CONTENT_AND_PLACE and reference.file == wanted.info.source_file:
+            if made is MadeHere.CONTENT_AND_PLACE and reference.file == code.info.source_file:
                 return str(reference)
             if _is_named(reference.file, self._named()):
                 return str(reference)
@@ -268,24 +268,24 @@ class Clearances:
                 content = read_content(Path(reference.file))
             except CannotRead as error:
                 return NotCleared(str(error))
-            trusted = made is not MadeHere.NO and _equals_recorded(content, wanted.info)
+            trusted = made is not MadeHere.NO and _equals_recorded(content, code.info)
         agreed = trusted or self._all_trusted or self._store.trusts(content)
-        if agreed and (not wanted.followed or self._all_trusted or self._store.follows(content)):
-            return _approved(wanted, content)
+        if agreed and (not code.followed or self._all_trusted or self._store.follows(content)):
+            return _approved(code, content)
         return _Undecided(content, agreed)
 
-    def _question(self, wanted: CodeToRun, undecided: _Undecided) -> TrustQuestion:
+    def _question(self, code: CodeToRun, undecided: _Undecided) -> TrustQuestion:
         content = undecided.content
-        before = None if wanted.recorded_text or undecided.agreed else self._store.trusted_before(content)
+        before = None if code.recorded_text or undecided.agreed else self._store.trusted_before(content)
         return TrustQuestion(
-            _printable(wanted.info.task),
-            wanted.recorded_text,
+            _printable(code.info.task),
+            code.recorded_text,
             code_files(content, before),
             tuple(map(_printable, content.unseen)),
             content.computed,
             before is not None,
             tuple(_printable(name) for name in before or () if name not in content.file_sums),
-            wanted.followed,
+            code.followed,
             undecided.agreed,
         )
 
@@ -362,10 +362,10 @@ def recorded_content(info: EpisodeInfo) -> TaskContent:
     return TaskContent(main, {main: texts[main], **texts})
 
 
-def _approved(wanted: CodeToRun, content: TaskContent) -> TaskName:
-    if wanted.recorded_text or isinstance(wanted.reference, str):
-        return wanted.reference
-    return replace(wanted.reference, file=content.main, approved=content.texts)
+def _approved(code: CodeToRun, content: TaskContent) -> TaskName:
+    if code.recorded_text or isinstance(code.reference, str):
+        return code.reference
+    return replace(code.reference, file=content.main, approved=content.texts)
 
 
 def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:

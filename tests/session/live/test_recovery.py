@@ -17,7 +17,7 @@ TASK = replace(description(table_scene(1)[0]), source={"push.py": "good"})
 def ran() -> Recovery:
     moments: list[bytes] = []
     recovery = Recovery(lambda: moments[-1] if moments else None)
-    assert recovery.wanted() == LoadInputs(None, None)
+    assert recovery.next_load() == LoadInputs(None, None)
     recovery.loaded(TASK)
     moments += [b"first", b"newest"]
     return recovery
@@ -26,24 +26,24 @@ def ran() -> Recovery:
 def test_what_ran_comes_back_at_its_newest_moment() -> None:
     recovery = ran()
     recovery.died(file_waits=False)
-    assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest") and recovery.restoring
+    assert recovery.next_load() == LoadInputs({"push.py": "good"}, b"newest") and recovery.restoring
 
 
 def test_a_moment_that_kills_is_not_tried_twice_and_then_the_version_neither() -> None:
     recovery = ran()
     recovery.died(file_waits=False)
-    recovery.wanted()
+    recovery.next_load()
     recovery.died(file_waits=False)
-    assert recovery.wanted() == LoadInputs({"push.py": "good"}, None)
+    assert recovery.next_load() == LoadInputs({"push.py": "good"}, None)
     recovery.died(file_waits=False)
-    assert recovery.wanted() is None
+    assert recovery.next_load() is None
 
 
 def test_a_file_that_kills_before_anything_ran_is_waited_for() -> None:
     recovery = Recovery(lambda: None)
-    recovery.wanted()
+    recovery.next_load()
     recovery.died(file_waits=False)
-    assert recovery.wanted() is None
+    assert recovery.next_load() is None
     assert recovery.file_requested() == LoadInputs(None, None)
 
 
@@ -51,15 +51,15 @@ def test_a_new_version_that_kills_gives_way_to_the_last_good_one() -> None:
     recovery = ran()
     recovery.file_requested()
     recovery.died(file_waits=False)
-    assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest")
+    assert recovery.next_load() == LoadInputs({"push.py": "good"}, b"newest")
 
 
 def test_a_file_that_waits_is_loaded_at_the_newest_moment_and_if_it_fails_the_last_good_one_is() -> None:
     recovery = ran()
     recovery.died(file_waits=True)
-    assert recovery.wanted() == LoadInputs(None, b"newest") and not recovery.restoring
+    assert recovery.next_load() == LoadInputs(None, b"newest") and not recovery.restoring
     assert recovery.failed(kept=False)
-    assert recovery.wanted() == LoadInputs({"push.py": "good"}, b"newest") and recovery.restoring
+    assert recovery.next_load() == LoadInputs({"push.py": "good"}, b"newest") and recovery.restoring
 
 
 def test_a_failure_that_leaves_the_version_before_asks_for_nothing() -> None:
@@ -82,11 +82,11 @@ def test_workers_do_not_die_for_ever(events: list[str]) -> None:
         else:
             loads = 0 if event == "waits" else loads
             recovery.died(file_waits=event == "waits")
-        loads += recovery.wanted() is not None
+        loads += recovery.next_load() is not None
         assert loads <= 8
     for _ in range(4):
         recovery.died(file_waits=False)
-        last = recovery.wanted()
+        last = recovery.next_load()
     assert last is None
 
 

@@ -192,7 +192,7 @@ def restored_text(edit: SourceEdit) -> str:
 
 
 def mismatch(
-    request: EditRequest, infos: Mapping[CameraKey, CameraInfo], wanted: CameraSettings | None
+    request: EditRequest, infos: Mapping[CameraKey, CameraInfo], written: CameraSettings | None
 ) -> str:
     """How the cameras of the reloaded env differ from the request; empty if they do not. The reload builds the camera from
     the file, so only this proves that the edit is right."""
@@ -204,15 +204,15 @@ def mismatch(
         return f"The new env has no {kind} camera {name}."
     if request.what == "rename" and request.key in infos:
         return f"The new env still has the {kind} camera {request.key[1]}."
-    numbers = "" if wanted is None else difference_text(wanted, info.settings)
+    numbers = "" if written is None else difference_text(written, info.settings)
     return f"The new env's {name} is not what was written ({numbers})." if numbers else ""
 
 
-def difference_text(wanted: CameraSettings, now: CameraSettings) -> str:
+def difference_text(written: CameraSettings, now: CameraSettings) -> str:
     """The settings that differ, with both values; empty if none does."""
 
     def value(settings: CameraSettings, what: str) -> str:
         return setting_text(vars(settings)["quaternion" if what == "orientation" else what])
 
-    differing = differences(wanted, now)
-    return "; ".join(f"{what}: {value(now, what)}, not {value(wanted, what)}" for what in differing)
+    differing = differences(written, now)
+    return "; ".join(f"{what}: {value(now, what)}, not {value(written, what)}" for what in differing)

@@ -64,7 +64,7 @@ class Recovery:
         """Whether the running load brings back the last good version."""
         return self.loading and self._attempt in ("moment", "version")
 
-    def wanted(self) -> LoadInputs | None:
+    def next_load(self) -> LoadInputs | None:
         """What a new worker has to load; None for nothing."""
         if self._attempt == "nothing":
             return None
@@ -83,7 +83,7 @@ class Recovery:
         self._attempt, self.loading = "file", False
 
     def failed(self, kept: bool) -> bool:
-        """A load failed in a worker that still runs. True if it has no version now, and `wanted` has one to try."""
+        """A load failed in a worker that still runs. True if it has no version now, and `next_load` has one to try."""
         was_loading, self.loading = self.loading, False
         if kept or not was_loading:
             return False
@@ -192,9 +192,9 @@ class Versions:
         with self._shared.lock:
             state = self._shared.state
             requests: list[Request] = [state.settings()]
-            wanted = self._recovery.wanted()
-            if wanted is not None:
-                requests.append(state.load_request(*wanted))
+            next_load = self._recovery.next_load()
+            if next_load is not None:
+                requests.append(state.load_request(*next_load))
             else:
                 state.wait_for_file()
             if state.wants_play:
@@ -231,8 +231,8 @@ class Versions:
     def failed(self, failed: LoadFailed) -> None:
         """A load failed; a worker without a version gets the next attempt of `Recovery`."""
         with self._shared.lock:
-            wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
-            request = None if wanted is None else self._shared.state.load_request(*wanted)
+            next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
+            request = None if next_load is None else self._shared.state.load_request(*next_load)
             task = self._shared.state.now.task
         if request is not None:
             self._send(request)

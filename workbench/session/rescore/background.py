@@ -89,7 +89,7 @@ class Rescoring:
 
         def run(job: Job) -> None:
             work(job)
-            self.tell(job, state="done")
+            self.update(job, state="done")
 
         with self._lock:
             # Under the lock, or the job's first update might come before `view`.
@@ -97,7 +97,7 @@ class Rescoring:
             self._view = replace(view, serial=self._view.serial + 1)
         self._on_change()
 
-    def tell(self, job: Job, **values: Any) -> None:
+    def update(self, job: Job, **values: Any) -> None:
         """Change fields of `view`, unless the job was stopped."""
         with self._lock:
             if job.stopped:
@@ -128,4 +128,4 @@ class Rescoring:
         self._job_lane.close()
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
-        self.tell(job, state="failed", why=str(failure), problem=failure.problem)
+        self.update(job, state="failed", why=str(failure), problem=failure.problem)

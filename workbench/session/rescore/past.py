@@ -298,8 +298,8 @@ class PastRescorer:
                 with self._lock:
                     names, differing = rescored.names()
                     verdicts = tuple(rescored.verdicts())
-                self.rescoring.tell(job, verdicts=verdicts, names=names, differing_names=differing)
-            self.rescoring.tell(
+                self.rescoring.update(job, verdicts=verdicts, names=names, differing_names=differing)
+            self.rescoring.update(
                 job,
                 state="rescoring",
                 done=done,
@@ -324,7 +324,7 @@ class PastRescorer:
     def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
         if self._process.has_loaded(load):
             return
-        self.rescoring.tell(job, state="loading")
+        self.rescoring.update(job, state="loading")
         if self._process.num_envs == rescored.num_envs:
             # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
             # loop although it runs from the recorded beginnings: so go to one of these first.

@@ -216,7 +216,7 @@ class Rescorer:
             notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
             notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
-            self._tell(job, broken_files, state="asking", notes=tuple(notes))
+            self._update(job, broken_files, state="asking", notes=tuple(notes))
             try:
                 self._rescore_all(job, groups, use_env_states)
             except CannotEnterRecording as error:
@@ -237,13 +237,13 @@ class Rescorer:
             cleared,
             lambda group, task: self._rescore(job, group, task, use_env_states),
             lambda: self.rescoring.view.verdicts,
-            lambda verdicts: self._tell(job, verdicts),
+            lambda verdicts: self._update(job, verdicts),
         )
 
     def _rescore(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
         process = self._process
         warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden_modules_text(reference))))
-        self._tell(job, state="loading", task=_code_text(group), warnings=warnings)
+        self._update(job, state="loading", task=_code_text(group), warnings=warnings)
         # Never patched into the env of the group before.
         load = Load(reference, group.options, level="rebuilt")
         try:
@@ -254,12 +254,12 @@ class Rescorer:
             raise JobFailed(
                 f"{group.info.task} could not be opened to judge with", failure.problem
             ) from failure
-        self._tell(job, state="rescoring")
+        self._update(job, state="rescoring")
         began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps
 
         def on_part(part: Rescored) -> None:
             seconds = before + time.monotonic() - began
-            self._tell(job, part.verdicts, steps=steps + part.steps, seconds=seconds)
+            self._update(job, part.verdicts, steps=steps + part.steps, seconds=seconds)
 
         question = Rescore(group.files, use_env_states)
         last = process.ask(job.check, question, lambda done, total, part: on_part(part))
@@ -267,10 +267,10 @@ class Rescorer:
         if last.problem is not None:
             raise JobFailed(f"the code of {group.info.task} raised", last.problem)
 
-    def _tell(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
+    def _update(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
         """Change fields of the view, and add these verdicts."""
         known = (*self.rescoring.view.verdicts, *verdicts)
-        self.rescoring.tell(job, verdicts=known, done=len(known), **values)
+        self.rescoring.update(job, verdicts=known, done=len(known), **values)
 
 
 def _code_text(group: Group) -> str:
