@@ -53,7 +53,7 @@ PROTECTED = {
     "recording/episode/made_here": "session/test_clearance.py recording/episode/test_document.py",
     "recording/writing/episode_writer": "recording/writing/test_episode_writer.py",
     "machine/files": "recording/test_new_file.py recording/episode/test_tags.py recording/writing/test_publish.py"
-    " machine/test_user_folder.py authoring/camera_source/test_disk.py",
+    " machine/test_folders.py authoring/camera_source/test_disk.py",
     "authoring/loading/registry": "authoring/loading/test_registry.py",
     "authoring/loading/modules": "authoring/loading/test_load.py authoring/loading/test_task_content.py authoring/loading/test_library_names.py"
     " authoring/loading/test_named_modules.py",

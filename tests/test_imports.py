@@ -21,13 +21,8 @@ MOST_ENTRIES = 12
 FEWEST_LINES = 60
 SHORT_FOR_A_REASON = {
     "core/env_numbers": "snapshots, cameras and resets read the numbers of envs by it, and none of them may import another",
-    "jobs/record_options": "`--help` does not wait for what records",
-    "machine/chromium": "the tests ask it, and the doctor",
-    "machine/processes/breakpoints": "every process that runs a task's code calls it before anything else is imported",
     "machine/processes/child_python": "every process is started by it",
-    "machine/processes/current_folder": "whatever calls a task's code holds the folder by it",
     "machine/processes/own_path": "it is imported before anything else, so that nothing else is imported from the wrong place",
-    "machine/web_assets": "it says where the page's files lie, to parts that may not import each other",
 }
 """Modules below `FEWEST_LINES` lines, each with why it stays apart."""
 

@@ -319,7 +319,7 @@ def main() -> None:
     import tempfile
 
     from tests.drive.page import browser_at
-    from workbench.machine.chromium import find_chromium, how_to_get_chromium
+    from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
     chromium = find_chromium()
     if chromium is None:

@@ -148,7 +148,7 @@ def in_chromium(port: int) -> float:
     from playwright.sync_api import sync_playwright
 
     from tests.drive.page import launch, new_page
-    from workbench.machine.chromium import find_chromium, how_to_get_chromium
+    from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
     chromium = find_chromium()
     if chromium is None:

@@ -29,7 +29,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import launch, new_page, open_workbench
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 NO_DRAWING = """

@@ -31,7 +31,7 @@ from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import TASK, browser_at, page_on
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 WIDTH = 100
 BARS = {"patched": 0.3, "cameras": 0.6, "rebuilt": 2.0}

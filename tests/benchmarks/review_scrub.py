@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
 from tests.drive.page import launch, new_page
 from tests.drive.waiting import until
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 expect.set_options(timeout=180_000)

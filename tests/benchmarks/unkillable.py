@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
 from tests.drive.page import launch, new_page, open_workbench
 from tests.session.hazards import calm, provocation, provoke, write_task
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native": "Restart"}
 DEATHS = ("exit", "segfault", "abort", "kill", "children", "memory")

@@ -30,7 +30,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import close_notice, launch, new_page, open_workbench
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 PLACE = Path("/tmp/golden")

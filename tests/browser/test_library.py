@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
-from workbench.machine.web_assets import web_assets_folder
+from workbench.machine.folders import web_assets_folder
 from workbench.recording.library.library import Library
 from workbench.ui.library.panel import LibraryPanel
 from workbench.ui.widgets.hotkeys import register

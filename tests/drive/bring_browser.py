@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from workbench.machine.apt import AptFailed, apt_install, can_install_packages, os_release
-from workbench.machine.chromium import VARIABLE, find_chromium, how_to_get_chromium
+from workbench.machine.doctor import CHROMIUM_VARIABLE, find_chromium, how_to_get_chromium
 
 
 def ensure_chromium() -> str | None:
@@ -18,7 +18,7 @@ def ensure_chromium() -> str | None:
     found = find_chromium()
     if (
         found is None
-        and not os.environ.get(VARIABLE)
+        and not os.environ.get(CHROMIUM_VARIABLE)
         and can_install_packages()
         and os_release().get("ID") == "debian"
     ):

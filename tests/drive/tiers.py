@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.drive import waiting
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 MARKER_OF = {"chromium_path": "browser", "child_process": "process", "renderer": "render"}
 STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.spawn", "os.system"}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.bring_browser import driver_complaint
-from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
+from workbench.machine.doctor import chromium_version, find_chromium, how_to_get_chromium
 
 
 def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> None:

@@ -19,8 +19,8 @@ from workbench.authoring.loading.reference import RecordedTask
 from workbench.authoring.loading.task_content import TaskContent, read_content
 from workbench.authoring.loading.trust import STORE_FILE, TrustStore
 from workbench.jobs.from_recording import recorded_source, reference_of
+from workbench.machine.folders import user_folder
 from workbench.machine.processes.child_python import child_environment, python_command
-from workbench.machine.user_folder import user_folder
 from workbench.recording.episode.document import write_into_description
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.made_here import KEY_FILE, MadeHere, made_here

@@ -25,7 +25,7 @@ from playwright.sync_api import Page, expect
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.charts import drawn
 from tests.drive.page import TASK, browser_at, page_on
-from workbench.machine.chromium import find_chromium
+from workbench.machine.doctor import find_chromium
 
 Kind = Literal["good", "NaN", "rebuilding", "broken"]
 LOOKS = 4

@@ -27,7 +27,7 @@ from tests.benchmarks.page_rate import COUNT, TASK, play_to_pause, prepare, time
 from tests.benchmarks.page_rate import Options as PageOptions
 from tests.drive.page import launch, new_page, open_workbench
 from tests.ui.tabs import Tab, open_deaf_tab, tabs_of
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from workbench.cli.arguments import (
     imported,
 )
 from workbench.cli.terminal import Exit, print_problem, print_text, refuse
-from workbench.jobs.record_options import RecordArguments
+from workbench.jobs.task import RecordArguments
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
@@ -74,7 +74,7 @@ def open_page(
     if (why := why_missing(task)) is not None:
         return refuse(why)
     from workbench.cli.page import open_in_terminal
-    from workbench.session.process.debugger import port_for_debugger
+    from workbench.machine.processes.debugger import port_for_debugger
     from workbench.session.process.memory_limit import parse_memory
     from workbench.session.process.supervisor import WorkerOptions
     from workbench.ui.server.gated_server import ServerOptions
@@ -116,7 +116,7 @@ def record(
     with quick_imports():
         from workbench.cli.record import record_in_terminal
         from workbench.jobs.record import RecordOptions
-        from workbench.session.process.debugger import debug_here
+        from workbench.machine.processes.debugger import debug_here
 
     try:
         options = envs.options()

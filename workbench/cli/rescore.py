@@ -27,7 +27,7 @@ from workbench.jobs.rescore_run import rescore
 from workbench.jobs.task import TaskOptions
 from workbench.jobs.verdict import Verdict
 from workbench.machine.files import replace_file
-from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import find_all_sources

@@ -22,7 +22,7 @@ from workbench.jobs.from_recording import run_of
 from workbench.jobs.policy import Policy, load_policy, policy_problem
 from workbench.jobs.task import ActionSource
 from workbench.machine.files import open_regular_file
-from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.machine.folders import CurrentFolder
 from workbench.recording.reader.reading import find_trajectories, read_recording
 
 

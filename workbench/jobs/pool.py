@@ -15,8 +15,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Protocol, TypeVar
 
 from workbench.authoring.problem import Problem, TaskError, treat_ctrl_c_as_error
-from workbench.machine.processes.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
+from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.family import describe_exit, end_family
 from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack, pack_message
 from workbench.machine.text import guard_terminal

@@ -24,10 +24,9 @@ from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpis
 from workbench.jobs.open_task import OpenedTask, blamed, open_task
 from workbench.jobs.policy import find_policy
 from workbench.jobs.pool import Deal, Executor, Processes, Share, ThisProcess, Work, shares
-from workbench.jobs.record_options import RecordArguments
 from workbench.jobs.replay import restore_recorded
-from workbench.jobs.task import Stepped, TaskOptions
-from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.jobs.task import RecordArguments, Stepped, TaskOptions
+from workbench.machine.folders import CurrentFolder
 from workbench.recording.writing.episode_writer import EpisodeFiles
 from workbench.recording.writing.publish import RecordingError
 

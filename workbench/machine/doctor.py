@@ -7,6 +7,8 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -22,7 +24,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from workbench.machine import DISTRIBUTION
-from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
+from workbench.machine.apt import has_apt, os_release
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 from workbench.machine.render_probe import driver_files
@@ -268,6 +270,54 @@ def _chromium() -> list[DoctorFinding]:
         advice = f"Only `make test` needs it. {how_to_get_chromium()}"
         return [DoctorFinding("browser (tests)", None, "no Chromium", advice)]
     return [DoctorFinding("browser (tests)", True, f"{path}: {chromium_version(path)}")]
+
+
+# --- the machine's own Chromium, which the tests drive ----------------------------------------------
+
+
+CHROMIUM_VARIABLE = "PLAYWRIGHT_CHROMIUM"
+CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+def find_chromium() -> str | None:
+    """Path of a working Chromium: the one named by PLAYWRIGHT_CHROMIUM, else the first on PATH."""
+    named = os.environ.get(CHROMIUM_VARIABLE)
+    candidates = [named] if named else [path for name in CHROMIUM_NAMES if (path := shutil.which(name))]
+    return next((path for path in candidates if chromium_version(path) is not None), None)
+
+
+def chromium_version(path: str) -> str | None:
+    """What ``PATH --version`` prints, None if it does not run or is not a Chromium.
+
+    Ubuntu's ``chromium-browser`` may be a script that only says "install the snap": a name on PATH proves nothing.
+    """
+    try:
+        done = subprocess.run(
+            [path, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    # Another program of that name may succeed too; a browser's version has four numbers.
+    version = re.search(r"\d+(\.\d+){3}", done.stdout)
+    return done.stdout.strip() if done.returncode == 0 and version else None
+
+
+def how_to_get_chromium() -> str:
+    """Advice for this machine, in one sentence."""
+    named = os.environ.get(CHROMIUM_VARIABLE)
+    if named:
+        return (
+            f"{CHROMIUM_VARIABLE}={named} is no Chromium that runs: correct the path or unset the variable."
+        )
+    if has_apt() and os_release().get("ID") == "debian":
+        return "Type: sudo apt-get install --no-install-recommends chromium fonts-liberation"
+    return (
+        "Install Chromium or Google Chrome so that `chromium` or `google-chrome` is on PATH, or name one in "
+        f"{CHROMIUM_VARIABLE}. (Ubuntu's chromium package is a snap, which works on a desktop and not in a container.)"
+    )
+
+
+# --- the command -----------------------------------------------------------------------------------
 
 
 def main() -> int:

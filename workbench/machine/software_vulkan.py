@@ -26,13 +26,13 @@ from workbench.machine.apt import (
     os_release,
     read_apt_sources,
 )
+from workbench.machine.folders import cache_folder
 from workbench.machine.render_probe import (
     DRIVER_VARIABLES,
     SYSTEM_LIBRARIES,
     RenderProbe,
     probe_render_device,
 )
-from workbench.machine.user_folder import cache_folder
 
 
 def private_mesa_folder() -> Path:

@@ -25,13 +25,14 @@ import workbench
 from tests.drive.envs import CPU, PICK_CUBE, batched, stock
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.snapshots.cpu_state import CpuState, plan_cpu_state, renew_physics
-from workbench.core.snapshots.gpu_state import read_gpu_state, write_gpu_state
 from workbench.core.snapshots.snapshot import (
     begin_anew,
     in_this_state,
+    read_gpu_state,
     restore_snapshot,
     step_only,
     take_snapshot,
+    write_gpu_state,
 )
 
 pytestmark = pytest.mark.thorough

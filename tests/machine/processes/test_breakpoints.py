@@ -11,7 +11,7 @@ from workbench.machine.processes.child_python import child_environment, python_c
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
-BEGIN = "from workbench.machine.processes.breakpoints import refuse_breakpoints\nrefuse_breakpoints('remove this line')\n"
+BEGIN = "from workbench.machine.processes.debugger import refuse_breakpoints\nrefuse_breakpoints('remove this line')\n"
 
 
 @pytest.mark.parametrize(

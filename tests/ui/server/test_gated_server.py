@@ -18,7 +18,7 @@ import viser.infra._infra
 
 from tests.drive.page import page_at
 from workbench.cli.terminal import print_addresses
-from workbench.machine.web_assets import web_assets_folder
+from workbench.machine.folders import web_assets_folder
 from workbench.ui.server import gated_server as door_module
 from workbench.ui.server import listening, viser_private
 from workbench.ui.server.access import cookie_name

@@ -15,7 +15,7 @@ from playwright.sync_api import Page
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.ui.knocking import ask
-from workbench.machine.web_assets import web_assets_folder
+from workbench.machine.folders import web_assets_folder
 from workbench.ui.server import responses
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.responses import DIRECTIVES, HANDLERS

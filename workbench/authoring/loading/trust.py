@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import msgspec
 
 from workbench.authoring.loading.task_content import TaskContent
-from workbench.machine.user_folder import locked, read_private, set_aside, user_folder, write_private
+from workbench.machine.folders import locked, read_private, set_aside, user_folder, write_private
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from enum import Enum
 from hashlib import sha256
 from typing import Any
 
-from workbench.machine.user_folder import create_private, read_private, set_aside
+from workbench.machine.folders import create_private, read_private, set_aside
 from workbench.recording.episode.document import SHARED, Description, SealJson, as_json
 from workbench.recording.episode.episode import EpisodeInfo
 

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import msgspec
 
-from workbench.machine.user_folder import cache_folder
+from workbench.machine.folders import cache_folder
 from workbench.recording.episode.row import Facts, LibraryEntry, clean_facts
 from workbench.recording.reader.scan import RecordingFiles
 

@@ -21,9 +21,9 @@ from typing import IO
 
 import rerun_cli
 
+from workbench.machine.folders import cache_folder
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.text import only_colours
-from workbench.machine.user_folder import cache_folder
 
 LOOPBACK = "127.0.0.1"
 START_SECONDS = 20.0

@@ -24,14 +24,14 @@ from workbench.jobs.open_task import OpenedTask, Opening, blamed, warm_up
 from workbench.jobs.pool import Answer, CannotAnswer, Progress
 from workbench.jobs.task import Restored
 from workbench.jobs.verdict import Rescore
-from workbench.machine.processes.current_folder import CurrentFolder
-from workbench.machine.processes.wire import Call, Question, pack
-from workbench.session.process.debugger import (
+from workbench.machine.folders import CurrentFolder
+from workbench.machine.processes.debugger import (
     CannotDebug,
     listen_for_debugger,
     listening_text,
     wait_for_debugger,
 )
+from workbench.machine.processes.wire import Call, Question, pack
 from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     SCENE_KEPT,

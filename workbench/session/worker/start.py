@@ -35,7 +35,7 @@ def main() -> None:
 
     heartbeat = HeartbeatWriter(heartbeat_fd)
     heartbeat.begin("starting")
-    from workbench.machine.processes.breakpoints import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
+    from workbench.machine.processes.debugger import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
 
     if niceness:  # in the background; the worker that plays is the one that is debugged
         pass_breakpoints()

@@ -24,8 +24,7 @@ from workbench.ui.cameras.export import CameraExport
 from workbench.ui.cameras.fields import CameraNumbers
 from workbench.ui.cameras.frustums import PlacedFrustum
 from workbench.ui.cameras.gizmo import CameraGizmo, LookThrough
-from workbench.ui.cameras.panel import KIND_NAMES, StudioPicture
-from workbench.ui.cameras.pixel_probe import CameraPick
+from workbench.ui.cameras.panel import KIND_NAMES, CameraPick, StudioPicture
 from workbench.ui.cameras.pose_math import Floats, Frame, Placing, Snap, nudged, panned
 from workbench.ui.cameras.report import CameraReportPanel
 from workbench.ui.cameras.suggest import CameraSuggest

@@ -15,7 +15,7 @@ import viser
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from workbench.machine.web_assets import web_assets_folder
+from workbench.machine.folders import web_assets_folder
 from workbench.ui.server import access, viser_private
 from workbench.ui.server.listening import DEFAULT_PORT, Listening, ServerError, listen_on_file, listen_on_port
 from workbench.ui.server.responses import (

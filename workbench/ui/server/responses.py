@@ -19,8 +19,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from workbench.machine.folders import web_assets_folder
 from workbench.machine.text import short_line
-from workbench.machine.web_assets import web_assets_folder
 from workbench.ui.server import access, viser_private
 from workbench.ui.server.file_response import FileReply, send_file
 

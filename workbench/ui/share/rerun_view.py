@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 import viser
 
-from workbench.machine.web_assets import web_assets_folder
+from workbench.machine.folders import web_assets_folder
 from workbench.recording.reader.reading import read_rerun_info
 from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, viewer_file, viewer_is_cached
 from workbench.ui.server.file_response import Downloads, FileReply

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import jinja2
 
+from workbench.machine.folders import web_assets_folder
 from workbench.machine.text import plain_text
-from workbench.machine.web_assets import web_assets_folder
 
 
 def render(template: str, **values: Any) -> str:

@@ -1,8 +1,7 @@
-"""Lets a debugger attach to the worker through debugpy, and reports when it holds the main thread."""
+"""Lets a debugger attach to a worker, and answers ``breakpoint()`` and ``pdb.set_trace()`` without a terminal."""
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import os
 import pdb
@@ -10,7 +9,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 USUAL_PORT = 5678
 """The default of editors."""
@@ -78,8 +77,11 @@ def _report_suspension(debugger: Any, hold: Callable[[bool], None]) -> None:
     """
     wait_suspended = getattr(debugger, "do_wait_suspend", None)
     if wait_suspended is None:
-        version = importlib.metadata.version("debugpy")
-        raise CannotDebug(f"debugpy {version} is not known to the workbench; install debugpy==1.8.22")
+        from importlib.metadata import version
+
+        raise CannotDebug(
+            f"debugpy {version('debugpy')} is not known to the workbench; install debugpy==1.8.22"
+        )
 
     def reported(self: Any, thread: threading.Thread, *arguments: Any, **keywords: Any) -> Any:
         if thread is not threading.main_thread():
@@ -140,3 +142,41 @@ def listening_text(port: int, waits: bool) -> str:
     if waits:
         return f"the worker waits for a debugger at {at}; the task is loaded when one has attached"
     return f"the worker listens for a debugger at {at}"
+
+
+# --- processes without a debugger -------------------------------------------------------------------
+
+
+OPEN_WITH_DEBUG = "remove this line, or open with --debug and attach a debugger"
+ONE_PROCESS = "remove this line, or use --workers 1 in a terminal, where Python's own debugger answers"
+
+
+class NoDebugger(RuntimeError):
+    """The author's code calls a debugger where there is no terminal."""
+
+
+def refuse_breakpoints(advice: str) -> None:
+    """Make both raise `NoDebugger` at their own line, in this process.
+
+    Python's debugger would read the end of its input and raise a bare ``BdbQuit`` at the next line. A ``PYTHONBREAKPOINT``
+    that names another function, or 0, stays in effect.
+
+    Args:
+        advice: what to do instead, appended after a colon.
+    """
+
+    def refuse_breakpoint(*arguments: Any, **keywords: Any) -> NoReturn:
+        raise NoDebugger(f"this line stops for a debugger, and there is no terminal to ask in: {advice}")
+
+    if os.environ.get("PYTHONBREAKPOINT", "") in ("", "pdb.set_trace"):
+        sys.breakpointhook = refuse_breakpoint
+    pdb.set_trace = refuse_breakpoint
+
+
+def pass_breakpoints() -> None:
+    """Make both do nothing in this process, which runs in the background."""
+
+    def pass_breakpoint(*arguments: Any, **keywords: Any) -> None:
+        pass
+
+    sys.breakpointhook = pdb.set_trace = pass_breakpoint

@@ -1,10 +1,11 @@
-"""The user's configuration folder: private files, replaced whole, by one process at a time."""
+"""The user's private folder, the folder of the page's files, and the current folder."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import stat
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -126,3 +127,58 @@ def _check_private(path: Path, status: os.stat_result) -> None:
         raise NoUserFolder(f"{path} belongs to another user")
     if status.st_mode & 0o022:
         raise NoUserFolder(f"others than this user may write to {path}: chmod go-w {path}")
+
+
+# --- the page's files -------------------------------------------------------------------------------
+
+
+def web_assets_folder() -> Path:
+    """Folder with the files for the browser: ``web_assets/`` of a checkout, ``workbench/_web_assets`` of a wheel.
+
+    The wheel's copy is asked first: an installed package must not pick up a folder beside it in site-packages.
+
+    Raises:
+        FileNotFoundError: neither the wheel's copy nor the checkout's folder is there.
+    """
+    from importlib import resources  # late: 10 ms that most commands do not need
+
+    package = Path(str(resources.files("workbench")))
+    for folder in (package / "_web_assets", package.parent / "web_assets"):
+        if (folder / "refused.html").is_file():
+            return folder
+    raise FileNotFoundError(
+        f"The page's files are missing: neither {package / '_web_assets'} nor {package.parent / 'web_assets'} "
+        "holds refused.html. Install workbench again (pip install --force-reinstall), or check out web_assets/."
+    )
+
+
+# --- the current folder, which a task may change by os.chdir ----------------------------------------
+
+
+_AT_FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
+
+
+class CurrentFolder:
+    """The current folder at construction, by descriptor, so that it may be renamed."""
+
+    def __init__(self) -> None:
+        self._fd = os.open(".", _AT_FOLDER)
+        weakref.finalize(self, os.close, self._fd)
+
+    @contextmanager
+    def again(self, *, stay: bool = False) -> Iterator[None]:
+        """Within this it is the current folder; afterwards the previous one is.
+
+        Args:
+            stay: keep the folder in which the block ends, unless it raises.
+        """
+        before = os.open(".", _AT_FOLDER)
+        leave = True
+        try:
+            os.fchdir(self._fd)
+            yield
+            leave = not stay
+        finally:
+            if leave:
+                os.fchdir(before)
+            os.close(before)

@@ -13,8 +13,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from workbench.machine import user_folder as module
-from workbench.machine.user_folder import (
+from workbench.machine import folders as module
+from workbench.machine.folders import (
     MOST_BYTES,
     NoUserFolder,
     create_private,

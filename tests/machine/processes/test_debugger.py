@@ -19,10 +19,10 @@ from tests.session.debug_client import DebugClient
 from workbench.cli.main import main
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.debugger import port_for_debugger
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.process import supervisor
-from workbench.session.process.debugger import port_for_debugger
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.ui.live.banners import is_busy_for_long
 from workbench.ui.live.status_line import status_values
@@ -172,7 +172,7 @@ def test_a_port_that_is_taken_is_refused_or_another_found(monkeypatch: pytest.Mo
         taken = other.getsockname()[1]
         with pytest.raises(ValueError, match=f"--debug-port {taken} cannot be listened on"):
             port_for_debugger(taken)
-        monkeypatch.setattr("workbench.session.process.debugger.USUAL_PORT", taken)
+        monkeypatch.setattr("workbench.machine.processes.debugger.USUAL_PORT", taken)
         assert port_for_debugger(None) not in (0, taken)
 
 

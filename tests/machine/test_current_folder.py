@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.processes.current_folder import CurrentFolder
+from workbench.machine.folders import CurrentFolder
 
 
 def test_one_comes_back_to_it_also_where_it_was_renamed(
