@@ -35,7 +35,7 @@ from workbench.machine.doctor import find_chromium, how_to_get_chromium
 GOLDEN = Path(__file__).parents[1] / "golden"
 PLACE = Path("/tmp/golden")
 LIVE_TABS = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Log")
-REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "Judge", "Share")
+REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "Rescore", "Share")
 STEPS = 6
 WIDTH, HEIGHT = 1280, 1000
 PATIENCE = 60.0

@@ -47,7 +47,7 @@ def shoot_branch(page: Page) -> None:
         time.sleep(2.0)
     for _ in range(18):
         page.get_by_role("button", name="‹ step", exact=True).click()
-    page.get_by_role("button", name=re.compile("Go on from here")).click()
+    page.get_by_role("button", name=re.compile("Continue from here")).click()
     for play in ("Play", "Pause"):
         page.get_by_role("button", name=play, exact=True).click()
         time.sleep(1.0)
@@ -209,25 +209,25 @@ def shoot_review(chromium: str) -> None:
             shoot(page, "compare")
 
 
-def shoot_camera_judged(page: Page) -> None:
+def shoot_measured_camera(page: Page) -> None:
     """What a camera sees of all envs: the table, the depths, and the pictures."""
     tab(page, "Studio")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="base_camera · sensor", exact=True).click()
-    page.get_by_text("Judge", exact=True).click()
-    page.get_by_role("button", name="Judge this camera").click()
+    page.get_by_text("Measure", exact=True).click()
+    page.get_by_role("button", name="Measure this camera").click()
     expect(page.locator(".wb-planes")).to_be_visible()
     page.get_by_role("button", name="Pictures of all envs").click()
     envs = page.locator(".wb-sheet figure")
     expect(envs).to_have_count(16)
     envs.first.click()
-    page.get_by_role("button", name="Judge this camera").evaluate("e => e.scrollIntoView({block: 'start'})")
-    shoot(page, "judge_camera")
+    page.get_by_role("button", name="Measure this camera").evaluate("e => e.scrollIntoView({block: 'start'})")
+    shoot(page, "measured_camera")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="none", exact=True).click()
 
 
-def shoot_judged(page: Page, file: Path) -> None:
+def shoot_rescored(page: Page, file: Path) -> None:
     """A reward that asks for less is saved: what it says of the episodes so far, and one moment of them."""
     good = file.read_text()
     asked = "reach = 1 - torch.tanh(5 * distance)"
@@ -240,7 +240,7 @@ def shoot_judged(page: Page, file: Path) -> None:
     expect(rows.nth(1)).to_have_class("wb-selected")
     time.sleep(2.0)
     page.locator(".wb-again-more").scroll_into_view_if_needed()
-    shoot(page, "judged")
+    shoot(page, "rescored")
     page.get_by_role("button", name="now", exact=True).click()
     file.write_text(good)
     expect(page.get_by_text("Nothing differs").first).to_be_visible(timeout=120_000)
@@ -275,13 +275,13 @@ def main() -> None:
             shoot(page, "run")
             page.get_by_role("button", name="Pause", exact=True).click()
             shoot_branch(page)
-            shoot_judged(page, file)
+            shoot_rescored(page, file)
             tab(page, "Cameras")
             for tick in page.locator("input[type=checkbox]:visible").all()[1:4]:
                 tick.check(force=True)
             time.sleep(4)
             shoot(page, "cameras")
-            shoot_camera_judged(page)
+            shoot_measured_camera(page)
             shoot_reloads(page, file)
             lines = TASK.read_text().splitlines()
             place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)

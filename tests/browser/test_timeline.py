@@ -186,7 +186,7 @@ def test_the_timeline_keeps_its_height_when_it_offers_to_go_on(desk: Desk) -> No
     panel = ".mantine-Paper-root:has(.wb-timeline)"
     live = desk.box(panel)
     desk.press("ArrowLeft")
-    expect(desk.page.get_by_role("button", name="Go on from here: env 0")).to_be_visible()
+    expect(desk.page.get_by_role("button", name="Continue from here: env 0")).to_be_visible()
     past = desk.box(panel)
     assert abs(past["height"] - live["height"]) < 1
 
@@ -196,7 +196,7 @@ def test_going_on_from_a_moment_leaves_the_old_future_in_reach(desk: Desk) -> No
     before = arcs.count()
     desk.press("ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowLeft")
     desk.comes_to(STEPS - 4)
-    desk.page.get_by_role("button", name="Go on from here: env 0").click()
+    desk.page.get_by_role("button", name="Continue from here: env 0").click()
     desk.timeline_says("live")
     desk.comes_to(STEPS - 4)
     desk.page.keyboard.press("s")

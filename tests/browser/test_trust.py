@@ -35,10 +35,10 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
     ):
         page.locator("tr", has_text="WorkbenchPushCube").first.click()
         page.keyboard.press("Enter")
-        live = page.get_by_role("button", name="Go on live from here")
+        live = page.get_by_role("button", name="Continue live from here")
         expect(live).to_be_visible(timeout=PATIENT)
-        page.get_by_role("tab", name="Judge").click()
-        rescore = page.get_by_role("button", name="Judge what is open")
+        page.get_by_role("tab", name="Rescore").click()
+        rescore = page.get_by_role("button", name="Rescore what is open")
         rescore.click()
         window = page.get_by_role("dialog")
         expect(window).to_contain_text(str(file), timeout=PATIENT)

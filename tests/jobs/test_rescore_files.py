@@ -185,7 +185,7 @@ def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, 
     dataset = tmp_path / "set"
     assert export_in_terminal([tmp_path / "made"], dataset, ExportOptions()) == 0
     assert {source.kind for source in find_all_sources([dataset])} == {"lerobot"}
-    with pytest.raises(UnreadableRecording, match="LeRobot dataset cannot be judged again"):
+    with pytest.raises(UnreadableRecording, match="LeRobot dataset cannot be rescored"):
         rescore_all(RescoreOptions((dataset,)))
     verdicts, _ = rescore_all(RescoreOptions((dataset, author / "recordings")))
     assert len(verdicts) == EPISODES and not any(verdict.why_not for verdict in verdicts)

@@ -116,7 +116,7 @@ def test_one_that_was_not_judged_says_nothing_else() -> None:
     found = Verdict("it", why_not="it has no step")
     assert (found.seed, found.length, found.returns, found.largest, found.differing) == (-1, 0, (0, 0), 0, ())
     assert len(found.old_reward) == len(found.new_reward) == 0 and found.metres is None
-    assert verdict_text.change_text(found) == "not judged: it has no step"
+    assert verdict_text.change_text(found) == "not rescored: it has no step"
 
 
 def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:

@@ -189,13 +189,13 @@ def rescore(
     json: Path | None = None,
     trust: bool = False,
 ) -> int:
-    """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise (on the page: Judge again).
+    """Rescore recorded episodes with today's reward and evaluate, and list what differs (on the page: Rescore).
 
     Args:
         places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
-        task: a task file, file.py:ClassName, package.module:ClassName or id to judge all of them with, in place of the
+        task: a task file, file.py:ClassName, package.module:ClassName or id to rescore all of them with, in place of the
             one each names.
-        recorded_source: judge each by the text that it was recorded with.
+        recorded_source: rescore each with the text that it was recorded with.
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
         csv: also write the table to this file, as CSV.
         json: also write the table to this file, as JSON.
@@ -206,7 +206,7 @@ def rescore(
         from workbench.cli.rescore import RescoreOptions, run_rescore
 
     if task is not None and recorded_source:
-        return refuse("--task and --recorded-source name two versions to judge with: give one of them")
+        return refuse("--task and --recorded-source name two versions to rescore with: give one of them")
     for table in (csv, json):
         if table is not None and not table.resolve().parent.is_dir():
             return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")

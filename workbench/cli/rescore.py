@@ -81,7 +81,7 @@ def rescore_all(
     files = [s for s in find_all_sources([place.absolute() for place in what.places]) if s.kind != "lerobot"]
     if not files:
         raise UnreadableRecording(
-            f"A LeRobot dataset cannot be judged again: {', '.join(map(str, what.places))}."
+            f"A LeRobot dataset cannot be rescored: {', '.join(map(str, what.places))}."
         )
     groups, verdicts = group_episodes(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
@@ -149,7 +149,7 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
         row = bar.add_task("reading the recordings", total=None)
 
         def report(episodes: int, total: int, steps: int) -> None:
-            bar.update(row, total=total, completed=episodes, description=f"judging, {steps} steps")
+            bar.update(row, total=total, completed=episodes, description=f"rescoring, {steps} steps")
 
         @contextmanager
         def without_bar() -> Iterator[None]:
@@ -166,7 +166,7 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
             Clearances(ask=ask, all_trusted=trust),
             warn,
         )
-        bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
+        bar.update(row, total=len(verdicts), completed=len(verdicts), description="rescored")
     for path, text in ((csv, verdict_text.as_csv), (json, verdict_text.as_json)):
         if path is not None:
             with here.again():

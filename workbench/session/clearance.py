@@ -22,7 +22,7 @@ LONGEST = 400
 """Characters of a shown name."""
 FOLLOWED = (
     "From then on, for as long as it is open live, every save of this file and of the modules beside it runs without asking, "
-    "whoever saves it, and Judge again takes the file as it is."
+    "whoever saves it, and Rescore takes the file as it is."
 )
 """Warning before going live with a file that a recording names."""
 

@@ -209,7 +209,7 @@ def test_a_press_on_a_row_that_has_moved_selects_that_row_and_made_up_numbers_se
 
 def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) -> None:
     rescored: list[tuple[str, ...]] = []
-    table.panel.add_action(Action("Judge again", "With today's code", rescored.append))
+    table.panel.add_action(Action("Rescore", "With today's code", rescored.append))
     table.draw()
     assert table.panels.html("wb-pill").count("wb-off") >= 5
     ids = newest(0, 5)

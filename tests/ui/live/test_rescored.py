@@ -149,14 +149,14 @@ def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
 
 def test_nothing_is_shown_before_the_first_judgement(rescoring: Rescoring) -> None:
     rescoring.draw(RescoreView())
-    assert not any(rescoring.panels.shows(name) for name in ("Stop judging", "Curve"))
+    assert not any(rescoring.panels.shows(name) for name in ("Stop rescoring", "Curve"))
     assert rescoring.panels.html("wb-again") == "" and rescoring.panels.charts() == []
 
 
 def test_only_what_runs_can_be_stopped(rescoring: Rescoring) -> None:
     for state, stoppable in (("loading", True), ("rescoring", True), ("done", False), ("failed", False)):
         rescoring.draw(done(state=state, serial=hash(state)))
-        assert rescoring.panels.shows("Stop judging") == stoppable and rescoring.panels.html("wb-again")
+        assert rescoring.panels.shows("Stop rescoring") == stoppable and rescoring.panels.html("wb-again")
 
 
 def test_the_new_line_lies_over_the_recorded_one(rescoring: Rescoring) -> None:
@@ -167,7 +167,7 @@ def test_the_new_line_lies_over_the_recorded_one(rescoring: Rescoring) -> None:
     assert [series.get("label") for series in chart.series] == [
         "step",
         "as recorded",
-        "judged again",
+        "rescored",
     ]
     recorded, rescored = ((series.get("width"), series.get("stroke")) for series in chart.series[1:])
     assert recorded[0] is not None and rescored[0] is not None and recorded[0] < rescored[0]

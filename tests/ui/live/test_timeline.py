@@ -87,7 +87,7 @@ def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Env
     assert np.array_equal(lived.hand(), there)
     assert "2 steps ago" in lived.panels.html("wb-status") and "2 steps ago" in lived.strip()
     travel = lived.panels.control("way to go on")
-    assert travel.options == ("Go on from here: env 0", "all envs", "env 0 into all envs")
+    assert travel.options == ("Continue from here: env 0", "all envs", "env 0 into all envs")
     assert lived.panels.shows("way to go on") and lived.ends() == (-4, 0, -2)
     lived.panels.command("What is live")
     lived.draw()
@@ -99,7 +99,7 @@ def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
     lived.panels.choose(panel.LAST_STEP)
     lived.panels.choose(panel.LAST_STEP)
     lived.draw()
-    lived.panels.choose("Go on from here: env 0")
+    lived.panels.choose("Continue from here: env 0")
     view = wait_until(lived.session, lambda view: view.timeline.last == 5, "the jump")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [2, 4, 4]
     lived.draw()
@@ -158,10 +158,10 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
 
 
 def test_of_one_env_there_is_one_way_to_go_on() -> None:
-    assert panel.continue_labels(running(1)) == ("Go on from here",)
-    assert panel.continue_labels(SessionView()) == ("Go on from here",)
+    assert panel.continue_labels(running(1)) == ("Continue from here",)
+    assert panel.continue_labels(SessionView()) == ("Continue from here",)
     labels = panel.continue_labels(running(3, selected_env=2))
-    assert labels == ("Go on from here: env 2", "all envs", "env 2 into all envs")
+    assert labels == ("Continue from here: env 2", "all envs", "env 2 into all envs")
 
 
 def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: EnvMoment) -> None:

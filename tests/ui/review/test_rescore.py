@@ -1,4 +1,4 @@
-"""What the Judge tab says of verdicts, and where a press on one goes."""
+"""What the Rescore tab says of verdicts, and where a press on one goes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> 
     assert verdict_text.change_text(reward) == "reward by up to 0.25, from step 4"
     assert verdict_text.change_text(verdict()) == "as it was"
     assert verdict_text.change_text(verdict(differing=("height",))) == "as it was, but for height"
-    assert verdict_text.change_text(verdict(why_not="it has no step")) == "not judged: it has no step"
+    assert verdict_text.change_text(verdict(why_not="it has no step")) == "not rescored: it has no step"
     assert verdict_text.returns_text(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
 
 
@@ -64,10 +64,10 @@ def test_all_of_them_are_one_sentence() -> None:
         verdict("c", why_not="x"),
     ]
     assert verdict_text.summary(many) == (
-        "1 of 2 episodes differs. Episodes with success: 0 → 1. Mean return: 5.5 → 7.5. 1 episode not judged."
+        "1 of 2 episodes differs. Episodes with success: 0 → 1. Mean return: 5.5 → 7.5. 1 episode not rescored."
     )
     assert verdict_text.summary(many[:1]).startswith("Nothing differs in 1 episode:")
-    assert verdict_text.summary(many[2:]) == "No episode could be judged."
+    assert verdict_text.summary(many[2:]) == "No episode could be rescored."
     assert "to the last bit" in verdict_text.drift_summary(many) and not verdict_text.count_drifted(many)
     assert verdict_text.drift_summary([verdict(metres=None)]) == ""
     told = verdict_text.drift_summary([verdict(metres=0.032)], verdict_text.PUT_IN)
@@ -96,7 +96,7 @@ def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     assert "push.py:88" in html and "<b>" not in html and "&lt;b&gt;" in html
     assert "Select recordings" in status_html(RescoreView(), idle=IDLE)
     told = RescoreView("rescoring", 2, (verdict(),), 1, 3, "episodes", task="Push-v1")
-    assert "judging with Push-v1: 1 of 3 episodes" in status_html(told)
+    assert "rescoring with Push-v1: 1 of 3 episodes" in status_html(told)
 
 
 @pytest.fixture
@@ -165,13 +165,13 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     ]
     rescoring.draw(RescoreView("done", 1, tuple(given), 3, 3))
     assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
-    assert not any(rescoring.panels.shows(name) for name in ("Judge what is open", "Stop"))
+    assert not any(rescoring.panels.shows(name) for name in ("Rescore what is open", "Stop"))
     rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
     until(lambda: review.view().opened, "the recording", seen=lambda: review.view().problems)
     view = review.view()
     assert view.opened[0].id == rows[2].id and view.states == (3,)
     rescoring.draw(replace(rescoring.told.view, serial=2))
-    assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Judge what is open")
+    assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Rescore what is open")
     assert "wb-selected" in rescoring.panels.html()
 
 
@@ -184,9 +184,9 @@ def test_why_nothing_could_be_judged_is_said_once(rescoring: Rescoring) -> None:
     )
     rescoring.draw(RescoreView("failed", 1, lost, 3, 3, why=why))
     assert rescoring.panels.html().count("is not trusted") == 1
-    assert "not judged: it has no step" in rescoring.panels.html()
+    assert "not rescored: it has no step" in rescoring.panels.html()
     rescoring.draw(RescoreView("done", 2, lost, 3, 3))
-    assert rescoring.panels.html().count(f"not judged: {why}") == 2, "nothing else says it"
+    assert rescoring.panels.html().count(f"not rescored: {why}") == 2, "nothing else says it"
 
 
 def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescoring: Rescoring) -> None:
@@ -203,7 +203,7 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
     assert said == [
         ([], "|seed 7||reward by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
         (["wb-same"], "|seed 5||as it was||10|"),
-        (["wb-same"], "|seed 6||not judged: it has no step|||"),
+        (["wb-same"], "|seed 6||not rescored: it has no step|||"),
     ]
     assert verdict_text.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
 

@@ -1,4 +1,4 @@
-"""The judgement on one request, as a function: `test_door_attacks` asks the same over real sockets."""
+"""The judgement on one request, as a function: `test_attacks` asks the same over real sockets."""
 
 from __future__ import annotations
 

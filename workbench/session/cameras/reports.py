@@ -116,7 +116,7 @@ class CameraReports:
                 question = MeasureCamera(camera.key, None, 0)
                 self._measure(job, self._live, question, camera.now, [], cases, len(cases), every)
 
-        self._live_lane.start(f"judging {camera.key[1]} {over}", work)
+        self._live_lane.start(f"measuring {camera.key[1]} {over}", work)
 
     def _measure_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
         question = MeasureCamera(camera.key, camera.now if camera.moved else None, 0)
@@ -141,7 +141,7 @@ class CameraReports:
             with self._measuring():
                 self._background.in_turns(job, measure)
 
-        self._background_lane.start(f"judging {camera.key[1]} over {seeds} seeds", work)
+        self._background_lane.start(f"measuring {camera.key[1]} over {seeds} seeds", work)
 
     def _measure(
         self,

@@ -334,7 +334,7 @@ class PastRescorer:
         except JobFailed as failure:
             if failure.problem is None:
                 raise
-            raise JobFailed("the new code could not be loaded to judge with", failure.problem) from failure
+            raise JobFailed("the new code could not be loaded to rescore with", failure.problem) from failure
 
     def _replay_steps(
         self,

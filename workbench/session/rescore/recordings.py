@@ -252,7 +252,7 @@ class Rescorer:
             if failure.problem is None:
                 raise
             raise JobFailed(
-                f"{group.info.task} could not be opened to judge with", failure.problem
+                f"{group.info.task} could not be opened to rescore with", failure.problem
             ) from failure
         self._update(job, state="rescoring")
         began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps

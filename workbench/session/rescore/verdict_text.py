@@ -23,7 +23,7 @@ _MOST_NAMED = 4
 def change_text(verdict: Verdict[Any]) -> str:
     """The change of success and fail, or else of the reward; ``as it was`` if nothing differs."""
     if verdict.why_not:
-        return f"not judged: {verdict.why_not}"
+        return f"not rescored: {verdict.why_not}"
     flags = (("success", verdict.success), ("fail", verdict.fail))
     changes = [_flag_text(name, was, now) for name, (was, now) in flags if was != now]
     if changes:
@@ -79,7 +79,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     """
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
     if not rescored:
-        return "No episode could be judged." if verdicts else ""
+        return "No episode could be rescored." if verdicts else ""
     differing, yet = sum(verdict.differs for verdict in rescored), " so far" * so_far
     if differing:
         return f"{differing} of {counted(len(rescored), 'episode')} {'differs' if differing == 1 else 'differ'}{yet}."
@@ -99,7 +99,7 @@ def totals(verdicts: Sequence[Verdict[Any]]) -> list[str]:
         means = (mean_text([verdict.returns[k] for verdict in rescored]) for k in (0, 1))
         texts.append(f"mean return: {_was_now(*means)}")
     skipped = len(verdicts) - len(rescored)
-    return texts + ([f"{counted(skipped, 'episode')} not judged"] if rescored and skipped else [])
+    return texts + ([f"{counted(skipped, 'episode')} not rescored"] if rescored and skipped else [])
 
 
 def summary(verdicts: Sequence[Verdict[Any]]) -> str:

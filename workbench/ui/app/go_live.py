@@ -256,7 +256,7 @@ class GoLivePart(PagePart[ReviewView]):
         self._about: object = None
         """The recording and the code that the note below the code is about."""
         gui = server.gui
-        self._folder = gui.add_folder("Going on live", expand_by_default=False, visible=False)
+        self._folder = gui.add_folder("Continue live", expand_by_default=False, visible=False)
         with self._folder:
             self._code = gui.add_dropdown(
                 "Code",

@@ -122,7 +122,7 @@ class ReviewPage:
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
             compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
-        with tabs.add_tab("Judge", viser.Icon.GAVEL):
+        with tabs.add_tab("Rescore", viser.Icon.GAVEL):
             self._rescore = RescorePanel(
                 server, place.rescorer, review, library, place.rescore_choices, place.task_files
             )
@@ -154,7 +154,7 @@ class ReviewPage:
         )
         self._library.add_action(
             Action(
-                "Judge again",
+                "Rescore",
                 "Run today's reward and evaluate over them (J)",
                 self._rescore.rescore_and_notify,
             )
@@ -326,8 +326,8 @@ class ReviewPage:
             Command("Frame what is shown", self._in_3d.frame, "F"),
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
-            Command("Judge again what is selected, or else what is open", self._rescore_chosen, "J"),
-            Command("Go on live from here", self._panel.enter_recording, "G"),
+            Command("Rescore the selected recordings, or else the open ones", self._rescore_chosen, "J"),
+            Command("Continue live from here", self._panel.enter_recording, "G"),
         ]
         if self._place.session is not None:
             commands.append(Command(BACK, self._go_back, "V"))

@@ -33,7 +33,7 @@ class CameraReportPanel:
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
+        with server.gui.add_folder("Measure", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
                 OVERS,
@@ -58,7 +58,7 @@ class CameraReportPanel:
                 visible=False,
                 hint="How many, each with a seed of its own.",
             )
-            self._measure = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
+            self._measure = server.gui.add_button("Measure this camera", icon=viser.Icon.CHECKLIST)
             self._report = JobResult(server, session)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"

@@ -239,7 +239,7 @@ class StudioPanel(PagePart[SessionView]):
             [
                 self._tool(
                     "Undo",
-                    f"Take back: {studio.undo} (Ctrl+Z)" if studio.undo else "There is nothing to take back.",
+                    f"Undo: {studio.undo} (Ctrl+Z)" if studio.undo else "There is nothing to undo.",
                     "undo",
                     lambda _: actions.undo(),
                     off=studio.undo is None,
@@ -341,7 +341,7 @@ class StudioPanel(PagePart[SessionView]):
     def commands(self) -> list[Command]:
         """Commands with keys. The arrow keys alone belong to the timeline."""
         return [
-            Command("Take back the last change of a camera", self._session.studio.undo, "Z", "cmd/ctrl"),
+            Command("Undo the last change of a camera", self._session.studio.undo, "Z", "cmd/ctrl"),
             Command("Make it again", self._session.studio.redo, "Z", "cmd/ctrl+shift"),
             self._moves("to its left", "arrowleft", (0, STEP, 0)),
             self._moves("to its right", "arrowright", (0, -STEP, 0)),

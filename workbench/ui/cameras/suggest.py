@@ -89,7 +89,7 @@ class CameraSuggest:
                 min=1,
                 max=MOST_RESETS,
                 step=1,
-                hint="Freshly reset envs in which a placement is judged; as many as there are envs at most.",
+                hint="Freshly reset envs in which a placement is measured; as many as there are envs at most.",
             )
             self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
             self._offers = JobResult(server, session)

@@ -43,7 +43,7 @@ class CameraChange:
         self._text = gui.add_html("", visible=False)
         self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
         self._undo = gui.add_button(
-            "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+            "Undo it in the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
         )
         self._copy = gui.add_button(
             "Copy the task into my folder",

@@ -170,7 +170,7 @@ class LibraryPanel(PagePart[object]):
                 for action in self._actions
                 if action.named
             ),
-            Command("Take back the last deletion", self._edits.undo_delete, "Z"),
+            Command("Undo the last deletion", self._edits.undo_delete, "Z"),
         ]
         self.keys = tuple(command.combination for command in commands)
         commands = [replace(command, registered=self._keys.append) for command in commands]

@@ -14,8 +14,8 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
-RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
-KEEP_BEFORE = "Keep the episode before"
+RECORD, NEXT, KEEP = "Record", "Record the next episode", "Save what I just saw"
+KEEP_BEFORE = "Save the episode before"
 STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
 
 
@@ -23,7 +23,7 @@ class RecordPanel(PagePart[SessionView]):
     """Three buttons, each of which also stops what it began, and their state in words.
 
     *Record* begins a fresh episode, since one without its reset cannot be replayed; *Record the next episode* waits for a
-    reset; *Keep what I just saw* makes a recording of the past.
+    reset; *Save what I just saw* makes a recording of the past.
     """
 
     every = 0.2
@@ -126,7 +126,7 @@ def has_one_before(view: SessionView) -> bool:
 
 
 def what_keeping_means(view: SessionView, all_envs: bool) -> str:
-    """Which episode *Keep what I just saw* takes, if it is a running one; else empty."""
+    """Which episode *Save what I just saw* takes, if it is a running one; else empty."""
     steps = runs_since(view)
     if steps is None or view.task is None:
         return ""

@@ -20,14 +20,14 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.rescored import RescoredPanel
 from workbench.ui.widgets.templates import render
 
-TITLE = "The past, judged again"
+TITLE = "The past, rescored"
 
 
 class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         super().__init__(server, "env")
         self._session = session
-        self._add_status("Stop judging", session.rescorer.stop)
+        self._add_status("Stop rescoring", session.rescorer.stop)
         names: tuple[str, ...] = ("reward",)
         self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Curve",
@@ -125,10 +125,10 @@ def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, ...]:
 def in_a_line(rescored: RescoreView) -> str:
     """Summary in one line; empty while there is nothing to report."""
     if rescored.state == "loading":
-        return "The past is judged again: loading the new code"
+        return "Rescoring the past: loading the new code"
     if rescored.state == "rescoring":
         # In tenths: each change is sent to the page.
-        return f"The past is judged again: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
+        return f"Rescoring the past: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
     if rescored.state == "done":
         return f"{TITLE}: {verdict_text.headline(rescored.verdicts, others=rescored.differing_names)}"
     return f"{TITLE}: {rescored.why}" if rescored.why else ""

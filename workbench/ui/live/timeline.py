@@ -36,7 +36,7 @@ STANDS_STILL = 0.35
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "step ›", "event ›", "now"
 EPISODE, EVERYTHING = "zoom to episode", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
-GO_ON = "Go on from here"
+GO_ON = "Continue from here"
 UNDO = "undo"
 """Start of the undo button's label; what is undone follows."""
 WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)

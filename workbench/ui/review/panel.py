@@ -19,7 +19,7 @@ from workbench.ui.widgets.templates import letter, render
 
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "over each other", "side by side"
-GO_LIVE, STAY = "Go on live from here", "Stay here"
+GO_LIVE, STAY = "Continue live from here", "Stay here"
 
 
 class ReviewPanel(PagePart[ReviewView]):

@@ -1,4 +1,4 @@
-"""The Judge tab of the review: runs recorded episodes again with today's or other code, and lists what differs."""
+"""The Rescore tab of the review: runs recorded episodes again with today's or other code, and lists what differs."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _recorded(infos: Sequence[EpisodeInfo]) -> str:
 
 IDLE = (
     "Runs today's reward and evaluate over recorded episodes, from their seeds and with their actions, and lists what is "
-    "judged otherwise now. Select recordings in the Library and press Judge again there, or judge what is open."
+    "different now. Select recordings in the Library and press Rescore there, or rescore what is open."
 )
 
 
@@ -128,7 +128,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         self._rescorer, self._review = rescorer, review
         self._library, self._choices, self._known = library, choices, known
         gui = server.gui
-        self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
+        self._begin = gui.add_button("Rescore what is open", icon=viser.Icon.GAVEL, visible=False)
         self._begin.on_click(lambda _: self.rescore([one.id for one in review.view().opened]))
         self._codes = codes_for((), ())
         self._codes_of: object = None
@@ -155,11 +155,11 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
     def rescore_and_notify(self, ids: Sequence[str]) -> None:
         """As `rescore`, for a press from where the tab is not seen."""
         if not ids:
-            tell_all(self._server, "Nothing to judge", "No recording is selected or open.")
+            tell_all(self._server, "Nothing to rescore", "No recording is selected or open.")
             return
         self.rescore(ids)
-        title = f"Judging {counted(len(ids), 'recording')} again"
-        tell_all(self._server, title, "What is otherwise now is listed under Judge.", None, 4.0)
+        title = f"Rescoring {counted(len(ids), 'recording')}"
+        tell_all(self._server, title, "What differs now is listed under Rescore.", None, 4.0)
 
     def rescore(self, ids: Sequence[str]) -> None:
         """Begin with these recordings of the library."""

@@ -71,7 +71,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
     def _draw_chart(
         self, title: str, x: NDArray, old: NDArray, new: NDArray, dot: NDArray | None = None
     ) -> None:
-        lines = ChartLine("as recorded", old, RECORD_COLOUR, 1.2), ChartLine("judged again", new)
+        lines = ChartLine("as recorded", old, RECORD_COLOUR, 1.2), ChartLine("rescored", new)
         self._chart.draw(title, x, lines, dot, span_of([line.values for line in lines]))
 
     def _row(self, place: int) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         told = self._failed_since and verdict.why_not.startswith(self._failed_since)
         return {
             "badge": None,
-            "changed": "not judged" if told else verdict_text.change_text(verdict),
+            "changed": "not rescored" if told else verdict_text.change_text(verdict),
             "returns": "" if verdict.why_not else verdict_text.returns_text(verdict),
             "drift": f"drifted {verdict_text.drift_text(verdict)}" if verdict.drifted else "",
             "same": not verdict.differs,

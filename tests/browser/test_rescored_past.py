@@ -30,7 +30,7 @@ def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
         page.get_by_role("tab", name="Reward").click()
         # Before there is something to say.
         expect(page.locator(".wb-again")).to_have_count(0)
-        expect(page.get_by_role("button", name="Stop judging")).to_have_count(0)
+        expect(page.get_by_role("button", name="Stop rescoring")).to_have_count(0)
         yield desk
 
 
@@ -48,9 +48,9 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
     says(desk, "mean return: .* → ")
     says(desk, "to the last bit")
     expect(desk.page.get_by_text("reward of env 0, before and now")).to_be_visible()
-    expect(desk.page.get_by_text("judged again", exact=True)).to_be_visible()
+    expect(desk.page.get_by_text("rescored", exact=True)).to_be_visible()
     until(lambda: rows(desk).count() >= 6, "the list")
-    expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
+    expect(desk.page.get_by_role("button", name="Stop rescoring")).to_have_count(0)
     above = desk.page.get_by_role("link", name=re.compile(r"judged again: (\d+) of \1 episodes differ"))
     desk.page.set_viewport_size({"width": 1280, "height": 600})
     expect(above).to_be_in_viewport()
@@ -63,7 +63,7 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
 def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
     until(lambda: rows(desk).count() >= 6, "the list")
-    expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
+    expect(desk.page.get_by_role("button", name="Stop rescoring")).to_have_count(0)
     row = rows(desk).nth(2)
     env = row.locator("td").first.inner_text()
     row.click()

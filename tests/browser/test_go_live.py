@@ -62,12 +62,12 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
     with page_at(browser, address) as (page, errors):
         page.locator("tr", has_text="WorkbenchPushCube").first.click()
         page.keyboard.press("Enter")
-        live = page.get_by_role("button", name="Go on live from here")
+        live = page.get_by_role("button", name="Continue live from here")
         expect(live).to_be_visible(timeout=PATIENT)
 
-        page.get_by_role("tab", name="Judge").click()
+        page.get_by_role("tab", name="Rescore").click()
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
-        page.get_by_role("button", name="Judge what is open").click()
+        page.get_by_role("button", name="Rescore what is open").click()
         expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)
         page.get_by_text("reward by up to").click()
         expect(page.get_by_text("step 1 / 15").first).to_be_visible()
@@ -93,7 +93,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
 
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
-        page.get_by_text("Going on live").click()
+        page.get_by_text("Continue live").click()
         page.locator('input[value="today\'s"]:visible').click()
         page.get_by_role("option", name="as recorded", exact=True).click()
         live.click()

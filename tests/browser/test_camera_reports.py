@@ -21,7 +21,7 @@ ENVS = 2
 CAMERA = "base_camera"
 PICTURE = "img[src^='blob:']:visible"
 FOLDERS = {
-    "Judge": "Judge this camera",
+    "Measure": "Measure this camera",
     "Compare": "Keep this placement as A",
     "Suggest a placement": "Search",
     "Matrices and files": "Download",
@@ -128,7 +128,7 @@ def test_a_press_on_the_picture_tells_body_depth_and_point(page: Page) -> None:
 
 
 def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of_another(page: Page) -> None:
-    press(page, "Judge this camera")
+    press(page, "Measure this camera")
     expect(page.get_by_text(f"{ENVS} envs as they are")).to_be_visible()
     row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
     expect(row.locator("td").nth(1)).to_have_text("100 %")
