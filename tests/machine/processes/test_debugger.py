@@ -61,8 +61,10 @@ def session(
         recordings=tmp_path / "recordings",
         worker=WorkerOptions(debug_port=port, debug_wait=True),
     )
+    text = task_file.read_text()
     yield session
     session.close()
+    task_file.write_text(text)  # a breakpoint() left in it would stop the next test's recording for ever
 
 
 @pytest.mark.slow
