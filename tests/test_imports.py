@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import tomllib
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
@@ -138,6 +139,16 @@ def test_the_architecture_page_tells_of_each_folder_what_it_holds_and_what_it_im
         same_layer = {name for name in names - {folder} if layer_of(f"{name}/") == layer_of(f"{folder}/")}
         assert told.get(folder) == (holds, same_layer), folder
     assert set(told) == folders
+
+
+def test_each_line_whose_slips_may_live_is_still_in_its_module() -> None:
+    listed = tomllib.loads((TESTS / "mutants_that_live.toml").read_text())["lives"]
+    gone = [
+        (one["module"], one["line"])
+        for one in listed
+        if one["line"] not in map(str.strip, (PACKAGE / f"{one['module']}.py").read_text().splitlines())
+    ]
+    assert gone == []
 
 
 def test_the_page_is_the_only_part_that_knows_viser() -> None:
