@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import arm  # noqa: F401  registers the robot
-import rescoring
+import judging
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
@@ -35,7 +35,7 @@ class GoldenSeveral(BaseEnv):
         builder = self.scene.create_actor_builder()
         builder.add_box_collision(half_size=[HALF] * 3)
         builder.add_box_visual(half_size=[HALF] * 3)
-        builder.initial_pose = sapien.Pose(p=[rescoring.BEGIN, 0, HALF])
+        builder.initial_pose = sapien.Pose(p=[judging.BEGIN, 0, HALF])
         self.box = builder.build(name="box")
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
@@ -43,19 +43,19 @@ class GoldenSeveral(BaseEnv):
             b = len(env_idx)
             self.agent.reset(torch.zeros((b, 2)))
             place = torch.zeros((b, 3))
-            place[:, 0] = rescoring.BEGIN + 0.01 * torch.rand(b)
+            place[:, 0] = judging.BEGIN + 0.01 * torch.rand(b)
             place[:, 2] = HALF
             self.box.set_pose(Pose.create_from_pq(place))
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        pushed = rescoring.pushed(self.box.pose.p)
-        return {"success": pushed > rescoring.WANTED, "pushed": pushed}
+        pushed = judging.pushed(self.box.pose.p)
+        return {"success": pushed > judging.WANTED, "pushed": pushed}
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         return {"box": self.box.pose.raw_pose}
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        return rescoring.share(self.box.pose.p)
+        return judging.share(self.box.pose.p)
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         return self.compute_dense_reward(obs, action, info)
