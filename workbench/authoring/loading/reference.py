@@ -80,7 +80,7 @@ def followed_folder(reference: TaskName) -> Path | None:
 
 
 def why_missing(reference: str) -> str | None:
-    """Why the named file or module cannot be opened, judged by form and disk alone; None if it may exist."""
+    """Why the named file or module cannot be opened, by form and disk alone; None if it may exist."""
     if (named := split_reference(reference)) is not None:
         return not_found_text(named[0]) if find_module(named[0]) is None else None
     file = named_file(reference)

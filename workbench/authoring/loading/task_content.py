@@ -76,10 +76,10 @@ def read_content(file: Path) -> TaskContent:
         CannotRead: it is not an ordinary file of Python text, or there is too much of it.
     """
     file = file.resolve()
-    return _Reader(file).content()
+    return _ContentReader(file).content()
 
 
-class _Reader:
+class _ContentReader:
     def __init__(self, file: Path) -> None:
         self._file, self._root = file, module_name(file).search_folder
         self._texts: dict[str, str] = {}

@@ -241,7 +241,7 @@ def _exchange(
         if change.level == "cameras":
             exchange_cameras(env)
         raise
-    clock.lap("judge")
+    clock.lap("rescore")
     loaded = with_late_imports(loaded)
     description = replace(
         opened.description,

@@ -46,7 +46,7 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
     """The choices for these recordings; today's code and the recorded text are always the first two.
 
     Args:
-        infos: Of the recordings that are open; of others nothing is known before they are judged.
+        infos: Of the recordings that are open; of others nothing is known before they are rescored.
         known: Further task files, not named by the recordings.
     """
     named = list({str(reference): reference for reference in map(reference_of, infos)}.values())
@@ -89,7 +89,7 @@ IDLE = (
 
 @dataclass
 class RescoreChoices:
-    """How it is judged; outlives the page, which goes and comes."""
+    """How it is rescored; outlives the page."""
 
     code: Code = Code(TODAYS, "")
     use_env_states: bool = False
@@ -106,9 +106,9 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
 
     Args:
         server: The page.
-        rescorer: What judges.
+        rescorer: What rescores.
         review: Shows the episode of a row, and says what is open.
-        library: Of the recordings that may be judged.
+        library: Of the recordings that may be rescored.
         choices: What was chosen before.
         known: Further task files that the server knows.
     """
@@ -200,7 +200,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             return
         self._codes_of = wanted
         self._codes = codes_for([one.episode.info for one in view.opened], self._known())
-        # What is not among the choices any more is not judged with, unseen.
+        # What is not among the choices any more does not rescore, unseen.
         chosen = next((code for code in self._codes if code == self._choices.code), self._codes[0])
         self._choices.code = chosen
         labels = tuple(code.label for code in self._codes)

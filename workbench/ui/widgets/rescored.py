@@ -105,7 +105,7 @@ def status_html(rescored: RescoreView, title: str = "", idle: str = "", advice: 
     """
     Args:
         title: Over it.
-        idle: What is said before anything was judged.
+        idle: The text before anything was rescored.
         advice: As `RescoredPanel.advice`.
     """
     return render(
