@@ -70,10 +70,10 @@ def trace(out: Path, authors: str) -> None:
         files: list[str] = []
         while frame is not None:
             name = frame.f_code.co_filename
-            if name.startswith(PACKAGE) and name not in files:
-                files.append(name)
+            if name.startswith(PACKAGE):
+                files.append(name.removeprefix(PACKAGE))
             frame = frame.f_back
-        line = json.dumps([time.monotonic(), what, [name.removeprefix(PACKAGE) for name in reversed(files)]])
+        line = json.dumps([time.monotonic(), what, list(dict.fromkeys(reversed(files)))])
         with out.open("a") as stream:
             stream.write(line + "\n")
 
@@ -174,8 +174,8 @@ WALKS = (
                 "send Call",
                 ("authoring/camera_source/plan.py",),
             ),
-            Point("The worker runs the author's text", "author <module>", HOOKS),
-            Point("and its hook", "author _default_sensor_configs", HOOKS),
+            Point("The worker calls the author's hook", "author _default_sensor_configs", HOOKS),
+            Point("and reads the values of its text", "author <module>", HOOKS),
             Point("The answer comes back", "send Answer", WIRE),
             Point("The change is shown", "queue_message GuiUpdateMessage", ("ui/cameras/write_to_file.py",)),
             Point("*Write* replaces the file", "disk"),

@@ -133,15 +133,15 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
     expect(row.locator("td").nth(1)).to_have_text("100 %")
     assert float(row.locator("td").nth(2).inner_text().removesuffix(" px")) > 10
-    expect(page.get_by_text("judge it again")).to_have_count(0)
+    expect(page.get_by_text("measure it again")).to_have_count(0)
     press(page, "Keep this placement as A")
     page.locator(".wb-planes [data-press]").last.click()
-    expect(page.get_by_text("judge it again")).to_be_visible()
+    expect(page.get_by_text("measure it again")).to_be_visible()
     press(page, "Show side by side")
     expect(page.locator(".wb-pair img")).to_have_count(2)
     expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
     press(page, "Place it as A")
-    expect(page.get_by_text("judge it again")).to_have_count(0)
+    expect(page.get_by_text("measure it again")).to_have_count(0)
 
 
 def test_the_sheet_has_all_envs_and_a_press_selects_one(page: Page) -> None:

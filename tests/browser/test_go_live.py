@@ -93,7 +93,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
 
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
-        page.get_by_text("Continue live").click()
+        page.get_by_text("Continue live", exact=True).click()
         page.locator('input[value="today\'s"]:visible').click()
         page.get_by_role("option", name="as recorded", exact=True).click()
         live.click()

@@ -51,7 +51,7 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
     expect(desk.page.get_by_text("rescored", exact=True)).to_be_visible()
     until(lambda: rows(desk).count() >= 6, "the list")
     expect(desk.page.get_by_role("button", name="Stop rescoring")).to_have_count(0)
-    above = desk.page.get_by_role("link", name=re.compile(r"judged again: (\d+) of \1 episodes differ"))
+    above = desk.page.get_by_role("link", name=re.compile(r"rescored: (\d+) of \1 episodes differ"))
     desk.page.set_viewport_size({"width": 1280, "height": 600})
     expect(above).to_be_in_viewport()
     expect(rows(desk).last).not_to_be_in_viewport()

@@ -74,7 +74,7 @@ def rescore_all(
         NotTrusted: a recording names code that is not trusted and no one can be asked, or the answer to all was no.
         FileNotFoundError, UnreadableRecording: there is nothing to rescore.
         TaskError: no task can be opened, or each raises; if some can, the verdicts of the others carry the error.
-        CannotStepIn: as TaskError, for a recorded text that cannot be opened.
+        CannotEnterRecording: as TaskError, for a recorded text that cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     here = CurrentFolder()

@@ -126,7 +126,7 @@ class RecordActionChooser:
     def __init__(self, chooser: ActionChooser | None) -> None:
         """
         Args:
-            acting: chooses actions that are neither random nor from a file; None for those two.
+            chooser: chooses actions that are neither random nor from a file; None for those two.
         """
         self._chooser = chooser
         self._rng: dict[int, np.random.Generator] = {}

@@ -174,7 +174,7 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset an imported task. On TaskError the caller undoes the import (`take_back`)."""
+    """Build, rehearse and reset an imported task. On TaskError the caller undoes the import (`undo_load`)."""
     on_activity, clock = opening.on_activity, opening.clock
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with blamed("build", loaded):

@@ -23,7 +23,7 @@ from workbench.machine.text import guard_terminal
 
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0
-"""In which a stopped process must finish the items that are over."""
+"""How long a stopped process may take to write the items that have ended."""
 _EXIT_SECONDS = 10.0
 _NO_LIMIT = sys.maxsize
 
@@ -72,7 +72,7 @@ class Share(Protocol):
         ...
 
     def limit(self) -> int:
-        """Items from this number on are not needed, also if they are under way. It only falls."""
+        """Items from this number on are not needed, even if they have begun. It never rises."""
         ...
 
     def send_result(self, number: int, result: Any) -> None:

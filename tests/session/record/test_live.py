@@ -75,10 +75,10 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     assert view.recording.bytes_written > 0
     session.stop_recording()
     live = written(session, 2)
-    session.keep_past()
-    wait_until(session, lambda view: bool(view.recording.keeping.message), "the keeping")
+    session.save_past()
+    wait_until(session, lambda view: bool(view.recording.saving.message), "the keeping")
     said = f"kept 2 episodes, {2 * STEPS} steps; none of them had ended"
-    assert session.view().recording.keeping.message == said
+    assert session.view().recording.saving.message == said
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
     assert kept.keys() == {0, 1}
@@ -104,18 +104,18 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
             session.change(action_source="random" if made == 0 else "hold")
             session.step()
         wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
-    session.keep_past((0,), before=True)
+    session.save_past((0,), before=True)
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
     # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
-    said = session.view().recording.keeping.message
+    said = session.view().recording.saving.message
     assert kept.info.seed == 5 and "no seed" not in said
-    session.keep_past((1,), before=True)
+    session.save_past((1,), before=True)
     kept = written(session, count + 2)[-1]
     assert kept.info.env_index == 1 and kept.info.seed == -1
     said = wait_until(
-        session, lambda view: bool(view.recording.keeping.message), "what came of it"
-    ).recording.keeping.message
+        session, lambda view: bool(view.recording.saving.message), "what came of it"
+    ).recording.saving.message
     assert "its start was drawn for several envs at once" in said
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
     session.change(action_source="random")
@@ -126,16 +126,16 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
     reports = session.studio.reports
     session.studio.select(BASE)
 
-    def keep(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
-        session.keep_past((0,))
-        wait_until(session, lambda view: bool(view.recording.keeping.message) or begun(view), "a keep")
+    def save(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
+        session.save_past((0,))
+        wait_until(session, lambda view: bool(view.recording.saving.message) or begun(view), "a keep")
 
     def kept() -> Episode:
-        wait_until(session, lambda view: bool(view.recording.keeping.message), "what was kept")
+        wait_until(session, lambda view: bool(view.recording.saving.message), "what was kept")
         return written(session, session.view().recording.episodes_written)[-1]
 
     def drawing(view: SessionView) -> bool:
-        progress = view.recording.keeping.progress
+        progress = view.recording.saving.progress
         return progress is not None and progress.what == "drawing it again" and progress.done > 0
 
     def measure() -> None:
@@ -159,7 +159,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
 
     start_over(session, 5)
     step(session, 20)
-    keep()
+    save()
     episode = kept()
     assert episode.length == 20
     measure()
@@ -168,14 +168,14 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
     offers = found()
     assert offers and not session.view().studio.problem
 
-    keep(drawing)
+    save(drawing)
     measure()
-    assert measured() == alone and not session.view().recording.keeping.message, "the keep came first"
+    assert measured() == alone and not session.view().recording.saving.message, "the keep came first"
     assert_same(kept(), episode)
     for begin, came, of in ((measure, measured, alone), (search, found, offers)):
         begin()
         wait_until(session, is_at_it, "its beginning")
-        keep()
+        save()
         assert_same(kept(), episode)
         assert session.view().studio.progress is not None, "the keep came last"
         assert came() == of
@@ -208,9 +208,9 @@ def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Sess
     assert first == 0  # the history is whole, so what is refused is an episode without a step
     session._state.timeline.history.limit = 1  # type: ignore[union-attr]
     step(session, 2)
-    session.keep_past((0,))
-    view = wait_until(session, lambda view: view.recording.keeping.failed, "the refusal")
-    assert "its beginning is no longer in memory" in view.recording.keeping.message
+    session.save_past((0,))
+    view = wait_until(session, lambda view: view.recording.saving.failed, "the refusal")
+    assert "its beginning is no longer in memory" in view.recording.saving.message
     session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
 
 

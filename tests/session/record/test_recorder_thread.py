@@ -19,8 +19,8 @@ from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.process.job_lane import JobProgress
 from workbench.session.record import live
-from workbench.session.record.keep_past import KeepStatus
 from workbench.session.record.live import LiveRecorder, RecordingStatus, recovered_text
+from workbench.session.record.save_past import SaveStatus
 from workbench.ui.live.episodes_panel import recording_html
 
 
@@ -86,13 +86,13 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
 
 
 def test_how_far_keeping_is_and_what_came_of_it_stand_on_the_page() -> None:
-    under_way = KeepStatus(progress=JobProgress("drawing it again", 3, 12))
-    html = recording_html(RecordingStatus(keeping=under_way))
+    under_way = SaveStatus(progress=JobProgress("drawing it again", 3, 12))
+    html = recording_html(RecordingStatus(saving=under_way))
     assert "keeping what was seen: drawing it again, 3 of 12 moments" in html and "width: 25%" in html
     assert "Each episode becomes" not in html
-    failed = recording_html(RecordingStatus(keeping=KeepStatus("nothing was seen yet", failed=True)))
+    failed = recording_html(RecordingStatus(saving=SaveStatus("nothing was seen yet", failed=True)))
     assert "nothing was seen yet" in failed and "wb-bad-text" in failed and "wb-again-bar" not in failed
-    kept = recording_html(RecordingStatus(keeping=KeepStatus("kept 1 episode")))
+    kept = recording_html(RecordingStatus(saving=SaveStatus("kept 1 episode")))
     assert "kept 1 episode" in kept and "wb-bad-text" not in kept
 
 

@@ -246,26 +246,26 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.rescored("rescoring")
     process, session = desk.session._background.pid, desk.session
-    session.keep_past((0,), before=True)
+    session.save_past((0,), before=True)
     wait_until(
         session,
-        lambda v: v.recording.keeping.progress is None and v.recording.keeping.message,
+        lambda v: v.recording.saving.progress is None and v.recording.saving.message,
         "what was kept",
     )
     view = session.view()
-    assert view.recording.keeping.message.startswith("kept 1 episode") and not view.recording.keeping.failed
+    assert view.recording.saving.message.startswith("kept 1 episode") and not view.recording.saving.failed
     assert view.rescored.state == "rescoring", "it has not ended meanwhile"
     desk.note()
     assert desk.rescored("rescoring").done < view.rescored.total
-    session.keep_past((1,), before=True)
+    session.save_past((1,), before=True)
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 3")
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
     assert desk.rescored().stopped_by is None
     wait_until(
-        session, lambda v: v.recording.keeping.progress is None and v.recording.keeping.message, "the second"
+        session, lambda v: v.recording.saving.progress is None and v.recording.saving.message, "the second"
     )
-    assert not session.view().recording.keeping.failed
+    assert not session.view().recording.saving.failed
     for env in range(N):
         np.testing.assert_array_equal(session.rescorer.curve("reward", env).new, 3 * rewards[:, env])
     assert session._background.pid == process

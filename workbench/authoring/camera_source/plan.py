@@ -37,7 +37,7 @@ def plan_edit(
         sources: the author's files on disk, by path.
 
     Raises:
-        RefusedEdit: also if the call does not give `before`: other code decides then, and an edit would have no effect.
+        RefusedEdit: also if the settings of the call are not `before`: then other code sets them, and an edit would have no effect.
     """
     check_camera(after)
     mount: list[str] = []
@@ -63,10 +63,10 @@ def _plan(
     made = call.run.made
     if made is None:
         raise RefusedEdit(f"the settings of the camera at {call.where} cannot be read")
-    apart = changed_fields(made, before)
+    differs_from_file = changed_fields(made, before)
     for name in fields:
         why = call.trace.unknown.get(name) or _why_not(edit, call, name)
-        if name in apart and not why:
+        if name in differs_from_file and not why:
             why = _difference_text(name, made, before)
         if why:
             raise RefusedEdit(f"{why} ({call.where})")
@@ -77,7 +77,7 @@ def _plan(
         if name in call.trace.parts:
             edit.emit(call.trace.parts[name])
     planned = edit.verified(call.file, call.camera, call.camera)
-    left = [name for name in apart if name not in fields]
+    left = [name for name in differs_from_file if name not in fields]
     settings = with_fields(_check_asked(planned.settings, fields, made, after), before, left)
     if planned.others:
         edit.note(f"{len(planned.changes)} files change together: {planned.names}")
@@ -96,12 +96,12 @@ def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
         return "it is given no pose" if name == "pose" else None
     if name == "pose":
         return why_not_a_pose(changes, part)
-    right = {
+    readable = {
         "shader_pack": isinstance(part.value, str),
         "intrinsic": part.value is None or (isinstance(part.value, tuple) and len(part.numbers) == 9),
         "fov": part.value is None or isinstance(part.value, float),
     }
-    if right.get(name, isinstance(part.value, float)):
+    if readable.get(name, isinstance(part.value, float)):
         return None
     return f"`{changes.code(part.at)}` is not a {name} that can be read"
 
@@ -171,21 +171,21 @@ def _check_asked(
     """Check that the edited camera has the new `fields` of `after`, and the others of `made`."""
     if found is None:
         raise RefusedEdit("the settings of the edited camera cannot be read")
-    right = not set(changed_fields(made, found)) - set(fields)
+    as_requested = not set(changed_fields(made, found)) - set(fields)
     for name in fields:
         was, requested = getattr(found, name, None), getattr(after, name, None)
         if name == "pose":
             moved = max(abs(a - b) for a, b in zip(found.position, after.position, strict=True))
             turned = angle_between(found.quaternion, after.quaternion)
-            right = right and moved <= POSITION_STEP and turned <= 1.5 * ANGLE_STEP
+            as_requested = as_requested and moved <= POSITION_STEP and turned <= 1.5 * ANGLE_STEP
         elif name == "intrinsic" and found.intrinsic is not None and after.intrinsic is not None:
             flat = [[x for row in matrix for x in row] for matrix in (found.intrinsic, after.intrinsic)]
-            right = right and max(abs(a - b) for a, b in zip(*flat, strict=True)) <= 1e-3
+            as_requested = as_requested and max(abs(a - b) for a, b in zip(*flat, strict=True)) <= 1e-3
         elif isinstance(was, (int, float)) and isinstance(requested, (int, float)):
-            right = right and abs(was - requested) <= 2e-4
+            as_requested = as_requested and abs(was - requested) <= 2e-4
         else:
-            right = right and was == requested
-    if not right:
+            as_requested = as_requested and was == requested
+    if not as_requested:
         raise RefusedEdit("the edited file does not give the camera the requested settings")
     return found
 

@@ -34,7 +34,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
     An installed file must not be edited: the next installation would overwrite it.
 
     Raises:
-        NoCopy: it cannot be copied; nothing was written.
+        CannotCopy: it cannot be copied; nothing was written.
     """
     try:
         _, text, encoding = read_exactly(source)
@@ -66,7 +66,7 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
         number: of the copy; it is part of the ids from 2 on.
 
     Raises:
-        NoCopy: it cannot be copied, such as a file without a package that imports modules of its folder relatively.
+        CannotCopy: it cannot be copied, such as a file without a package that imports modules of its folder relatively.
     """
     try:
         file = SourceFile(str(source), text)

@@ -142,7 +142,7 @@ class TaskEnv:
             max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
             check: called with what ``evaluate`` and the reward returned, before either is converted;
                 raises if the task broke its contract.
-            obs: the last observation of an env that goes on, as its ``obs_mode`` gives it.
+            obs: the last observation of an env that already runs, as its ``obs_mode`` gives it.
         """
         self.env = env
         self.max_episode_steps = max_episode_steps

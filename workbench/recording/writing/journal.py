@@ -32,7 +32,7 @@ SYNC_SECONDS = 0.4
 _BATCH_BYTES = 2 << 20
 """Beyond this `append` writes by itself: memory stays bounded when the disk is slower than the episode."""
 _MOST_BATCHES = 4
-"""Cached while reading: pictures of the same states are read camera by camera."""
+"""Batches cached while reading: pictures of the same states are read camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
 
@@ -57,7 +57,7 @@ class Journal:
 
     - ``header``: JSON; the scene's meshes are in a file next to it (`write_scene`);
     - ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: one or several consecutive rows of that layout;
-    - ``acted`` `action`: source of the actions from this one on, if it differs from the header's;
+    - ``acted`` `action`: what chose the actions from this number on, if not what the header names;
     - ``entry`` `state`: JSON of an entry of ``evaluate()`` that is not a number and changes here (`columns.TextWriter`);
     - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 

@@ -92,7 +92,7 @@ class CameraStudio:
         """Place a camera, live. If placements come faster than the worker takes them, only the newest is made.
 
         Args:
-            hand: id of the control; successive calls with the same one are one step of undo (a drag).
+            control: id of the control; successive calls with the same one are one step of undo (a drag).
             pause: seconds without a call after which a new step begins.
         """
         with self._lock:

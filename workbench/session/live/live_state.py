@@ -42,7 +42,7 @@ from workbench.session.protocol.messages import (
     Settings,
     Status,
 )
-from workbench.session.record.keep_past import KeepRequest, PastEpisode, find_episode
+from workbench.session.record.save_past import PastEpisode, SaveRequest, find_episode
 
 
 @dataclass
@@ -341,14 +341,14 @@ class LiveState:
             None if self.timeline is None else self.timeline.history.snapshot_at(self.timeline.history.last)
         )
 
-    def keep_request(
+    def save_request(
         self,
         env_idx: tuple[int, ...] | None,
         load: Load | None,
         placed: tuple[PlaceCamera, ...],
         before: bool = False,
-    ) -> KeepRequest | str:
-        """See `Session.keep_past`; or the reason why there is nothing to keep."""
+    ) -> SaveRequest | str:
+        """See `Session.save_past`; or the reason why there is nothing to keep."""
         if self.now.task is None or self.timeline is None or load is None:
             return "no task is loaded"
         history, shown = self.timeline.history, self.timeline.shown
@@ -359,7 +359,7 @@ class LiveState:
         if not episodes:
             env, why = next(iter(found.items()))
             return f"nothing was kept of env {env}: {why}"
-        return KeepRequest(self.now.task, load, placed, episodes)
+        return SaveRequest(self.now.task, load, placed, episodes)
 
     def view(self, **known: Any) -> SessionView:
         """The view of the shown moment.

@@ -41,8 +41,8 @@ from workbench.session.protocol.messages import (
     SingleStep,
     WarmUp,
 )
-from workbench.session.record.keep_past import PastKeeper
 from workbench.session.record.live import LiveRecorder
+from workbench.session.record.save_past import PastSaver
 from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
 
@@ -112,7 +112,7 @@ class Session:
         )
         self._background = Background()
         """Asks the background process."""
-        self.keeper = PastKeeper(recordings, self._recorder.finisher, self._notify, self._background)
+        self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
         self.rescorer = PastRescorer(self._notify, self._background)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
@@ -137,7 +137,7 @@ class Session:
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
         known = {
-            "recording": replace(self._recorder.status(), keeping=self.keeper.status()),
+            "recording": replace(self._recorder.status(), saving=self.past_saver.status()),
             "printed": self._printed.view(),
             "vitals": self._worker.vitals,
             "rescored": self.rescorer.rescoring.view,
@@ -255,10 +255,10 @@ class Session:
         self._recorder.stop()
         self._notify()
 
-    def keep_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
+    def save_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
         """Record from the history: for each of these envs (all if None) the episode that contains the shown moment.
 
-        Live, that is the running episode, or the one before if that has no step yet. `SessionView.recording` has progress
+        While live, the running episode is saved; if it has no step yet, the one before. `SessionView.recording` has progress
         and result.
 
         Args:
@@ -267,11 +267,11 @@ class Session:
         load = self.versions.running_load()
         placed = self.studio.placed_cameras()
         with self._lock:
-            what = self._state.keep_request(env_idx, load, placed, before)
+            what = self._state.save_request(env_idx, load, placed, before)
         if isinstance(what, str):
-            self.keeper.refuse(what)
+            self.past_saver.refuse(what)
         else:
-            self.keeper.keep(what)
+            self.past_saver.save(what)
 
     def enter_recording(
         self,
@@ -319,7 +319,7 @@ class Session:
         self._worker.stop()
         self.rescorer.rescoring.close()
         self.studio.close()
-        self.keeper.close()
+        self.past_saver.close()
         self._background.end()
         self._recorder.close()
 
@@ -370,9 +370,9 @@ class Session:
         with self._lock:
             s = self._state
             restored, stale = self.versions.version_loaded(event.task)
-            meaning = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
+            what_to_do = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
             rescored = None
-            if meaning == "rescore" and s.timeline is not None:
+            if what_to_do == "rescore" and s.timeline is not None:
                 rescored = RescoredPast(s.timeline.history)
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
@@ -381,7 +381,7 @@ class Session:
             load = self.versions.running_load()
             assert load is not None
             self.rescorer.rescore(load, rescored)
-        elif meaning == "forget":
+        elif what_to_do == "forget":
             self.rescorer.forget()
         self.versions.follow(event.task, stale)
         self._send_settings()

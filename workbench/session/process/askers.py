@@ -140,7 +140,7 @@ class Background(Asker):
         comes during the turn, `ask` raises GaveWay.
 
         Args:
-            aside: lowest priority, since no person waits for this job.
+            low_priority: lowest priority, since no person waits for this job.
 
         Raises:
             Stopped: the job was stopped.

@@ -284,7 +284,7 @@ class Loaded:
     task: TaskDescription
     first: StepResult
     milliseconds: dict[str, float]
-    """Time of each part of the load: import, build, reset, probe, geometry."""
+    """Time of each part of the load: import, build, rehearse, reset, geometry."""
     reload: ReloadReport | None = None
     """None for the first version of a task. With ``same``, ``patched`` and ``cameras`` the scene, its episodes and
     `first`'s poses are unchanged, and the geometry's visuals, which are large, are left out."""

@@ -14,7 +14,7 @@ from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.recording.reader.reading import recover_confined, recovered_text
 from workbench.recording.writing.publish import RecordingError
-from workbench.session.record.keep_past import KeepStatus
+from workbench.session.record.save_past import SaveStatus
 
 _MOST_WAITING = 256 * 1024**2
 """Bytes of steps that wait for the disk."""
@@ -41,7 +41,7 @@ class RecordingStatus:
     last_file: str | None = None
     problem: str | None = None
     """Why the recording ended, or the last file could not be written."""
-    keeping: KeepStatus = field(default_factory=KeepStatus)
+    saving: SaveStatus = field(default_factory=SaveStatus)
 
 
 class LiveRecorder:
@@ -77,7 +77,7 @@ class LiveRecorder:
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue()
         """Work of the recorder's thread; None ends it."""
         self.finisher = EpisodeFinisher(on_change, self._recover)
-        """Makes the files, also those of `PastKeeper`."""
+        """Makes the files, also those of `PastSaver`."""
         self._thread = watched_thread("recorder", self._work)
         self._thread.start()
 

@@ -233,7 +233,7 @@ class Worker:
         if before is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, before, self._last)
         try:
-            # A changed current folder of the previous version is undone for this one, unless it fails.
+            # A load starts in the first current folder; if it fails, the previous version's comes back.
             with self._start_folder.again(stay=True):
                 opened, report = load_version(
                     request,

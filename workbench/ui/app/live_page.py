@@ -294,7 +294,7 @@ class Page:
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
-            Command("Save what I just saw", self._record.keep, "C", "shift"),
+            Command("Save what I just saw", self._record.save, "C", "shift"),
             Command("Open or close the list of warnings", self._rules.toggle, "W"),
             Command("Load the file again", session.versions.reload, "L"),
             Command("Interrupt what the task is doing", session.interrupt, "I"),

@@ -49,7 +49,7 @@ class Workplace:
     """Both pages on one server, and what outlives them. Used by ``workbench open`` and ``workbench review``.
 
     Args:
-        door: The server of the pages.
+        gated_server: The server of the pages.
         recordings: The folder that is recorded to and reviewed.
         make_session: Opens a task that a recording names; gets what `Session` gets.
         base: Options that all tasks named by recordings share.

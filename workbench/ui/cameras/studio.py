@@ -48,7 +48,7 @@ PLACE = (
     "eye and target: move the eye, and it goes on looking at its target; or move the target."
 )
 ALONG = "Along which axes it is moved and turned. The camera's own: red is forward, green left, blue up."
-STEPS = "In which it is dragged."
+STEPS = "The step size of a drag."
 SIZE = "Of the picture above, for a quick look. The camera keeps its own."
 VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
 IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
@@ -363,14 +363,14 @@ class StudioPanel(PagePart[SessionView]):
         turn = partial(self._by_key, partial(panned, left=left, up=up), "turning key")
         return Command(f"Turn the chosen camera {name}", turn, key, "alt+shift")
 
-    def _by_key(self, move: Callable[[Floats], Floats], hand: str) -> None:
+    def _by_key(self, move: Callable[[Floats], Floats], control: str) -> None:
         def change(now: CameraSettings, frame: Frame) -> CameraSettings:
             moved = frame.from_view(now, move(frame.to_view(now)))
             keeps_target = self._look_at and moved.position != now.position
             return frame.turned_to(moved, target_of(now)) if keeps_target else moved
 
         if self._placing.camera is not None:
-            self._placing.change(hand, change)
+            self._placing.change(control, change)
 
 
 def _placed(camera: StudioCamera) -> CameraSettings:

@@ -14,8 +14,8 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
-RECORD, NEXT, KEEP = "Record", "Record the next episode", "Save what I just saw"
-KEEP_BEFORE = "Save the episode before"
+RECORD, NEXT, SAVE = "Record", "Record the next episode", "Save what I just saw"
+SAVE_BEFORE = "Save the episode before"
 STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
 
 
@@ -42,13 +42,13 @@ class RecordPanel(PagePart[SessionView]):
             icon=viser.Icon.PLAYER_TRACK_NEXT,
             hint="Wait for the next reset and record that one episode",
         )
-        self._keep = server.gui.add_button(
-            KEEP,
+        self._save = server.gui.add_button(
+            SAVE,
             icon=viser.Icon.HISTORY,
             hint="Record after the fact: the episode at the moment that is shown (shift+C)",
         )
         self._before = server.gui.add_button(
-            KEEP_BEFORE,
+            SAVE_BEFORE,
             icon=viser.Icon.PLAYER_TRACK_PREV,
             color="gray",
             visible=False,
@@ -58,8 +58,8 @@ class RecordPanel(PagePart[SessionView]):
         self._status = server.gui.add_html("")
         self._button.on_click(lambda _: self.toggle())
         self._next.on_click(lambda _: session.start_recording(self._envs, next_episode=True))
-        self._keep.on_click(lambda _: self.keep())
-        self._before.on_click(lambda _: session.keep_past(self._envs, before=True))
+        self._save.on_click(lambda _: self.save())
+        self._before.on_click(lambda _: session.save_past(self._envs, before=True))
 
     @property
     def _envs(self) -> tuple[int, ...] | None:
@@ -72,12 +72,12 @@ class RecordPanel(PagePart[SessionView]):
         else:
             self._session.start_recording(self._envs)
 
-    def keep(self) -> None:
+    def save(self) -> None:
         """Start or stop keeping the past episode."""
-        if self._session.view().recording.keeping.progress is not None:
-            self._session.keeper.stop()
+        if self._session.view().recording.saving.progress is not None:
+            self._session.past_saver.stop()
         else:
-            self._session.keep_past(self._envs)
+            self._session.save_past(self._envs)
 
     def key(self, view: SessionView) -> object:
         return view.recording, view.timeline, view.step_serial
@@ -85,26 +85,26 @@ class RecordPanel(PagePart[SessionView]):
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
         shown = view.task_serial, view.state, view.selected_env, view.timeline.shown, self._which.value
-        stand = recording.active, recording.waiting, recording.keeping.progress is None
+        stand = recording.active, recording.waiting, recording.saving.progress is None
         return *shown, *stand, view.timeline.moments == 0
 
     def draw(self, view: SessionView) -> None:
-        recording, keeping = view.recording, view.recording.keeping.progress is not None
+        recording, saving = view.recording, view.recording.saving.progress is not None
         waits = recording.active and recording.waiting == len(recording.env_idx)
         self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
         self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
-        self._keep.label = STOP_KEEPING if keeping else KEEP
-        self._keep.icon = viser.Icon.PLAYER_STOP if keeping else viser.Icon.HISTORY
+        self._save.label = STOP_KEEPING if saving else SAVE
+        self._save.icon = viser.Icon.PLAYER_STOP if saving else viser.Icon.HISTORY
         can_record = view.task is not None and view.state != "stopped"
         self._button.disabled = not can_record and not recording.active
         # Disabled, not hidden: the next button would move under the pointer.
         self._next.disabled = not can_record or recording.active
-        self._keep.disabled = view.timeline.moments == 0 and not keeping
+        self._save.disabled = view.timeline.moments == 0 and not saving
         self._which.disabled = not can_record
         self._which.visible = view.task is None or view.task.num_envs > 1
         about = what_keeping_means(view, self._which.value == ALL_ENVS)
-        self._about.content = render("note", text=about) if about and not keeping else ""
-        self._before.visible = has_one_before(view) and not keeping
+        self._about.content = render("note", text=about) if about and not saving else ""
+        self._before.visible = has_one_before(view) and not saving
         self._status.content = recording_html(recording)
 
 
@@ -131,12 +131,12 @@ def what_keeping_means(view: SessionView, all_envs: bool) -> str:
     if steps is None or view.task is None:
         return ""
     if view.timeline.shown is not None:
-        return f"{KEEP} takes the whole episode round the moment that is shown."
+        return f"{SAVE} takes the whole episode round the moment that is shown."
     count = f"{counted(steps, 'step')} so far"
     if all_envs and view.task.num_envs > 1:
-        return f"{KEEP} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
+        return f"{SAVE} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
     which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
-    return f"{KEEP} takes the {which} that runs: {count}, and not ended."
+    return f"{SAVE} takes the {which} that runs: {count}, and not ended."
 
 
 def recording_html(recording: RecordingStatus) -> str:

@@ -218,7 +218,7 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
         label: shown at the top of viser's panel.
 
     Raises:
-        DoorError: the host or port cannot be bound, or the installed viser is not the known one.
+        ServerError: the host or port cannot be bound, or the installed viser is not the known one.
     """
     if options.socket is None:
         listening = listen_on_port(options.host, options.port)
@@ -280,7 +280,7 @@ def _test_refusal(listening: Listening) -> None:
     """Send a request as from a rebound name: it must be refused, or the checks are not in front of viser.
 
     Raises:
-        DoorError: it was not refused.
+        ServerError: it was not refused.
     """
     knock = http.client.HTTPConnection("rebound.invalid", timeout=10)
     knock.sock = listening.connect(timeout=10)

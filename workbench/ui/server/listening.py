@@ -90,7 +90,7 @@ def listen_on_port(host: str, port: int) -> Listening:
         port: 0 takes any free one. If `DEFAULT_PORT` is taken, the next free one is used.
 
     Raises:
-        DoorError: The host is not this machine's, or the port is taken or forbidden.
+        ServerError: The host is not this machine's, or the port is taken or forbidden.
     """
     # "localhost" may be 127.0.0.1, ::1 or both; the printed address has to be the bound one.
     asked = "127.0.0.1" if host.lower() == "localhost" else host
@@ -133,7 +133,7 @@ def listen_on_file(path: Path, port: int) -> Listening:
         port: On the browser's machine, at the other end of ``ssh -L``.
 
     Raises:
-        DoorError: Something else is at `path`, or other users may write into its folder.
+        ServerError: Something else is at `path`, or other users may write into its folder.
     """
     folder = path.expanduser().absolute().parent.resolve()
     place = folder / path.name

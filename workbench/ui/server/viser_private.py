@@ -338,7 +338,7 @@ def make_viser(
         told: logs what pages did that they should not.
 
     Raises:
-        DoorError: the installed viser is not the known one. Nothing is left listening.
+        ServerError: the installed viser is not the known one. Nothing is left listening.
     """
     missing = missing_names()
     if missing:

@@ -22,7 +22,7 @@ from workbench.session.protocol.questions import CaptureMoment
 
 
 @dataclass(frozen=True)
-class KeepStatus:
+class SaveStatus:
     """Progress and result of recording a past episode."""
 
     message: str = ""
@@ -58,7 +58,7 @@ class PastEpisode:
 
 
 @dataclass(frozen=True)
-class KeepRequest:
+class SaveRequest:
     """Episodes to record and what a worker needs for it. Independent of the history, which moves on meanwhile."""
 
     task: TaskDescription
@@ -125,7 +125,7 @@ _SAME_START = 1e-6
 """Metres and quaternion components."""
 
 
-class PastKeeper:
+class PastSaver:
     """Records past episodes, one job at a time, in the background process.
 
     The history has poses, actions, rewards and results of ``evaluate`` as they were, and a snapshot of each moment. The
@@ -137,14 +137,14 @@ class PastKeeper:
         self, folder: Path, finisher: EpisodeFinisher, on_change: Callable[[], None], process: Background
     ) -> None:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
-        self._status = KeepStatus()
+        self._status = SaveStatus()
         self._process = process
         self._job_lane = JobLane("keep-past", on_change, self._failed)
 
-    def keep(self, what: KeepRequest) -> None:
+    def save(self, what: SaveRequest) -> None:
         """Start; cancels the running job."""
         self._report("")
-        self._job_lane.start(WAITING, lambda job: self._keep(job, what))
+        self._job_lane.start(WAITING, lambda job: self._save(job, what))
 
     def stop(self) -> None:
         """Cancel the running job; it writes no file."""
@@ -155,7 +155,7 @@ class PastKeeper:
         """Report why nothing can be recorded."""
         self._report(why, failed=True)
 
-    def status(self) -> KeepStatus:
+    def status(self) -> SaveStatus:
         return replace(self._status, progress=self._job_lane.progress)
 
     def close(self) -> None:
@@ -163,7 +163,7 @@ class PastKeeper:
 
     # --- on the lane's thread --------------------------------------------------------------------------
 
-    def _keep(self, job: Job, what: KeepRequest) -> None:
+    def _save(self, job: Job, what: SaveRequest) -> None:
         seeds: dict[int, int] = {}
         writers: dict[int, GatheredEpisode] = {}
         moments, packer = deque(moments_of(what.episodes)), BatchPacker()
@@ -232,7 +232,7 @@ class PastKeeper:
             self._report(why, failed=True)
 
     def _report(self, message: str, failed: bool = False) -> None:
-        self._status = KeepStatus(message, failed)
+        self._status = SaveStatus(message, failed)
         self._on_change()
 
 
