@@ -221,9 +221,9 @@ def test_closing_frees_the_port_and_ends_the_thread(gated_server):
 def test_nothing_is_printed_but_by_us(child_process: None):
     # In a process of its own: what is printed at its exit counts too.
     code = (
-        "from workbench.ui.server.gated_server import open_door, DoorOptions\n"
+        "from workbench.ui.server.gated_server import open_server, ServerOptions\n"
         "import rich\n"
-        "door = open_door(DoorOptions(port=0)); rich.print('ours')\n"
+        "door = open_server(ServerOptions(port=0)); rich.print('ours')\n"
         "import sys\n"
         "if sys.argv[1] == 'close': door.close()\n"
     )

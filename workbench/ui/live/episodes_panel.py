@@ -16,7 +16,7 @@ from workbench.ui.widgets.templates import counted, render
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 RECORD, NEXT, SAVE = "Record", "Record the next episode", "Save what I just saw"
 SAVE_BEFORE = "Save the episode before"
-STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
+STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving"
 
 
 class RecordPanel(PagePart[SessionView]):
@@ -93,7 +93,7 @@ class RecordPanel(PagePart[SessionView]):
         waits = recording.active and recording.waiting == len(recording.env_idx)
         self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
         self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
-        self._save.label = STOP_KEEPING if saving else SAVE
+        self._save.label = STOP_SAVING if saving else SAVE
         self._save.icon = viser.Icon.PLAYER_STOP if saving else viser.Icon.HISTORY
         can_record = view.task is not None and view.state != "stopped"
         self._button.disabled = not can_record and not recording.active
@@ -102,7 +102,7 @@ class RecordPanel(PagePart[SessionView]):
         self._save.disabled = view.timeline.moments == 0 and not saving
         self._which.disabled = not can_record
         self._which.visible = view.task is None or view.task.num_envs > 1
-        about = what_keeping_means(view, self._which.value == ALL_ENVS)
+        about = what_saving_means(view, self._which.value == ALL_ENVS)
         self._about.content = render("note", text=about) if about and not saving else ""
         self._before.visible = has_one_before(view) and not saving
         self._status.content = recording_html(recording)
@@ -125,7 +125,7 @@ def has_one_before(view: SessionView) -> bool:
     return steps is not None and at - past.first > steps
 
 
-def what_keeping_means(view: SessionView, all_envs: bool) -> str:
+def what_saving_means(view: SessionView, all_envs: bool) -> str:
     """Which episode *Save what I just saw* takes, if it is a running one; else empty."""
     steps = runs_since(view)
     if steps is None or view.task is None:
