@@ -9,6 +9,8 @@
 {
   const NOT_TYPED_INTO = ["checkbox", "radio", "range", "button", "submit", "reset", "color", "file"];
 
+  const LATER = 50; // milliseconds
+
   function isTypedInto(element) {
     if (element.isContentEditable || element instanceof HTMLTextAreaElement) return true;
     if (!(element instanceof HTMLInputElement) || NOT_TYPED_INTO.includes(element.type)) return false;
@@ -23,11 +25,14 @@
     if (!isTypedInto(focused) || event.target instanceof HTMLCanvasElement) focused.blur();
   }
 
+  let again = 0;
+
   const PRESSED_BY_KEY = "button, summary, a[href], input[type=checkbox], input[type=radio]";
 
   window.addEventListener(
     "keydown",
     (event) => {
+      clearTimeout(again); // or a key that comes soon after a click would lose what it has just walked to
       if ((event.key !== " " && event.key !== "Enter") || !(event.target instanceof Element)) return;
       // The browser presses it all the same; our own HTML has no such control and hears its keys itself.
       if (event.target.matches(PRESSED_BY_KEY) && !event.target.matches("[data-press]")) event.stopImmediatePropagation();
@@ -42,7 +47,8 @@
       (event) => {
         giveBack(event);
         // Again: some controls take the focus, or close their list, in handlers that come after this one.
-        setTimeout(() => giveBack(event), 50);
+        clearTimeout(again);
+        again = setTimeout(() => giveBack(event), LATER);
       },
       true,
     );

@@ -170,6 +170,8 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
 def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) -> None:
     at = "[document.activeElement.textContent, document.activeElement.ariaPressed]"
     tool(page, "move, turn")
+    # The click before this gives the focus back once more a moment later.
+    page.evaluate("new Promise(done => setTimeout(done, 60))")
     page.evaluate(
         "[...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn').focus()"
     )
@@ -207,6 +209,22 @@ def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -
     )
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.textContent") == "eye and target"
+    page.evaluate("document.activeElement.blur()")
+
+
+def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -> None:
+    tool(page, "move, turn")
+    kept = page.evaluate(
+        """async () => {
+            const pill = [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn');
+            pill.dispatchEvent(new PointerEvent("pointerup", { bubbles: true }));
+            pill.dispatchEvent(new KeyboardEvent("keydown", { bubbles: true, key: "Tab" }));
+            pill.focus();
+            await new Promise(done => setTimeout(done, 100));
+            return document.activeElement.textContent;
+        }"""
+    )
+    assert kept == "move, turn"
     page.evaluate("document.activeElement.blur()")
 
 
