@@ -20,7 +20,17 @@ MODULES ?= all
 # The files keep their order: by number of tests, as xdist has it, those of one long test come last and leave a core idle.
 WORKERS ?= 2
 SEEDS ?= $(shell echo $$RANDOM $$RANDOM)
+# MANISKILL=nightly: ManiSkill's nightly build in place of its release, in an environment of its own.
+MANISKILL ?= release
+ifeq ($(MANISKILL),release)
 VENV := .venv
+EXTRA := maniskill
+else ifeq ($(MANISKILL),nightly)
+VENV := .venv-nightly
+EXTRA := nightly
+else
+$(error MANISKILL is release or nightly, not "$(MANISKILL)")
+endif
 BIN := $(VENV)/bin
 
 # The first Python that runs and that every pinned package has a release for. A pyenv shim can be on PATH and
@@ -41,7 +51,9 @@ help:
 	@echo "make open      show tasks/push_cube.py in the browser (TASK=file or env id, ARGS=options of workbench open)"
 	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
 	@echo "make test-fast ruff and the tests that need no process, renderer or browser: about two minutes"
-	@echo "make test-all  the slow tests too, all of them twice in random order (SEEDS=\"1 2\" makes two orders again)"
+	@echo "make test-all  the slow tests too, all of them twice in random order (SEEDS=\"1 2\" makes two orders again),"
+	@echo "               then make test MANISKILL=nightly"
+	@echo "make test MANISKILL=nightly  the same tests with ManiSkill's nightly build, in .venv-nightly; likewise make open"
 	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/server/access ..., or all)"
 	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
 	@echo "               (without a network: WHEELS=DIR, filled by make gpu-wheels WHEELS=DIR elsewhere, and PHYSX_GPU=FILE)"
@@ -73,6 +85,7 @@ test-all: lint
 			|| failed="$$failed $$seed"; \
 	done; \
 	[ -z "$$failed" ] || { echo "failed in the order of seed$$failed" >&2; exit 1; }
+	$(MAKE) --no-print-directory test MANISKILL=nightly
 
 test-gpu:
 	@if [ -z "$(GPU_PYTHON)" ]; then echo "test-gpu needs Python 3.11 or 3.12; name one: make test-gpu GPU_PYTHON=/path/to/python3.12" >&2; exit 1; fi
@@ -90,7 +103,8 @@ mutants: set-up-test $(VENV)/.installed-mutants
 lint: set-up-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+# The types are those of the release.
+	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright)
 
 wheel: set-up-test
 	$(BIN)/python -m build --wheel
@@ -100,7 +114,7 @@ doctor: set-up
 
 clean:
 	rm -rf dist build test-results .pytest_cache .ruff_cache .hypothesis
-	find . \( -path ./$(VENV) -o -path ./.venv-gpu \) -prune -o -name __pycache__ -type d -print0 | xargs -0 -r rm -rf
+	find . \( -path './.venv*' \) -prune -o -name __pycache__ -type d -print0 | xargs -0 -r rm -rf
 
 set-up: $(VENV)/.installed
 
@@ -125,16 +139,16 @@ $(VENV)/pyvenv.cfg: $(BROKEN_VENV)
 
 $(VENV)/.installed: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e .
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRA)]'
 	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[test]'
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRA),test]'
 	@touch $(VENV)/.installed $@
 
 $(VENV)/.installed-mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[mutants]'
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRA),mutants]'
 	@touch $@
 
 FORCE:

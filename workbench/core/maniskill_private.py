@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.agents.base_agent import BaseAgent
-from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController, PDEEPoseController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
-from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+from mani_skill.sensors import camera as camera_module
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
@@ -32,6 +34,11 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind
 
+parse_cameras: Callable[[Any], dict[str, Any]] = (
+    getattr(camera_module, "parse_camera_configs", None) or camera_module.parse_sensor_configs
+)
+"""What a camera hook returns as a dict: 3.0.1 has the first name, the nightly builds of 2026 the second."""
+
 
 @cache
 def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
@@ -43,6 +50,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     """
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_set_ee_action = PDEEPosController.set_action
+    stock_get_contacts = ManiSkillScene.get_contacts
 
     def link_data(self: Any) -> torch.Tensor:
         # Only velocities are read this way (`Link.pose` reads the tensor itself), and a root's are fetched with
@@ -57,6 +65,20 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             stock_set_ee_action(self, action)
         else:
             _set_ee_action_of_each_env(self, action)
+
+    def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Nightly builds refuse the frames that GPU simulation lacks by ``scene.gpu_sim_enabled``, 3.0.1 by the device."""
+
+        def check(self: Any) -> None:
+            if batched_system(self.scene) is None:
+                stock(self)
+
+        return check
+
+    def get_contacts(self: Any) -> Any:
+        # Nightly builds raise before they ask the system, whose message says what to call instead.
+        system = batched_system(self)
+        return stock_get_contacts(self) if system is None else system.get_contacts()
 
     def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
         """Replace the cached property `name`: in a batched CPU scene it gives the row of each of the struct's `things`."""
@@ -81,6 +103,9 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     find_rows(ArticulationJoint, "_data_index", "_physx_articulations", "index", torch.int32)
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
+    for controller in (PDEEPosController, PDEEPoseController):
+        controller._check_gpu_sim_works = check_frame(controller._check_gpu_sim_works)
+    ManiSkillScene.get_contacts = get_contacts
 
 
 def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
@@ -350,9 +375,9 @@ def noting_cameras(note: Callable[[Any, FrameType], None]) -> Iterator[None]:
 
 def camera_configs(env: Any) -> dict[CameraKey, Any]:
     """Configs that the camera hooks return now, before keywords of ``gym.make`` change them."""
-    of_agent = {} if env.agent is None else parse_camera_configs(env.agent._sensor_configs)
-    sensors = {**parse_camera_configs(env._default_sensor_configs), **of_agent}
-    people = parse_camera_configs(env._default_human_render_camera_configs)
+    of_agent = {} if env.agent is None else parse_cameras(env.agent._sensor_configs)
+    sensors = {**parse_cameras(env._default_sensor_configs), **of_agent}
+    people = parse_cameras(env._default_human_render_camera_configs)
     return {
         **{("sensor", name): config for name, config in sensors.items()},
         **{("human", name): config for name, config in people.items()},
@@ -411,6 +436,9 @@ def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components
     """Give a ``Camera`` this config and these components, which already match the config."""
     kind, name = key
     camera.config = config
+    if hasattr(camera, "_shader_config"):
+        # Nightly builds read the shader's textures from here, 3.0.1 from the config.
+        camera._shader_config = config.shader_config
     (env._sensor_configs if kind == "sensor" else env._human_render_camera_configs)[name] = config
     inner: RenderCamera = camera.camera
     if inner._render_cameras is not components:

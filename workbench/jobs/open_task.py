@@ -39,6 +39,7 @@ from workbench.core.env.assets import MissingAssets
 from workbench.core.env.cpu_scene import BatchedCpuMixin, ForgottenInit
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.maniskill_private import parse_cameras
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
@@ -271,6 +272,7 @@ def describe(
         in_place_of=None if loaded.in_place_of is None else loaded.in_place_of.name,
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env),
+        parse_cameras=parse_cameras.__name__,
     )
 
 

@@ -88,6 +88,8 @@ class TaskDescription:
     """Objects that a camera can be measured on."""
     notices: tuple[str, ...] = ()
     """Notices about a task that works, as sentences."""
+    parse_cameras: str = "parse_camera_configs"
+    """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
 
     def camera(self, key: CameraKey) -> CameraInfo | None:
         return next((camera for camera in self.cameras if camera.key == key), None)

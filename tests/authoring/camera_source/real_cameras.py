@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 
 from workbench.authoring.camera_source.cameras import HOOKS as KINDS
@@ -23,6 +23,7 @@ from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.run_hooks import camera_run, owners, recording_calls
 from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.core.maniskill_private import parse_cameras
 
 FILE = "/author/task.py"
 HEADER = """\
@@ -89,7 +90,7 @@ def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[t
             (hook, name): config
             for hook in HOOKS
             if hasattr(task, hook)
-            for name, config in parse_camera_configs(getattr(task, hook)).items()
+            for name, config in parse_cameras(getattr(task, hook)).items()
         }
 
 
@@ -103,7 +104,7 @@ def run_class(sources: Mapping[str, str], class_name: str = "Task") -> HookCamer
                 (KINDS[hook], name): config
                 for hook in (() if issubclass(cls, BaseEnv) else HOOKS)
                 if hasattr(task, hook)
-                for name, config in parse_camera_configs(getattr(task, hook)).items()
+                for name, config in parse_cameras(getattr(task, hook)).items()
             }
             return HookCameras(
                 {key: camera_run(config, recorded) for key, config in configs.items()}, owners(cls)

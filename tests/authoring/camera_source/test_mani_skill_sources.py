@@ -11,7 +11,7 @@ from typing import Any
 
 import mani_skill
 import pytest
-from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+from mani_skill.sensors.camera import CameraConfig
 
 from tests.authoring.camera_source.real_cameras import close, looking, settings_of
 from workbench.authoring.camera_source.cameras import HOOKS, HookCameras
@@ -19,6 +19,7 @@ from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.camera_source.run_hooks import camera_run, recording_calls
 from workbench.core.camera_data import CameraKey
+from workbench.core.maniskill_private import parse_cameras
 
 PACKAGE = Path(mani_skill.__file__).parent
 FILES = sorted(
@@ -61,7 +62,7 @@ def hook_results(path: Path, text: str) -> dict[tuple[str, int], dict[str, Camer
             exec(compile(ast.Module([node], []), TASK, "exec"), names)
             count = sum(name == node.name for name, _ in found)
             try:
-                found[node.name, count] = parse_camera_configs(names[node.name](Anything()))
+                found[node.name, count] = parse_cameras(names[node.name](Anything()))
             except (TypeError, ValueError):  # numbers that only a real task has
                 found[node.name, count] = {}
     return found

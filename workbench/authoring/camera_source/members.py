@@ -125,18 +125,25 @@ def plan_remove(sources: Mapping[str, str], key: CameraKey, run: RunHooks) -> So
         return edit.verified(call.file, key, None)
 
 
-_PARSE_IMPORT = {"parse_camera_configs": "from mani_skill.sensors.camera import parse_camera_configs"}
-
-
 def override_text(
-    kind: CameraKind, uid: str, settings: CameraSettings, more: Sequence[str] = (), indent: str = "    "
+    kind: CameraKind,
+    uid: str,
+    settings: CameraSettings,
+    parse: str,
+    more: Sequence[str] = (),
+    indent: str = "    ",
 ) -> str:
-    """Text of a hook that takes the parent's cameras and replaces one; `more` are further arguments, such as its mount."""
+    """Text of a hook that takes the parent's cameras and replaces one.
+
+    Args:
+        parse: ManiSkill's function for a hook's result, `TaskDescription.parse_cameras`.
+        more: further arguments of the camera, such as its mount.
+    """
     hook, inner = HOOK_OF[kind], indent + "    "
     lines = (
         f"{indent}@property",
         f"{indent}def {hook}(self):",
-        f"{inner}cameras = parse_camera_configs(super().{hook})",
+        f"{inner}cameras = {parse}(super().{hook})",
         f"{inner}cameras[{repr_text(uid)}] = {snippet(uid, settings, inner, more)}",
         f"{inner}return cameras",
     )
@@ -152,6 +159,7 @@ def plan_override(
     settings: CameraSettings,
     site: CallSite,
     run: RunHooks,
+    parse: str,
     more: Sequence[str] = (),
 ) -> SourceEdit:
     """Adds the hook of `override_text` to `class_name`; `site` is where the parent makes the camera. Raises RefusedEdit."""
@@ -172,9 +180,11 @@ def plan_override(
             f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets a {hook} of its own, with all "
             f"cameras of {parent} and this one in place of its {uid}"
         )
-        edit.add_imports(source, needed_imports(settings) | _PARSE_IMPORT)
+        edit.add_imports(
+            source, needed_imports(settings) | {parse: f"from mani_skill.sensors.camera import {parse}"}
+        )
         text = at_end_of_class(
-            source, cls, hook, lambda indent: override_text(kind, uid, settings, more, indent)
+            source, cls, hook, lambda indent: override_text(kind, uid, settings, parse, more, indent)
         )
         edit.change(source, text)
         return edit.verified(source, (kind, uid), (kind, uid))

@@ -116,7 +116,7 @@ def _override_edit(
     more = [f'mount={robot}.links_map["{link}"]'] if link else []
     if site.function.rpartition(".")[2] not in HOOK_OF.values():
         raise RefusedEdit(owner_text, snippet(uid, request.settings, more=more))
-    whole = members.override_text(kind, uid, request.settings, more)
+    whole = members.override_text(kind, uid, request.settings, task.parse_cameras, more)
     if request.what != "edit" or task.file is None or task.file not in texts:
         raise RefusedEdit(owner_text, whole)
     if info.varies:
@@ -125,7 +125,7 @@ def _override_edit(
         )
         raise RefusedEdit(reason, whole)
     return members.plan_override(
-        texts, task.file, task.class_name, kind, uid, request.settings, site, run, more
+        texts, task.file, task.class_name, kind, uid, request.settings, site, run, task.parse_cameras, more
     )
 
 
