@@ -93,7 +93,7 @@ def install(wheels: Path | None) -> None:
 
 def requirements() -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return [*project["dependencies"], *TEST_PACKAGES]
+    return [*project["dependencies"], *project["optional-dependencies"]["maniskill"], *TEST_PACKAGES]
 
 
 def torch_has_cuda(python: str) -> bool:

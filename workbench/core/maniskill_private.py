@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind
 
 parse_cameras: Callable[[Any], dict[str, Any]] = (
-    getattr(camera_module, "parse_camera_configs", None) or camera_module.parse_sensor_configs
+    getattr(camera_module, "parse_camera_configs", None) or camera_module.parse_sensor_configs  # pyright: ignore
 )
 """What a camera hook returns as a dict: 3.0.1 has the first name, the nightly builds of 2026 the second."""
 
@@ -104,7 +104,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
     for controller in (PDEEPosController, PDEEPoseController):
-        controller._check_gpu_sim_works = check_frame(controller._check_gpu_sim_works)
+        controller._check_gpu_sim_works = check_frame(controller._check_gpu_sim_works)  # type: ignore[method-assign,assignment]
     ManiSkillScene.get_contacts = get_contacts
 
 
