@@ -57,7 +57,7 @@ def length(metres: float) -> str:
 # --- text from elsewhere, made safe for a terminal and a page: controls are escaped, colours kept -----
 
 
-_SHOWN = re.compile(
+_ESCAPED = re.compile(
     "[\x00-\x1f\x7f-\x9f"  # C0, DEL and C1, which some terminals take for ESC and a letter
     "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # the direction of writing
     "\u2028\u2029"  # line ends, to some programs
@@ -76,9 +76,9 @@ def plain_text(text: str, keep: str = "") -> str:
     Such characters can clear a terminal, rename its window, write to the clipboard, move the cursor over other text, or make a
     name look like another.
     """
-    if not _SHOWN.search(text):
+    if not _ESCAPED.search(text):
         return text
-    return _SHOWN.sub(
+    return _ESCAPED.sub(
         lambda found: found[0] if found[0] in keep else found[0].encode("unicode_escape").decode(), text
     )
 
@@ -92,7 +92,7 @@ def short_line(text: str, longest: int) -> str:
 
 def only_colours(text: str, keep: str = "\n\t") -> str:
     """`text` as `plain_text`, but with its colours."""
-    if not _SHOWN.search(text):
+    if not _ESCAPED.search(text):
         return text
     parts: list[str] = []
     end = 0

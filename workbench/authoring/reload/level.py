@@ -94,7 +94,7 @@ def find_change(
     exchanged unless something may outlive the exchange (`workbench.authoring.reload.kept_state`): values that hooks keep
     between calls, dicts and lists at the top that are filled while the task runs, attributes that only the old version
     writes, objects of the author's classes. If code may reach further than its names (``exec``), nothing is exchanged. In
-    doubt it is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" an afternoon.
+    doubt it is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
 
     Pure: nothing is imported or executed, and no content of the texts raises.
     """

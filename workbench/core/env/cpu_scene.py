@@ -32,8 +32,8 @@ from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
     in_ascending_order,
-    others,
     seeded,
+    untouched_envs,
 )
 from workbench.core.env.strict import StrictMixin
 from workbench.core.maniskill_private import asks_for_a_gpu, install_row_lookups, substeps_are_unwatched
@@ -213,7 +213,7 @@ class BatchedCpuMixin:
         """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
 
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        untouched = others(self, options)
+        untouched = untouched_envs(self, options)
         options, seeds = in_ascending_order(options or {}, seed, self)
         # ManiSkill takes a list of seeds for those of the whole batch.
         if not untouched or seeds is None or len(seeds) == 1:

@@ -1,4 +1,4 @@
-"""Partial resets that leave the other envs alone."""
+"""Resets of some envs that change neither state nor random numbers of the others."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def active_controllers(env: Any) -> list[BaseController]:
     return single
 
 
-def others(env: Any, options: dict[str, Any] | None) -> list[int]:
+def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
     """The envs that a reset with these options does not touch; empty for a reset of all."""
     chosen = _chosen(env, options or {})
     return [] if chosen is None else sorted(set(range(env.num_envs)).difference(chosen))
@@ -135,7 +135,7 @@ def explain_reset_errors(env: Any, untouched: list[int]) -> Iterator[None]:
         raise  # has the line already
     except Exception as error:
         line = _line_of_the_task(error, env)
-        lost = [] if rows is None else [path for path, envs in rows.changes().items() if not envs]
+        lost = [] if rows is None else [path for path, envs in rows.changed_envs().items() if not envs]
         if line is not None or lost:
             error.add_note(_note(env, chosen, line, lost))
         raise
