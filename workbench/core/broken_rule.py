@@ -43,7 +43,7 @@ class BrokenRule(RuntimeError):
     """The task broke a rule of GPU simulation that stops."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
-        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', it goes on.)")
+        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', the task continues.)")
         self.rule, self.place = rule, place
 
 

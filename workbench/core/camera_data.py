@@ -142,7 +142,7 @@ class CameraInfo:
     intrinsic: NDArray[np.float32]
     """(3, 3) OpenCV intrinsic matrix in pixels (env 0's, where they differ)."""
     mount: str | None
-    """Body name that the camera rides on, or None when it stands still."""
+    """Body name that the camera rides on, or None when it is fixed."""
     modalities: tuple[str, ...]
     """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None

@@ -29,8 +29,8 @@ def nonfinite_text(values: ArrayLike) -> str:
     """Counts of values that are not finite: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
     flat = np.asarray(values).reshape(-1)
     counts = {"NaN": int(np.isnan(flat).sum()), "infinite": int(np.isinf(flat).sum())}
-    told = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
-    return f"{told} of {len(flat)}" if told else ""
+    counted = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
+    return f"{counted} of {len(flat)}" if counted else ""
 
 
 def mean_text(values: ArrayLike, form_text: Callable[[float], str] = number_text) -> str:
@@ -49,7 +49,7 @@ def length(metres: float) -> str:
     if metres == 0:
         return "0"
     if not math.isfinite(metres):
-        return "more than can be told"
+        return "infinite"
     unit, size = next((unit, size) for unit, size, least in _UNITS if metres >= least)
     return f"{metres / size:.2g} {unit}"
 
@@ -147,7 +147,7 @@ class SafeStream:
 def guard_terminal() -> None:
     """Let this process print only text and colours to its terminal.
 
-    For good, since a traceback that ends the process is printed last. Does not cover native code and other programs.
+    Not undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)

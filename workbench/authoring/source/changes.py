@@ -24,7 +24,7 @@ from workbench.core.cameras.conventions import normalised
 class Changes:
     """Collects edits of traced values and turns them into replacements of text.
 
-    A value is edited where it is written if nothing else reads it there. Otherwise (one ``pose`` for two cameras, a
+    A value is edited where it is written if nothing else reads it there. Else (one ``pose`` for two cameras, a
     constant that the scene uses) the new value is written in place of the name, for this use alone, with a note.
 
     Places come from the worker, whose texts may differ: one that is not an expression of these files raises RefusedEdit.

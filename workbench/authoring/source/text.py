@@ -57,7 +57,7 @@ class SourceFile:
             self.module = ast.parse(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as exc:
             reason = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
-            raise RefusedEdit(f"{self.name} is not valid Python as it stands: {reason}") from exc
+            raise RefusedEdit(f"{self.name} is not valid Python now: {reason}") from exc
         self._starts = [0, *(m.end() for m in _LINE_END.finditer(text))]
         self.nodes = list(walk(self.module))
         """All nodes, nearly in the order of the text."""

@@ -21,7 +21,7 @@ ENOUGH_PIXELS = 100.0
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """One object that a search can ask for: of the task, or a robot, whose single links can be asked for."""
+    """One object that a search can name: of the task, or a robot, whose single links can be named too."""
 
     name: str
     """An actor's or an articulation's."""

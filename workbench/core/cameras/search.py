@@ -69,7 +69,7 @@ def suggest_cameras(
 ) -> tuple[OfferedPlacement, ...]:
     """The best placements found, best first, for envs that are already reset; the envs stay as they are.
 
-    Placements that stand apart are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
+    Placements at a distance from each other are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
     there are not more, or if the search is cancelled. The same seed gives the same result.
 
     Args:
@@ -202,7 +202,7 @@ class _Search:
         return measured
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
-        """The best that stand apart."""
+        """The best that are not close to each other."""
         chosen: list[tuple[float, _Candidate, CameraReport]] = []
         for entry in sorted(self.found, key=lambda entry: -entry[0]):
             if entry[0] > 0 and not any(self._near(entry[1], other[1]) for other in chosen):

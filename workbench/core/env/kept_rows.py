@@ -179,10 +179,10 @@ class _Lines:
 
     def start(self) -> None:
         if sys.gettrace() is not None or not self.rows.before:
-            return  # of a debugger, or of coverage
+            return  # a debugger or coverage is tracing
         self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
-        while frame is not None:  # callers of the reset go on after it, as the task's own `reset` does
+        while frame is not None:  # callers of the reset continue after it, as the task's own `reset` does
             if self._is_the_tasks(frame):
                 frame.f_trace = self._traced
                 self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)

@@ -164,7 +164,7 @@ class StrictMixin:
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
-            # What `evaluate` stores for all envs is no fault of the reset: compare from here on.
+            # `evaluate` may store values of all envs, which is not the reset's fault: compare from here.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
 

@@ -327,7 +327,7 @@ def _at_most(pixels: NDArray[np.uint8], max_size: int) -> NDArray[np.uint8]:
 
 
 def _collision_shape(shape: Any) -> tuple[Hashable, Callable[[], Mesh]]:
-    """Key, and the function that makes the mesh. PhysX's capsules, cylinders and planes lie along x."""
+    """Key, and the function that makes the mesh. PhysX's capsules, cylinders and planes are along x."""
     if isinstance(shape, physx.PhysxCollisionShapeBox):
         half = shape.half_size.tolist()
         return ("box", *half), lambda: _mesh(trimesh.creation.box(extents=2 * np.array(half)))
