@@ -123,7 +123,7 @@ class BrokenRules:
         Args:
             frames: at fault, to become the innermost of the traceback; empty for those of the present call, None where
                 no line is at fault or only `place` is known.
-            subject: the thing that gets one row, instead of the line.
+            subject: what gets one row, instead of the line.
         """
         degree = self._degrees[rule]
         if degree == "off":

@@ -37,7 +37,7 @@ _TABLE = (
         "stepped-in-reset",
         "stop",
         "_initialize_episode does not call scene.step() while other envs are in the middle of an episode.",
-        "The episodes of other envs are moved on.",
+        "The episodes of other envs advance.",
     ),
     Rule(
         "apply-before-fetch",

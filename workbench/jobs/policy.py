@@ -28,7 +28,7 @@ Policy = Callable[[Any], Any]
 for all envs, or a dict for several robots."""
 
 _warned: set[Path] = set()
-"""Files with a library's name that were warned of."""
+"""Files with a library's name that a warning named."""
 
 
 class NoPolicy(ValueError):

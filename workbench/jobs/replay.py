@@ -225,16 +225,14 @@ def _distance(
 def replay_text(replay_result: ReplayResult) -> str:
     """One sentence: how the state was reached, and how close it is."""
     if replay_result.way == "put there":
-        text = (
-            "the recorded state was put in place; contacts, and what the task counts on itself, start again"
-        )
+        text = "the recorded state was restored; contacts, and what the task counts on itself, start again"
     elif replay_result.way == "corrected":
         text = (
             f"its actions were made again, and its state put back at {replay_result.corrected} of {replay_result.steps} steps, "
-            "where they had parted"
+            "where they differed"
         )
     elif replay_result.steps == 0:
-        text = "reset with its seed" + (", then its first state put in place" * replay_result.start_differs)
+        text = "reset with its seed" + (", then its first state restored" * replay_result.start_differs)
     else:
         text = "its actions were made again"
         text += " from its first state" if replay_result.start_differs else " from its seed"

@@ -194,7 +194,7 @@ def _varies(config: Any, components: Sequence[Any]) -> bool:
 
 
 def mount_of(env: Any, camera: Any) -> str | None:
-    """Name of the body that a camera rides on; `camera` as `cameras_of` gives it."""
+    """Name of the body that a camera is mounted on; `camera` as `cameras_of` gives it."""
     mount = camera.camera.mount
     return None if mount is None else scene_index(env).name_of(maniskill_private.objects_of(mount)[0])
 

@@ -26,7 +26,7 @@ class KeptControllers:
     """What the active controllers remember of some envs: start, target and all else with a row an env.
 
     ManiSkill 3.0.1 resets the controllers of every env in a partial reset: it sets the reset mask back to all ones before
-    ``controller.reset()``, which asks that mask. A controller with ``use_target`` then takes the present joints as its
+    ``controller.reset()``, which reads that mask. A controller with ``use_target`` then takes the present joints as its
     target in envs that are not reset. So their values are kept and put back before the first observation.
     """
 

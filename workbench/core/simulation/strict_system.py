@@ -90,7 +90,7 @@ _MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
 class StrictCpuSystem(BatchedCpuSystem):
     """A `BatchedCpuSystem` that reports breaches of the rules of GPU simulation.
 
-    On the GPU ``gpu_fetch_*`` overwrites the tensors and ``gpu_apply_*`` the simulation, for all envs and without a word. So a
+    On the GPU ``gpu_fetch_*`` overwrites the tensors and ``gpu_apply_*`` the simulation, for all envs and without a message. So a
     pose that was set and not applied is lost at the next fetch, an apply after a step without a fetch puts every body of
     every env back, and a read between the two gives the past. `BatchedCpuSystem` does the first and the last as the GPU
     does; this class reports all three, and changes no bit where a rule only warns. It compares values, not calls: a pose set

@@ -211,7 +211,7 @@ def _with_rows(
     if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
         if listed:
             return "it is no list with an entry for each env now"
-        return f"it had shape ({', '.join(['N', *map(str, shape[1:])])}) and is another thing now"
+        return f"it had shape ({', '.join(['N', *map(str, shape[1:])])}) and has another shape or type now"
     if listed:
         new: Any = list(value) if fits else [None] * env.num_envs
         for i, row in zip(env_idx, rows, strict=True):
