@@ -214,7 +214,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 self.rules.report_breach(
                     "not-applied",
                     f"The {what} of '{name}' in {where} was set and not applied: physics never sees it{seen_by}, and "
-                    "the next fetch writes it over. To have it seen, call self.scene._gpu_apply_all() and "
+                    "the next fetch overwrites it. To have it seen, call self.scene._gpu_apply_all() and "
                     "self.scene._gpu_fetch_all() after the write (under `if self.gpu_sim_enabled:`).",
                     frames,
                 )
@@ -268,7 +268,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             self.rules.report_breach(
                 "stepped-in-reset",
                 f"The simulation is stepped in _initialize_episode while {envs_named(others)} are not being reset: "
-                "their episodes are moved on as well. (With one env, as --num-envs 1 opens it, there are no others.)",
+                "their episodes advance as well. (With one env, as --num-envs 1 opens it, there are no others.)",
             )
         super().step()
 
