@@ -48,7 +48,7 @@ def make(
 
     * ``num_envs`` above 1 works without a GPU.
     * A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock) gets the richest
-      one that is. Otherwise the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
+      one that is. Else the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
     * ``render_backend`` is found if it is not given; without a driver an env without pictures is made as with
       ``render_backend="none"``, and one that needs pictures is refused.
     * ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper would end every episode.

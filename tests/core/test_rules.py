@@ -148,7 +148,7 @@ def a_rule() -> BrokenRules:
 def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
     rules = a_rule()
     for rules.step in range(5):
-        rules.breaks("not-applied", f"lost in step {rules.step}", None, ("task.py", 7, "lift"))
+        rules.report_breach("not-applied", f"lost in step {rules.step}", None, ("task.py", 7, "lift"))
     (row,) = rules.rows
     assert (row.count, row.first_step, row.message) == (5, 0, "lost in step 0")
     assert (row.file, row.line, row.function) == ("task.py", 7, "lift")
@@ -157,7 +157,7 @@ def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
 def test_rows_are_bounded_and_the_rest_is_counted() -> None:
     rules, serial = a_rule(), 0
     for line in range(3 * MOST_ROWS):
-        rules.breaks("not-applied", "lost", None, ("task.py", line, "lift"))
+        rules.report_breach("not-applied", "lost", None, ("task.py", line, "lift"))
         assert rules.serial > serial
         serial = rules.serial
     assert len(rules.rows) == MOST_ROWS and rules.more == 2 * MOST_ROWS
@@ -166,9 +166,9 @@ def test_rows_are_bounded_and_the_rest_is_counted() -> None:
 def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
     rules = a_rule()
     with rules.during("step"):
-        rules.breaks("not-applied", "lost", None, ("task.py", 7, "lift"))
+        rules.report_breach("not-applied", "lost", None, ("task.py", 7, "lift"))
     with rules.during("reset"):
-        rules.breaks("rows-rewritten", "drawn", None, ("task.py", 9, "draw"), subject="target")
+        rules.report_breach("rows-rewritten", "drawn", None, ("task.py", 9, "draw"), subject="target")
     rules.edited(lambda row: ("task.py", (row.line or 0) + 1))
     assert [(row.rule, row.line) for row in rules.rows] == [("not-applied", 8), ("rows-rewritten", 10)]
     with pytest.raises(ZeroDivisionError), rules.during("step"):
@@ -180,7 +180,7 @@ def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
         pass
     assert [row.rule for row in rules.rows] == ["rows-rewritten"]
     with rules.during("reset"):
-        rules.breaks("rows-rewritten", "drawn", None, ("task.py", 10, "draw"), subject="target")
+        rules.report_breach("rows-rewritten", "drawn", None, ("task.py", 10, "draw"), subject="target")
     assert rules.rows[0].count == 2
 
 

@@ -14,7 +14,16 @@ from tests.drive.waiting import until
 from tests.jobs import work
 from tests.jobs.work import PROBLEM, Setup, Squared, square
 from workbench.authoring.problem import TaskError
-from workbench.jobs.pool import Deal, Executor, PoolError, Processes, Share, ThisProcess, Work, shares
+from workbench.jobs.pool import (
+    Deal,
+    Executor,
+    ItemQueue,
+    PoolError,
+    Processes,
+    ThisProcess,
+    Work,
+    envs_per_process,
+)
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -33,7 +42,7 @@ class Run:
         numbers: Iterable[int],
         stop: Callable[[], bool] = lambda: False,
         on_result: Callable[[Run, int], None] = lambda run, number: None,
-        run: Callable[[Setup, Share], None] = square,
+        run: Callable[[Setup, ItemQueue], None] = square,
     ) -> None:
         self.results: dict[int, Squared] = {}
         self.updates: list[str] = []
@@ -87,7 +96,8 @@ def test_cores_and_envs_are_shared_out(tmp_path: Path) -> None:
     ]
     together = sorted(int(core) for one in given for core in one)
     assert together == (cores if len(cores) > 1 else 2 * cores)
-    assert [shares(5, 2), shares(2, 3), shares(6, 3)] == [[3, 2], [1, 1], [2, 2, 2]]
+    divided = [envs_per_process(5, 2), envs_per_process(2, 3), envs_per_process(6, 3)]
+    assert divided == [[3, 2], [1, 1], [2, 2, 2]]
 
 
 @pytest.mark.parametrize("executor", [ThisProcess(), Processes(), Processes(3)])
@@ -148,7 +158,7 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
         fails("endless", "a process that squares sent what cannot be read"),
         fails("another type", "a process that squares sent what cannot be read"),
         fails("no path", "a process that squares sent what cannot be read"),
-        fails("another's", "a process that squares told of an item that it does not have"),
+        fails("another's", "a process that squares sent the result of an item that it does not have"),
     ],
 )
 def test_a_process_that_fails_ends_the_job_and_the_others_finish_what_they_have(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from workbench.authoring.problem import Problem, TaskError
-from workbench.jobs.pool import Share
+from workbench.jobs.pool import ItemQueue
 
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
 
@@ -31,27 +31,27 @@ class Squared:
     pid: int
 
 
-def square(setup: Setup, share: Share) -> None:
+def square(setup: Setup, queue: ItemQueue) -> None:
     """Two items at a time, as an env that has two places."""
     if setup.how == "cannot be loaded":
         raise TaskError(PROBLEM)
-    share.send_update(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
+    queue.send_update(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
     running: list[int] = []
     while True:
-        running = [number for number in running if number < share.limit()]
-        while len(running) < 2 and (number := share.next()) is not None:
+        running = [number for number in running if number < queue.limit()]
+        while len(running) < 2 and (number := queue.next()) is not None:
             (setup.folder / f"begun{number}").touch()
             running.append(number)
         if not running:
             return
         number = running.pop(0)
         if number == setup.at:
-            go_wrong(setup, share)
-        share.send_update(1)
-        share.send_result(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
+            go_wrong(setup, queue)
+        queue.send_update(1)
+        queue.send_result(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
 
 
-def go_wrong(setup: Setup, share: Share) -> None:
+def go_wrong(setup: Setup, queue: ItemQueue) -> None:
     if setup.how == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
     elif setup.how == "left":
@@ -69,11 +69,11 @@ def go_wrong(setup: Setup, share: Share) -> None:
     elif setup.how == "endless":
         os.write(int(sys.argv[2]), b"\x7f\xff\xff\xff")
     elif setup.how == "another type":
-        share.send_result(setup.at, "a text")
+        queue.send_result(setup.at, "a text")
     elif setup.how == "no path":
-        share.send_result(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
+        queue.send_result(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
     elif setup.how == "another's":
-        share.send_result(10**6, Squared(0, 0, Path(), 0))
+        queue.send_result(10**6, Squared(0, 0, Path(), 0))
     elif setup.how in ("hangs", "half a message"):
         if setup.how != "hangs":
             os.write(int(sys.argv[2]), b"\x00\x00\x00\x10hel")
@@ -82,10 +82,10 @@ def go_wrong(setup: Setup, share: Share) -> None:
             time.sleep(0.01)
     elif setup.how == "waits":
         (setup.folder / "waits").touch()
-        while share.limit() > setup.at:
+        while queue.limit() > setup.at:
             time.sleep(0.01)
 
 
-def forget(setup: Setup, share: Share) -> None:
+def forget(setup: Setup, queue: ItemQueue) -> None:
     """Ends with an item that it says nothing of."""
-    share.next()
+    queue.next()

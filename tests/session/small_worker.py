@@ -17,10 +17,17 @@ from typing import Any, get_args
 
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
-from workbench.jobs.pool import Answer
 from workbench.machine.processes.wire import Call, Unpacker, pack_message
 from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter, Interrupts
-from workbench.session.protocol.messages import ListenForDebugger, Load, Loaded, Loading, Quit, Request
+from workbench.session.protocol.messages import (
+    Answer,
+    ListenForDebugger,
+    Load,
+    Loaded,
+    Loading,
+    Quit,
+    Request,
+)
 from workbench.session.protocol.questions import QUESTIONS, RunCameras
 from workbench.session.worker.start import main
 

@@ -102,7 +102,7 @@ class Problem:
 
 
 class TaskError(Exception):
-    """The task cannot be loaded or built; `problem` says why.
+    """The author's code failed, in a load, a step or a reset; `problem` says why.
 
     Args:
         classes: task classes of the file that can be opened, this one first; empty if it has no other.

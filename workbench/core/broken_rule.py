@@ -43,7 +43,7 @@ class BrokenRule(RuntimeError):
     """The task broke a rule of GPU simulation that stops."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
-        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', it goes on.)")
+        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', the task continues.)")
         self.rule, self.place = rule, place
 
 
@@ -68,7 +68,7 @@ def warn_of(finding: Finding) -> None:
 
 
 @dataclass(frozen=True)
-class _Row:
+class _KeptFinding:
     finding: Finding
     occasion: Occasion
     """When it was last broken."""
@@ -94,7 +94,7 @@ class BrokenRules:
             on_finding: called once for each place where a rule that does not stop is broken.
         """
         self._degrees, self._on_finding = degrees, on_finding
-        self._rows: dict[_Key, _Row] = {}
+        self._rows: dict[_Key, _KeptFinding] = {}
         self._now: Occasion = "reset"
         self.more = 0
         """Breaches at places beyond `MOST_ROWS`."""
@@ -110,7 +110,7 @@ class BrokenRules:
     def degree(self, rule: str) -> Degree:
         return self._degrees[rule]
 
-    def breaks(
+    def report_breach(
         self,
         rule: str,
         message: str,
@@ -123,7 +123,7 @@ class BrokenRules:
         Args:
             frames: at fault, to become the innermost of the traceback; empty for those of the present call, None where
                 no line is at fault or only `place` is known.
-            subject: the thing that gets one row, instead of the line.
+            subject: what gets one row, instead of the line.
         """
         degree = self._degrees[rule]
         if degree == "off":
@@ -143,7 +143,7 @@ class BrokenRules:
         }
 
     def returned(self, rule: str, hook: str, problem: str, place: Place | None) -> None:
-        """As `breaks`, for the return value of a hook."""
+        """As `report_breach`, for the return value of a hook."""
         if self._degrees[rule] == "stop":
             raise WrongReturn(problem, hook, rule, place)
         if self._degrees[rule] == "warn":
@@ -159,13 +159,13 @@ class BrokenRules:
         if row is None:
             found = Finding(rule, self._degrees[rule], message, None, None, "", "", 1, self.step)
             found = found if place is None else _at(found, place)
-            self._rows[key] = _Row(found, self._now, exact)
+            self._rows[key] = _KeptFinding(found, self._now, exact)
             self._on_finding(found)
             return
         found = replace(row.finding, count=row.finding.count + 1)
         if exact and place is not None and not row.exact:
             found, row = _at(found, place), replace(row, exact=True)
-        self._rows[key] = _Row(found, self._now, row.exact)
+        self._rows[key] = _KeptFinding(found, self._now, row.exact)
 
     # --- an edited file ------------------------------------------------------------------------------
 

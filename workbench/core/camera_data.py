@@ -142,7 +142,7 @@ class CameraInfo:
     intrinsic: NDArray[np.float32]
     """(3, 3) OpenCV intrinsic matrix in pixels (env 0's, where they differ)."""
     mount: str | None
-    """Body name that the camera rides on, or None when it stands still."""
+    """Name of the body that the camera is mounted on; None if it is fixed."""
     modalities: tuple[str, ...]
     """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
@@ -172,7 +172,7 @@ class Picture:
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
     """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation is
-    this in whole millimetres as int16, up to 32.767 m, and `step_pictures` leaves it so. Otherwise unlimited."""
+    this in whole millimetres as int16, up to 32.767 m, and `step_pictures` leaves it so. All other depth is unlimited."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 Degree = Literal["stop", "warn", "off"]
-"""*stop* raises at the line that broke the rule; *warn* reports the line, and the operation goes on as without rules, to the
+"""*stop* raises at the line that broke the rule; *warn* reports the line, and the operation continues as without rules, to the
 last bit. By default a rule stops where the state of other envs is overwritten, since every number after that is wrong."""
 DEGREES: tuple[Degree, ...] = get_args(Degree)
 
@@ -37,7 +37,7 @@ _TABLE = (
         "stepped-in-reset",
         "stop",
         "_initialize_episode does not call scene.step() while other envs are in the middle of an episode.",
-        "The episodes of other envs are moved on.",
+        "The episodes of other envs advance.",
     ),
     Rule(
         "apply-before-fetch",
@@ -56,7 +56,7 @@ _TABLE = (
         "rows-rewritten",
         "warn",
         "_initialize_episode(env_idx) changes the rows of env_idx only in what a task keeps on itself.",
-        "Other envs go on with another target, counter or best value than they began with.",
+        "Other envs continue with another target, counter or best value than they began with.",
     ),
     Rule(
         "applied-by-reset",

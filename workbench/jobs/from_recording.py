@@ -76,7 +76,7 @@ def changed_since(
 
     Args:
         then_file, now_file: of the task.
-        then, now: texts by path, of that file and the modules beside it.
+        then, now: texts by path, of that file and the modules in its folder.
     """
     if then_file is None or now_file is None:
         return ""

@@ -28,7 +28,7 @@ Policy = Callable[[Any], Any]
 for all envs, or a dict for several robots."""
 
 _warned: set[Path] = set()
-"""Files with a library's name that were warned of."""
+"""Files with a library's name that a warning named."""
 
 
 class NoPolicy(ValueError):
@@ -159,7 +159,7 @@ def _find(name: str, task_folder: Path | None) -> Path:
     there = (task_folder / path).resolve()
     if not there.is_file():
         raise NoPolicy(
-            f"there is no {name} in {Path.cwd()}, where the command was started, nor beside the task in {task_folder}"
+            f"there is no {name} in {Path.cwd()}, where the command was started, nor in the folder of the task, {task_folder}"
         )
     return there
 

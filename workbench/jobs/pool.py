@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, get_args
 
 from workbench.authoring.problem import Problem, TaskError, treat_ctrl_c_as_error
 from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
@@ -33,38 +33,10 @@ Update = TypeVar("Update")
 
 
 class PoolError(RuntimeError):
-    """A process died or failed; the others finished their items."""
+    """A process died or failed; the others were stopped and dropped the items under way."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """How far a `wire.Call` is."""
-
-    number: int
-    done: int
-    total: int
-    part: bytes = b""
-    """The new part of the answer since the last one, packed; see `wire.Question.part`."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The end of a `wire.Call`."""
-
-    number: int
-    value: bytes = b""
-    """Packed: only the caller knows its type."""
-    why: str = ""
-    """Why there is no value, for the page; empty if there is one."""
-    problem: Problem | None = None
-    """What the author's code raised, if that is the reason."""
-
-
-class CannotAnswer(Exception):
-    """Raised in a worker that has no answer; the text is a sentence for the page."""
-
-
-class Share(Protocol):
+class ItemQueue(Protocol):
     """The items of one process. Used on one thread."""
 
     def next(self) -> int | None:
@@ -132,8 +104,8 @@ class Deal(Generic[Result, Update]):
 class Work(Generic[Setup, Result, Update]):
     """What each process does."""
 
-    run: Callable[[Setup, Share], None]
-    """A function that can be imported by its name. It returns when its share has no next item and none is under way.
+    run: Callable[[Setup, ItemQueue], None]
+    """A function that can be imported by its name. It returns when its queue has no next item and none is under way.
 
     A TaskError, OSError, ValueError or RuntimeError from it ends the job.
     """
@@ -153,7 +125,7 @@ class Executor(Protocol):
         """Deal until no item is left or needed, and all items under way are finished.
 
         Raises:
-            TaskError, PoolError: a share failed, or its process died; the others were stopped before.
+            TaskError, PoolError: one process failed or died; the others were stopped and dropped the items under way.
         """
         ...
 
@@ -177,7 +149,7 @@ class Processes:
         self._chunk = chunk
 
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
-        pool = _WorkerPool(work, deal, self._chunk)
+        pool = _ProcessPool(work, deal, self._chunk)
         try:
             pool.start()
             pool.serve()
@@ -185,7 +157,7 @@ class Processes:
             pool.end()
 
 
-def shares(count: int, processes: int) -> list[int]:
+def envs_per_process(count: int, processes: int) -> list[int]:
     """`count` envs divided among so many processes; fewer processes where some would get none."""
     processes = min(processes, count)
     return [count // processes + (i < count % processes) for i in range(processes)]
@@ -199,9 +171,34 @@ class _Next:
     """A request for more items."""
 
 
-_ALL = -1
-"""The number of the last answer: nothing is under way, and no message follows. Other answers are of items; progress is
-sent as `Progress.part`."""
+@dataclass(frozen=True)
+class _Update:
+    """Progress of a process."""
+
+    value: bytes
+    """Packed, as `Work.update`."""
+
+
+@dataclass(frozen=True)
+class _Result:
+    """The result of an item."""
+
+    number: int
+    value: bytes
+    """Packed, as `Work.result`."""
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """The last message of a process: no item is under way."""
+
+    why: str = ""
+    """Why it failed; empty if it did not."""
+    problem: Problem | None = None
+    """What the author's code raised, if that is the reason."""
+
+
+_Message = _Next | _Update | _Result | _Ended
 
 
 @dataclass(eq=False)
@@ -214,8 +211,8 @@ class _Process:
     """Items that it has and did not report yet."""
 
 
-class _WorkerPool:
-    """The processes."""
+class _ProcessPool:
+    """Starts the processes of one run, deals items to them and collects results."""
 
     def __init__(self, work: Work, deal: Deal, chunk: int) -> None:
         self._work, self._deal, self._chunk = work, deal, chunk
@@ -236,7 +233,7 @@ class _WorkerPool:
                     start_new_session=True,  # Ctrl-C in the terminal reaches only this process, which stops them
                     env=child_environment(),
                 )
-            process = _Process(MessageSocket(ours, (_Next, Answer, Progress)), keeper)
+            process = _Process(MessageSocket(ours, get_args(_Message)), keeper)
             self._processes.append(process)
             self._busy.append(process)
             self._send(process, cores[i :: len(self._work.setups)] or cores)
@@ -290,17 +287,19 @@ class _WorkerPool:
             words = describe_exit(self._exit_code(process, 2.0))
             raise PoolError(f"a process {self._work.name} {words}") from None
 
-    def _take(self, process: _Process, message: _Next | Answer | Progress) -> None:
+    def _take(self, process: _Process, message: _Message) -> None:
         if isinstance(message, _Next):
             numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
             process.begun.update(numbers)
             self._send(process, numbers)
-        elif isinstance(message, Progress):
-            self._deal.send_update(self._unpack(message.part, self._work.update))
-        elif message.number != _ALL:
+        elif isinstance(message, _Update):
+            self._deal.send_update(self._unpack(message.value, self._work.update))
+        elif isinstance(message, _Result):
             result = self._unpack(message.value, self._work.result)
             if message.number not in process.begun:
-                raise PoolError(f"a process {self._work.name} told of an item that it does not have")
+                raise PoolError(
+                    f"a process {self._work.name} sent the result of an item that it does not have"
+                )
             process.begun.remove(message.number)
             self._deal.send_result(message.number, result)
         elif message.why:
@@ -326,8 +325,8 @@ class _WorkerPool:
 # --- a process of the pool -----------------------------------------------------------------------------
 
 
-class _RemoteShare:
-    """The share of a process of the pool: asks the process that started it."""
+class _RemoteQueue:
+    """The items of a process of the pool: asks the process that started it."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -351,10 +350,10 @@ class _RemoteShare:
         return self._limit
 
     def send_result(self, number: int, result: Any) -> None:
-        self.send(Answer(number, pack(result)))
+        self.send(_Result(number, pack(result)))
 
     def send_update(self, update: Any) -> None:
-        self.send(Progress(0, 0, 0, pack(update)))
+        self.send(_Update(pack(update)))
 
     def _take(self) -> list[int] | int:
         message: list[int] | int = self._connection.recv()
@@ -374,18 +373,18 @@ def main(socket_fd: str) -> None:
     refuse_breakpoints(ONE_PROCESS)
     treat_ctrl_c_as_error()
     connection = Connection(int(socket_fd))
-    share = _RemoteShare(connection)
+    queue = _RemoteQueue(connection)
     try:
         # PhysX and the software renderer start a thread for each core that the process may use.
         os.sched_setaffinity(0, connection.recv())
         with quick_imports():
             run, setup = connection.recv()
         try:
-            run(setup, share)
-            share.send(Answer(_ALL))
+            run(setup, queue)
+            queue.send(_Ended())
         except TaskError as error:
-            share.send(Answer(_ALL, why=str(error) or "TaskError", problem=error.problem))
+            queue.send(_Ended(str(error) or "TaskError", error.problem))
         except (OSError, ValueError, RuntimeError) as error:
-            share.send(Answer(_ALL, why=str(error) or type(error).__name__))
+            queue.send(_Ended(str(error) or type(error).__name__))
     except (ConnectionError, EOFError):
         return  # the process that started this one is gone

@@ -23,7 +23,7 @@ from workbench.jobs.actions import SUFFIXES, ActionChooser, RecordActionChooser,
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.open_task import OpenedTask, blamed, open_task
 from workbench.jobs.policy import find_policy
-from workbench.jobs.pool import Deal, Executor, Processes, Share, ThisProcess, Work, shares
+from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work, envs_per_process
 from workbench.jobs.replay import restore_recorded
 from workbench.jobs.task import RecordArguments, Stepped, TaskOptions
 from workbench.machine.folders import CurrentFolder
@@ -148,18 +148,18 @@ def record(
         FileNotFoundError, ValueError: the request is invalid.
     """
     what, given = with_given_actions(what)
-    envs = shares(what.options.num_envs, what.workers)
+    envs = envs_per_process(what.options.num_envs, what.workers)
     setups = [replace(what, options=replace(what.options, num_envs=count)) for count in envs]
-    recording = _RecordRun(what, on_activity, on_progress, stop, on_finding)
-    run = _record_share
+    recording = _Recording(what, on_activity, on_progress, stop, on_finding)
+    run = _record_items
     if executor is None and len(setups) == 1:
-        executor, run = ThisProcess(), partial(_record_share, given=given)
+        executor, run = ThisProcess(), partial(_record_items, given=given)
     work = Work(run, setups, result=Written | None, update=str | int | Finding, name="that records")
     (executor or Processes()).run(work, recording.deal)
     return recording.so_far(stop())
 
 
-class _RecordRun:
+class _Recording:
     """Collects the results of all processes.
 
     Of the successes the K with the lowest numbers are kept. With many envs or processes a later episode may succeed before
@@ -218,8 +218,8 @@ class _RecordRun:
             (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)
 
 
-def _record_share(what: RecordOptions, share: Share, given: Sequence[RecordedRun] | None = None) -> None:
-    """Record the share of one process. Raises as `record`.
+def _record_items(what: RecordOptions, queue: ItemQueue, given: Sequence[RecordedRun] | None = None) -> None:
+    """Record the items that one process gets. Raises as `record`.
 
     Args:
         given: as of `with_given_actions`, if it was read already.
@@ -231,10 +231,10 @@ def _record_share(what: RecordOptions, share: Share, given: Sequence[RecordedRun
     with here.again():
         folder = what.out.absolute()
         opened = open_task(
-            what.task, what.options, on_activity=share.send_update, on_finding=share.send_update
+            what.task, what.options, on_activity=queue.send_update, on_finding=queue.send_update
         )
         try:
-            _Episodes(opened, what, here, folder, given, share).run()
+            _Episodes(opened, what, here, folder, given, queue).run()
         finally:
             opened.env.close()
 
@@ -249,9 +249,9 @@ class _Episodes:
         here: CurrentFolder,
         folder: Path,
         given: Sequence[RecordedRun],
-        share: Share,
+        queue: ItemQueue,
     ) -> None:
-        self._opened, self._what, self._given, self._share = opened, what, given, share
+        self._opened, self._what, self._given, self._queue = opened, what, given, queue
         self._finisher = EpisodeFinisher()
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
@@ -278,9 +278,9 @@ class _Episodes:
 
     def _begin_free(self) -> bool:
         """Begin episodes in free envs. Returns whether any env has one."""
-        self._drop_from(self._share.limit())
+        self._drop_from(self._queue.limit())
         for env in self._envs:
-            if env not in self._running and (index := self._share.next()) is not None:
+            if env not in self._running and (index := self._queue.next()) is not None:
                 self._begin(env, index)
         return bool(self._running)
 
@@ -306,7 +306,7 @@ class _Episodes:
                 raise RecordingError(files)
             shown = self._what.out / files.rrd.name  # as the person named the folder
             start_corrected = index in self._start_corrected
-            self._share.send_result(
+            self._queue.send_result(
                 index,
                 Written(
                     index,
@@ -361,7 +361,7 @@ class _Episodes:
             step = restore_recorded(self._opened, states, action)
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
-        self._share.send_update(len(self._running))
+        self._queue.send_update(len(self._running))
         for env in list(self._running):
             self._steps[env] += 1
             if self._is_over(env, step):
@@ -386,7 +386,7 @@ class _Episodes:
         index = self._running[episode.env]
         if self._what.successes is not None and not episode.success:
             episode.writer.discard()
-            self._share.send_result(index, None)
+            self._queue.send_result(index, None)
         else:
             self._made[index] = episode, self._finisher.finish(episode)
 

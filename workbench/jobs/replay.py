@@ -74,7 +74,7 @@ def begin_run(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, 
     for i, run in runs.items():
         options = {name: value for name, value in run.reset_options.items() if name != "env_idx"}
         if options.pop("reconfigure", False):
-            missed[i]["reset option reconfigure"] = "the scene is not built anew for one env of a batch"
+            missed[i]["reset option reconfigure"] = "the scene is not built again for one env of a batch"
         if run.seed < 0:
             missed[i]["the seed"] = "the recording does not know it: what the task drew at the reset is new"
         seed = [run.seed] if run.seed >= 0 else None
@@ -122,7 +122,7 @@ def replay_to(
     compared with the recording after each step, and where they are too far apart the recorded state is restored; the
     result counts that.
 
-    The other envs stand still (`step_only`), and what the task keeps for them is restored afterwards.
+    The other envs do not move (`step_only`), and what the task keeps for them is restored afterwards.
 
     Args:
         on_step: called with the number of replayed steps.
@@ -225,14 +225,14 @@ def _distance(
 def replay_text(replay_result: ReplayResult) -> str:
     """One sentence: how the state was reached, and how close it is."""
     if replay_result.way == "put there":
-        text = "the recorded state was put in place; contacts, and what the task counts on itself, begin anew"
+        text = "the recorded state was restored; contacts, and what the task counts on itself, start again"
     elif replay_result.way == "corrected":
         text = (
             f"its actions were made again, and its state put back at {replay_result.corrected} of {replay_result.steps} steps, "
-            "where they had parted"
+            "where they differed"
         )
     elif replay_result.steps == 0:
-        text = "reset with its seed" + (", then its first state put in place" * replay_result.start_differs)
+        text = "reset with its seed" + (", then its first state restored" * replay_result.start_differs)
     else:
         text = "its actions were made again"
         text += " from its first state" if replay_result.start_differs else " from its seed"

@@ -78,7 +78,7 @@ def rescore(
     """Rescore these episodes with the open task's code; gives a verdict for each, in the order in which they end.
 
     Each env begins an episode (`replay.begin_run`), makes its actions, and then takes the next one, independent of the
-    other envs. Envs without one stand still.
+    other envs. Envs without one do not move.
 
     Args:
         use_env_states: restore every recorded state after its step, so that nothing drifts.

@@ -159,7 +159,7 @@ class RecordArguments:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         out: folder for the files.
         episodes: how many, over all envs; 4, or as many as a file of actions has.
-        successes: go on until so many episodes succeeded, and keep no others.
+        successes: continue until so many episodes succeeded, and keep no others.
         tries: give up after so many episodes where successes are wanted; 100 for each.
         actions: random, zero, hold; a policy as module:function or file.py:function; or a file: .npy or .npz with
             actions, or .h5 with ManiSkill's demonstrations, which begin from their own seeds.

@@ -135,7 +135,7 @@ def _check_private(path: Path, status: os.stat_result) -> None:
 def web_assets_folder() -> Path:
     """Folder with the files for the browser: ``web_assets/`` of a checkout, ``workbench/_web_assets`` of a wheel.
 
-    The wheel's copy is asked first: an installed package must not pick up a folder beside it in site-packages.
+    The wheel's copy is asked first: an installed package must not use a folder next to it in site-packages.
 
     Raises:
         FileNotFoundError: neither the wheel's copy nor the checkout's folder is there.

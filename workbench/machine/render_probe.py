@@ -129,7 +129,9 @@ def _why(refusal: str) -> str:
     """SAPIEN's refusal, with advice if the environment names a driver."""
     for variable in DRIVER_VARIABLES:
         if os.environ.get(variable):
-            return f"{refusal} (the environment has {variable}={os.environ[variable]}: unset it, or mend it)"
+            return (
+                f"{refusal} (the environment has {variable}={os.environ[variable]}: unset it, or correct it)"
+            )
     return refusal
 
 

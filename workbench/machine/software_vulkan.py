@@ -198,7 +198,7 @@ def plan_mesa() -> MesaPlan | None:
 def ensure_render_device(install: bool) -> RenderProbe:
     """Find a render device, and with `install` provide what is missing. Slow only where it installs.
 
-    A machine whose driver works is left alone. Otherwise Mesa's lavapipe does, from 24.3 on, from the distribution or from
+    A machine whose driver works is left alone. Else Mesa's lavapipe does, from 24.3 on, from the distribution or from
     Debian's backports: installed with apt for root, unpacked into the user's cache for others, who start the process that
     renders with `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
 

@@ -29,8 +29,8 @@ def nonfinite_text(values: ArrayLike) -> str:
     """Counts of values that are not finite: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
     flat = np.asarray(values).reshape(-1)
     counts = {"NaN": int(np.isnan(flat).sum()), "infinite": int(np.isinf(flat).sum())}
-    told = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
-    return f"{told} of {len(flat)}" if told else ""
+    counted = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
+    return f"{counted} of {len(flat)}" if counted else ""
 
 
 def mean_text(values: ArrayLike, form_text: Callable[[float], str] = number_text) -> str:
@@ -49,7 +49,7 @@ def length(metres: float) -> str:
     if metres == 0:
         return "0"
     if not math.isfinite(metres):
-        return "more than can be told"
+        return "infinite"
     unit, size = next((unit, size) for unit, size, least in _UNITS if metres >= least)
     return f"{metres / size:.2g} {unit}"
 
@@ -57,7 +57,7 @@ def length(metres: float) -> str:
 # --- text from elsewhere, made safe for a terminal and a page: controls are escaped, colours kept -----
 
 
-_SHOWN = re.compile(
+_ESCAPED = re.compile(
     "[\x00-\x1f\x7f-\x9f"  # C0, DEL and C1, which some terminals take for ESC and a letter
     "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # the direction of writing
     "\u2028\u2029"  # line ends, to some programs
@@ -76,9 +76,9 @@ def plain_text(text: str, keep: str = "") -> str:
     Such characters can clear a terminal, rename its window, write to the clipboard, move the cursor over other text, or make a
     name look like another.
     """
-    if not _SHOWN.search(text):
+    if not _ESCAPED.search(text):
         return text
-    return _SHOWN.sub(
+    return _ESCAPED.sub(
         lambda found: found[0] if found[0] in keep else found[0].encode("unicode_escape").decode(), text
     )
 
@@ -92,7 +92,7 @@ def short_line(text: str, longest: int) -> str:
 
 def only_colours(text: str, keep: str = "\n\t") -> str:
     """`text` as `plain_text`, but with its colours."""
-    if not _SHOWN.search(text):
+    if not _ESCAPED.search(text):
         return text
     parts: list[str] = []
     end = 0
@@ -147,7 +147,7 @@ class SafeStream:
 def guard_terminal() -> None:
     """Let this process print only text and colours to its terminal.
 
-    For good, since a traceback that ends the process is printed last. Does not cover native code and other programs.
+    Not undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)

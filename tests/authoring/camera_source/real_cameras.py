@@ -20,7 +20,7 @@ from mani_skill.utils import sapien_utils
 from workbench.authoring.camera_source.cameras import HOOKS as KINDS
 from workbench.authoring.camera_source.cameras import HookCameras, RunHooks
 from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.authoring.camera_source.run_hooks import camera_run, owners, recording_calls
+from workbench.authoring.camera_source.run_hooks import hook_camera, owners, recording_calls
 from workbench.authoring.source.text import RefusedEdit
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.maniskill_private import parse_cameras
@@ -107,7 +107,7 @@ def run_class(sources: Mapping[str, str], class_name: str = "Task") -> HookCamer
                 for name, config in parse_cameras(getattr(task, hook)).items()
             }
             return HookCameras(
-                {key: camera_run(config, recorded) for key, config in configs.items()}, owners(cls)
+                {key: hook_camera(config, recorded) for key, config in configs.items()}, owners(cls)
             )
     except (SyntaxError, NameError, TypeError, AttributeError) as error:
         raise RefusedEdit(f"with it the file fails: {error}") from error

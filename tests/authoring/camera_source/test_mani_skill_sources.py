@@ -17,7 +17,7 @@ from tests.authoring.camera_source.real_cameras import close, looking, settings_
 from workbench.authoring.camera_source.cameras import HOOKS, HookCameras
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.camera_source.run_hooks import camera_run, recording_calls
+from workbench.authoring.camera_source.run_hooks import hook_camera, recording_calls
 from workbench.core.camera_data import CameraKey
 from workbench.core.maniskill_private import parse_cameras
 
@@ -78,7 +78,7 @@ def ran(path: Path, text: str, hook: tuple[str, int]) -> HookCameras:
     with recording_calls({TASK: text}) as recorded:
         configs = hook_results(path, text)[hook]
     return HookCameras(
-        {(HOOKS[hook[0]], uid): camera_run(config, recorded) for uid, config in configs.items()}, {}
+        {(HOOKS[hook[0]], uid): hook_camera(config, recorded) for uid, config in configs.items()}, {}
     )
 
 

@@ -35,7 +35,7 @@ COPIED = '''"""A task."""
 
 from __future__ import annotations
 
-import pack.sub.inner.task as installed_task  # its files lie there
+import pack.sub.inner.task as installed_task  # its files are there
 import os
 from pack.sub.base import Base, other
 from pack.sub.inner import sibling
@@ -83,7 +83,7 @@ def test_imports_ids_and_its_own_place_are_said_otherwise_and_nothing_else(insta
     ],
 )
 def test_what_stands_before_all_else_stays_there(installed: Path, text: str, copied: str) -> None:
-    added = "import pack.sub.inner.task as installed_task  # its files lie there\n"
+    added = "import pack.sub.inner.task as installed_task  # its files are there\n"
     assert copied_text(installed, text) == (copied.format(added), ())
 
 

@@ -13,7 +13,7 @@ import pytest
 from tests.authoring.camera_source.real_cameras import FILE, modules
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import DEGREE, trace_call
-from workbench.authoring.source.text import Part, Trace
+from workbench.authoring.source.text import Trace, TracedValue
 
 HEAD = """\
 import math
@@ -53,7 +53,7 @@ def told(text: str, others: Mapping[str, str] | None = None, **instead: Any) -> 
     return said(project, trace.parts["a"])
 
 
-def said(project: Project, part: Part) -> str:
+def said(project: Project, part: TracedValue) -> str:
     text = project.texts[part.at.file][part.at.start : part.at.end]
     inside = ""
     if "of" in part.parts:

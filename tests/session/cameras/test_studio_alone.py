@@ -15,7 +15,6 @@ from tests.session.studio import BARE, FILE, INFO, KEY
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.cameras.report import OfferedPlacement
-from workbench.jobs.pool import Answer
 from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.machine.processes.wire import Call
 from workbench.session.cameras.file_edits import FileEdits
@@ -27,7 +26,7 @@ from workbench.session.live.live_state import LiveState, SharedState
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions
 from workbench.session.process.askers import Asker, Background
-from workbench.session.protocol.messages import Load, PlaceCamera, Placed, Request
+from workbench.session.protocol.messages import Answer, Load, PlaceCamera, Placed, Request
 
 MOVED = replace(FILE, position=(0.45, 0.3, 0.6))
 GEOMETRY, POSES = table_scene(2)

@@ -18,12 +18,11 @@ import pytest
 from tests.drive.waiting import until
 from tests.session.hazards import calm, provoke, provoked, write_task
 from workbench.authoring.problem import Problem
-from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Call, pack
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.job_lane import Job, JobFailed, JobLane, Stopped
-from workbench.session.protocol.messages import Load, Request, Reset
+from workbench.session.protocol.messages import Answer, Load, Progress, Request, Reset
 from workbench.session.protocol.questions import MakeScene, MeasureCamera
 
 BASE = ("sensor", "base_camera")

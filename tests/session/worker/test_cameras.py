@@ -17,12 +17,12 @@ import pytest
 
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.open_task import OpenedTask, open_task
-from workbench.jobs.pool import CannotAnswer
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import MessageSocket
 from workbench.session.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     CameraRequest,
+    CannotAnswer,
     DrawPast,
     Event,
     LoadFailed,

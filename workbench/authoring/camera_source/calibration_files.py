@@ -74,7 +74,7 @@ class CameraToExport:
 class FoundPose:
     """A matrix in a text that may be a camera's pose.
 
-    A matrix does not tell its convention: camera to world and world to camera both look plausible, as do the three
+    A matrix does not say its convention: camera to world and world to camera both look plausible, as do the three
     conventions of camera axes. So a person is asked, except for our own JSON, which names it.
     """
 

@@ -24,7 +24,7 @@ _SAME = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class CameraRun:
+class HookCamera:
     """One camera that a hook made."""
 
     made: CameraSettings | None
@@ -42,7 +42,7 @@ class CameraRun:
 class HookCameras:
     """What the camera hooks of the open task return for given texts of the author's files."""
 
-    cameras: Mapping[CameraKey, CameraRun]
+    cameras: Mapping[CameraKey, HookCamera]
     owners: Mapping[str, tuple[str, str]]
     """Hook to name and file of the class that defines it; ManiSkill's empty hooks are left out."""
 
@@ -59,7 +59,7 @@ class CameraCall:
     node: ast.Call
     camera: CameraKey
     arguments: dict[str, ast.expr]
-    run: CameraRun
+    run: HookCamera
     trace: Trace
 
     @property

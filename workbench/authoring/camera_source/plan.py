@@ -133,7 +133,7 @@ def _write_fields(changes: Changes, call: CameraCall, fields: list[str], after: 
 
 
 def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> list[str]:
-    """Write `fov` or `intrinsic`, of which ManiSkill needs exactly one. Returns arguments to add."""
+    """Write `fov` or `intrinsic`; ManiSkill needs exactly one of them. Returns arguments to add."""
     file = call.file
     if after.intrinsic is None:
         assert after.fov is not None

@@ -10,7 +10,7 @@ from typing import Any
 
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.authoring.camera_source.cameras import FIELDS, HOOKS, PARAMETERS, CameraRun, HookCameras
+from workbench.authoring.camera_source.cameras import FIELDS, HOOKS, PARAMETERS, HookCamera, HookCameras
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import trace_call
 from workbench.authoring.source.text import Trace
@@ -40,16 +40,16 @@ def run_hooks(env: Any, sources: Mapping[str, str]) -> HookCameras:
     with recording_calls(sources) as recorded:
         configs = maniskill_private.camera_configs(env)
     return HookCameras(
-        {key: camera_run(config, recorded) for key, config in configs.items()},
+        {key: hook_camera(config, recorded) for key, config in configs.items()},
         owners(maniskill_private.task_class(env)),
     )
 
 
-def camera_run(config: Any, recorded: RecordedCalls) -> CameraRun:
+def hook_camera(config: Any, recorded: RecordedCalls) -> HookCamera:
     _, made, trace = recorded.get(id(config), (None, None, None))
     name = getattr(config.mount, "name", None)
     mount = f"{config.entity_uid} {name if isinstance(name, str) else type(config.mount).__name__}"
-    return CameraRun(made, settings_of(config), mount, maniskill_private.camera_site(config), trace)
+    return HookCamera(made, settings_of(config), mount, maniskill_private.camera_site(config), trace)
 
 
 def owners(task: type) -> dict[str, tuple[str, str]]:

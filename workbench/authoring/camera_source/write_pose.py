@@ -13,7 +13,7 @@ from transforms3d.euler import euler2quat
 from transforms3d.quaternions import mat2quat
 
 from workbench.authoring.source.changes import Changes, list_text, quaternion_texts, same_side, written_value
-from workbench.authoring.source.text import Part, Replacement, SourceFile
+from workbench.authoring.source.text import Replacement, SourceFile, TracedValue
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import angle_between, rotation_matrix, target_of
 
@@ -30,7 +30,7 @@ _METRES = (4, 5, 6)
 """Decimals to try: 0.1 mm, and more if the target is so close that 0.1 mm would turn the camera."""
 
 
-def why_not_a_pose(changes: Changes, pose: Part) -> str | None:
+def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
     """Why a pose cannot be edited in its form; None if it can."""
     p, q = pose.parts.get("p"), pose.parts.get("q")
     if pose.function == "look_at":
@@ -60,11 +60,11 @@ def why_not_a_pose(changes: Changes, pose: Part) -> str | None:
     )
 
 
-def _is_vector(part: Part, length: int) -> bool:
+def _is_vector(part: TracedValue, length: int) -> bool:
     return isinstance(part.value, tuple) and len(part.value) == len(part.numbers) == length
 
 
-def write_pose(changes: Changes, pose: Part, after: CameraSettings) -> None:
+def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
     """Edit `pose` to that of `after`, in its own form or else with a quaternion.
 
     A ``look_at`` stays one while the camera is level and does not look along `up`: the target stays if the camera still
@@ -93,7 +93,7 @@ def write_pose(changes: Changes, pose: Part, after: CameraSettings) -> None:
         changes.texts[part] = f"[{', '.join(texts)}]"
 
 
-def _position(changes: Changes, pose: Part, requested: Sequence[float]) -> None:
+def _position(changes: Changes, pose: TracedValue, requested: Sequence[float]) -> None:
     part = pose.parts.get("p")
     if part is not None and part.value is not None:
         _vector(changes, part, requested, 4)
@@ -104,7 +104,7 @@ def _position(changes: Changes, pose: Part, requested: Sequence[float]) -> None:
             changes.texts[part] = list_text(requested, 4)
 
 
-def _vector(changes: Changes, vector: Part, requested: Sequence[float], decimals: int) -> None:
+def _vector(changes: Changes, vector: TracedValue, requested: Sequence[float], decimals: int) -> None:
     if vector.literal:
         for item, number in zip(vector.parts.values(), requested, strict=True):
             changes.number(item, number, decimals)
@@ -115,7 +115,7 @@ def _vector(changes: Changes, vector: Part, requested: Sequence[float], decimals
         changes.note(f"`{code}` became {text}: it is no longer computed")
 
 
-def _written_values(vector: Part, requested: Sequence[float], decimals: int) -> tuple[float, ...]:
+def _written_values(vector: TracedValue, requested: Sequence[float], decimals: int) -> tuple[float, ...]:
     """The numbers that result from writing `requested`."""
     if vector.literal:
         pairs = zip(vector.parts.values(), requested, strict=True)
@@ -125,7 +125,7 @@ def _written_values(vector: Part, requested: Sequence[float], decimals: int) -> 
     return vector.numbers
 
 
-def _look_at(changes: Changes, pose: Part, after: CameraSettings) -> bool:
+def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool:
     """Write eye and target; False if a look_at cannot express the orientation."""
     eye, target = pose.parts["eye"], pose.parts["target"]
     up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
@@ -167,7 +167,7 @@ def look_at_text(name: str, settings: CameraSettings) -> str | None:
     return None
 
 
-def _as_quaternion(changes: Changes, pose: Part, after: CameraSettings) -> None:
+def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
     """Replace a look_at by a pose with a quaternion, keeping the author's expression of the position."""
     file, node = changes.find(pose.at)
     assert isinstance(node, ast.Call)
@@ -254,7 +254,7 @@ def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float
     return best[0], best[1], best[2]
 
 
-def _euler(changes: Changes, part: Part, after: CameraSettings) -> bool:
+def _euler(changes: Changes, part: TracedValue, after: CameraSettings) -> bool:
     items = [part.parts[name] for name in ("ai", "aj", "ak")]
     requested = to_euler(after.quaternion, [item.numbers[0] for item in items])
     for decimals in (4, 5, 6):

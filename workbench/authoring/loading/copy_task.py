@@ -80,7 +80,7 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
     ]
     places = [node for node in file.nodes if isinstance(node, ast.Name) and node.id == "__file__"]
     if places:
-        first = f"line {file.line(places[0])} asks for the file's own place"
+        first = f"line {file.line(places[0])} reads the file's own path"
         if not package:
             raise CannotCopy(f"{first}, which the copy does not have")
         if any(text[slice(*file.inner_span(node))] != "__file__" for node in places):
@@ -88,7 +88,7 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
         name = _free_name("installed_task", text)
         changes += [Replacement(*file.inner_span(node), f"{name}.__file__") for node in places]
         at = file.import_place()
-        changes.append(Replacement(at, at, f"import {'.'.join(package)} as {name}  # its files lie there\n"))
+        changes.append(Replacement(at, at, f"import {'.'.join(package)} as {name}  # its files are there\n"))
     ids: list[tuple[str, str]] = []
     for _, call, uid in registrations_in(file.module):
         if not isinstance(uid, ast.Constant) or not isinstance(uid.value, str):

@@ -1,4 +1,4 @@
-"""Tells the author's files and modules from those of libraries."""
+"""Distinguishes the author's files and modules from those of libraries."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _permanent_folder = False
 def is_own_file(path: str, folder: Path) -> bool:
     """True for the author's files in or below `folder`.
 
-    Below a project's root also lie a virtual environment and, if installed from its repository, the workbench: those are
+    A project's root may also contain a virtual environment and, if installed from its repository, the workbench: those are
     not the author's.
     """
     root = str(folder) + os.sep

@@ -382,7 +382,7 @@ def _check_file(file: Path) -> None:
         if not file.exists():
             raise _missing(file)
         if not file.is_file():
-            # Reading a pipe may wait for ever, and a device may have no end.
+            # Reading a pipe may never end, and a device may have no end.
             raise task_error(f"{file} is not an ordinary file")
         if file.suffix != ".py":
             raise task_error(

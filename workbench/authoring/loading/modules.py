@@ -131,7 +131,7 @@ class AuthorFinder(MetaPathFinder):
         """For a name without a given text: an installed module, else a folder of given texts without an ``__init__.py``.
 
         Raises ModuleNotFoundError for other files of the folder: if an earlier task, or the code itself, has put the folder
-        on ``sys.path``, Python would go on to `PathFinder` and find them.
+        on ``sys.path``, Python would continue with `PathFinder` and find them.
         """
         root = str(self.file.parent)
         places = [place for place in (sys.path if path is None else path) if not _is_in(place, root)]

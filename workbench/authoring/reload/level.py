@@ -94,7 +94,7 @@ def find_change(
     exchanged unless something may outlive the exchange (`workbench.authoring.reload.kept_state`): values that hooks keep
     between calls, dicts and lists at the top that are filled while the task runs, attributes that only the old version
     writes, objects of the author's classes. If code may reach further than its names (``exec``), nothing is exchanged. In
-    doubt it is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" an afternoon.
+    doubt it is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
 
     Pure: nothing is imported or executed, and no content of the texts raises.
     """
@@ -203,7 +203,7 @@ class _Comparison:
             for symbol in self._versions.by_key.get((owner[0], f"{owner[1]}.__init__"), ()):
                 if _goes_on_after_super(symbol.nodes):
                     raise _NeedsRebuild(
-                        f"{symbol.name} goes on after super().__init__(), which has run a reset"
+                        f"{symbol.name} continues after super().__init__(), which has run a reset"
                     )
         rewards = self._versions.members(family, REWARD_HOOKS)
         for key in self._versions.changed:

@@ -11,11 +11,11 @@ import numpy as np
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.text import (
     DEGREE,
-    Part,
     Place,
     RefusedEdit,
     Replacement,
     SourceFile,
+    TracedValue,
     arguments,
 )
 from workbench.core.cameras.conventions import normalised
@@ -24,7 +24,7 @@ from workbench.core.cameras.conventions import normalised
 class Changes:
     """Collects edits of traced values and turns them into replacements of text.
 
-    A value is edited where it is written if nothing else reads it there. Otherwise (one ``pose`` for two cameras, a
+    A value is edited where it is written if nothing else reads it there. Else (one ``pose`` for two cameras, a
     constant that the scene uses) the new value is written in place of the name, for this use alone, with a note.
 
     Places come from the worker, whose texts may differ: one that is not an expression of these files raises RefusedEdit.
@@ -32,9 +32,9 @@ class Changes:
 
     def __init__(self, project: Project) -> None:
         self.project = project
-        self.texts: dict[Part, str] = {}
+        self.texts: dict[TracedValue, str] = {}
         """New texts of expressions."""
-        self.added: dict[Part, list[str]] = {}
+        self.added: dict[TracedValue, list[str]] = {}
         """New arguments of calls."""
         self.notes: list[str] = []
         self.replacements: list[tuple[SourceFile, Replacement]] = []
@@ -86,7 +86,7 @@ class Changes:
 
     # --- new values ---------------------------------------------------------------------------------
 
-    def number(self, value: Part, requested: float, decimals: int) -> None:
+    def number(self, value: TracedValue, requested: float, decimals: int) -> None:
         """Edit `value` to `requested`, unless it is the same to so many decimals."""
         if written_value(value, requested, decimals) == value.value:
             return
@@ -101,10 +101,10 @@ class Changes:
 
     # --- replacements -------------------------------------------------------------------------------
 
-    def is_edited(self, value: Part) -> bool:
+    def is_edited(self, value: TracedValue) -> bool:
         return any(part in self.texts or part in self.added for part in value.walk())
 
-    def emit(self, value: Part, known: int = 0) -> None:
+    def emit(self, value: TracedValue, known: int = 0) -> None:
         """Turn the edits within `value` into replacements. The first `known` of its reads are followed already."""
         if not self.is_edited(value):
             return
@@ -127,7 +127,7 @@ class Changes:
             assert isinstance(node, ast.Call)
             self.change(file, *file.added_arguments(node, self.added[value]))
 
-    def rendered(self, value: Part, known: int, into: SourceFile) -> str:
+    def rendered(self, value: TracedValue, known: int, into: SourceFile) -> str:
         """The code of `value` as a standalone expression in the file `into`."""
         if value in self.texts:
             return self.texts[value]
@@ -149,7 +149,7 @@ class Changes:
         inside = ", ".join(items or [number_text(number, 7) for number in value.numbers])
         return f"({inside})" if isinstance(node, ast.Tuple) else f"[{inside}]"
 
-    def _rendered_call(self, value: Part, into: SourceFile) -> str:
+    def _rendered_call(self, value: TracedValue, into: SourceFile) -> str:
         file, node = self.find(value.at)
         assert isinstance(node, ast.Call)
         by_node = {given: name for name, given in arguments(node, list(value.parts)).items()}
@@ -161,7 +161,7 @@ class Changes:
             texts.append(f"{given.arg}={code}" if isinstance(given, ast.keyword) else code)
         return f"{file.code(node.func)}({', '.join([*texts, *self.added.get(value, [])])})"
 
-    def _with_part(self, value: Part, into: SourceFile) -> str:
+    def _with_part(self, value: TracedValue, into: SourceFile) -> str:
         """The code of an expression whose inner number is edited."""
         chain = _chain(value)
         inner = chain[-1]
@@ -173,7 +173,7 @@ class Changes:
         return file.text[start:a] + self.texts[inner] + file.text[b:end]
 
 
-def written_value(value: Part, requested: float, decimals: int) -> float:
+def written_value(value: TracedValue, requested: float, decimals: int) -> float:
     """The number that results from writing `requested` with so many decimals."""
     assert isinstance(value.value, float)
     if abs(value.value - requested) <= 0.5000001 * 10**-decimals:
@@ -182,21 +182,21 @@ def written_value(value: Part, requested: float, decimals: int) -> float:
     return _outer_value(_chain(value), round(new, places))
 
 
-def _chain(value: Part) -> list[Part]:
+def _chain(value: TracedValue) -> list[TracedValue]:
     found = [value]
     while "of" in found[-1].parts:
         found.append(found[-1].parts["of"])
     return found
 
 
-def _outer_value(chain: list[Part], innermost: float) -> float:
+def _outer_value(chain: list[TracedValue], innermost: float) -> float:
     """The value of the first part of `chain` if the last one is `innermost`."""
     for outer in reversed(chain[:-1]):
         innermost = innermost * outer.slope + outer.offset
     return innermost
 
 
-def _inner_target(value: Part, requested: float, decimals: int) -> tuple[Part, float, int]:
+def _inner_target(value: TracedValue, requested: float, decimals: int) -> tuple[TracedValue, float, int]:
     """The number to edit within `value`, its new value, and its decimals."""
     *outer, last = _chain(value)
     for part in outer:

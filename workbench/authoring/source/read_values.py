@@ -27,13 +27,13 @@ from workbench.authoring.source.names import Binding, Project, reaching
 from workbench.authoring.source.text import (
     DEGREE,
     FUNCTIONS,
-    Part,
     Place,
     Plain,
     Read,
     Scope,
     SourceFile,
     Trace,
+    TracedValue,
     arguments,
     is_starred,
 )
@@ -84,7 +84,7 @@ def trace_call(
     if not isinstance(call, ast.Call):
         return None
     reader = ValueReader(project, file, call, frame)
-    parts: dict[str, Part] = {}
+    parts: dict[str, TracedValue] = {}
     unknown: dict[str, str] = {}
     given, starred = arguments(call, parameters), is_starred(call)
     for name, value in values.items():
@@ -126,7 +126,7 @@ class ValueReader:
     def computed(self, file: SourceFile, node: ast.AST) -> Unknown:
         return Unknown(f"`{file.one_line(node)}` is computed when the task runs")
 
-    def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> Part:
+    def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> TracedValue:
         """The parts of an expression. Raises Unknown."""
         if len(reads) > _DEPTH:
             raise Unknown(f"`{file.code(node)}` is defined by itself")
@@ -142,10 +142,10 @@ class ValueReader:
         value = self._value(file, node)
         if isinstance(node, (ast.List, ast.Tuple)):
             parts = {str(i): self.part(file, item, reads) for i, item in enumerate(node.elts)}
-            return Part(place, reads, value, parts=parts, literal=True)
+            return TracedValue(place, reads, value, parts=parts, literal=True)
         if _is_number(node) or not isinstance(value, float):
-            return Part(place, reads, value, literal=_is_number(node))
-        return self._with_editable_number(file, node, Part(place, reads, value))
+            return TracedValue(place, reads, value, literal=_is_number(node))
+        return self._with_editable_number(file, node, TracedValue(place, reads, value))
 
     # --- values -------------------------------------------------------------------------------------
 
@@ -201,7 +201,7 @@ class ValueReader:
             raise self.computed(file, node)
         return self._evaluate(file, node, node, bool)
 
-    def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: Part) -> Part:
+    def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: TracedValue) -> TracedValue:
         """`whole` with the number within it that is best edited, if there is one.
 
         That is the 60 of ``60 * np.pi / 180`` and the 0.2 of ``HEIGHT + 0.2``, which still follows HEIGHT.
@@ -228,7 +228,7 @@ class ValueReader:
             return whole
         _, leaf, slope, offset = best
         parts = {"of": self.part(file, leaf, whole.reads)}
-        return Part(whole.at, whole.reads, whole.value, parts=parts, slope=slope, offset=offset)
+        return TracedValue(whole.at, whole.reads, whole.value, parts=parts, slope=slope, offset=offset)
 
     def _value_with(self, file: SourceFile, node: ast.expr, leaf: ast.expr, value: float) -> float:
         """The value of the expression with `value` in place of `leaf`."""
@@ -249,22 +249,22 @@ class ValueReader:
                 return found
         raise self.computed(file, node)
 
-    def _call(self, file: SourceFile, node: ast.Call, place: Place, reads: Reads) -> Part:
+    def _call(self, file: SourceFile, node: ast.Call, place: Place, reads: Reads) -> TracedValue:
         known = self._function(file, node)
         if known.converts and (node.args or node.keywords):
             inner = self.part(file, node.args[0] if node.args else node.keywords[0].value, reads)
             if inner.function or isinstance(inner.value, float) or (inner.literal and inner.reads == reads):
                 return inner  # the argument is edited, the call stays
-            return Part(place, reads, inner.value, parts=inner.parts, literal=inner.literal)
+            return TracedValue(place, reads, inner.value, parts=inner.parts, literal=inner.literal)
         if not known.parameters:
             self._check(file, node)
-            return self._with_editable_number(file, node, Part(place, reads, self._value(file, node)))
+            return self._with_editable_number(file, node, TracedValue(place, reads, self._value(file, node)))
         given = arguments(node, known.parameters)
         if len(given) != len(node.args) + len(node.keywords) or not set(given) <= set(known.parameters):
             raise self.computed(file, node)
         given.pop("device", None)
         parts = {name: self.part(file, value, reads) for name, value in given.items()}
-        return Part(place, reads, self._value(file, node), known.name, parts)
+        return TracedValue(place, reads, self._value(file, node), known.name, parts)
 
     # --- names --------------------------------------------------------------------------------------
 
@@ -485,7 +485,7 @@ class KnownFunction:
     """A library function whose value depends on its arguments alone, so that a call may be evaluated again."""
 
     name: str = ""
-    """Name for `Part.function`; empty if it needs none."""
+    """Name for `TracedValue.function`; empty if it needs none."""
     parameters: tuple[str, ...] = ()
     """Parameters in order, of a function whose arguments may be edited."""
     converts: bool = False

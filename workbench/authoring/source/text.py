@@ -57,7 +57,7 @@ class SourceFile:
             self.module = ast.parse(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as exc:
             reason = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
-            raise RefusedEdit(f"{self.name} is not valid Python as it stands: {reason}") from exc
+            raise RefusedEdit(f"{self.name} is not valid Python now: {reason}") from exc
         self._starts = [0, *(m.end() for m in _LINE_END.finditer(text))]
         self.nodes = list(walk(self.module))
         """All nodes, nearly in the order of the text."""
@@ -393,7 +393,7 @@ else:  # the decoder of messages has no recursive types: numbers, vectors, matri
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class TracedValue:
     """An expression that is not a name, its value in the run, and its parts that may be edited."""
 
     at: Place
@@ -403,7 +403,7 @@ class Part:
     """A pose is seven numbers: p, then q as wxyz."""
     function: str = ""
     """Name (`KnownFunction.name`) of the called function; empty for other expressions."""
-    parts: Mapping[str, Part] = field(default_factory=dict)
+    parts: Mapping[str, TracedValue] = field(default_factory=dict)
     """Elements of a list by index; arguments of a call by parameter; ``of``: the number within an expression that may be
     edited instead of it."""
     slope: float = 1.0
@@ -417,7 +417,7 @@ class Part:
         """All numbers of the value, in order."""
         return tuple(_numbers(self.value))
 
-    def walk(self) -> Iterator[Part]:
+    def walk(self) -> Iterator[TracedValue]:
         """This part and all parts within it."""
         yield self
         for part in self.parts.values():
@@ -431,7 +431,7 @@ class Trace:
     at: Place
     function: str
     """Qualified name of the function that contains it."""
-    parts: Mapping[str, Part]
+    parts: Mapping[str, TracedValue]
     """Arguments that could be followed."""
     unknown: Mapping[str, str]
     """Reasons for the other arguments."""

@@ -236,7 +236,7 @@ def pose_from_look_at(look_at: LookAt) -> Floats:
 def look_at_of(pose: ArrayLike, distance: float = 1.0) -> LookAt:
     """Eye, target and roll of a pose (7,), with the target `distance` metres ahead of the eye."""
     if not distance > 0:
-        raise ValueError(f"the target must lie in front of the camera, not {distance} m")
+        raise ValueError(f"the target must be in front of the camera, not {distance} m")
     p = _vector(pose, 7, "a pose")
     r = rotation_matrix(p[3:])
     target = p[:3] + distance * r[:, 0]
@@ -319,7 +319,7 @@ def intrinsic_from_fov(fov: float, width: int, height: int) -> Floats:
     """
     _check_size(width, height)
     if not 0 < fov < math.pi:
-        raise ValueError(f"a vertical field of view lies between 0 and pi radians, not {fov}")
+        raise ValueError(f"a vertical field of view is between 0 and pi radians, not {fov}")
     focal = height / 2 / math.tan(fov / 2)
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 

@@ -183,7 +183,7 @@ def settings_of(config: Any) -> CameraSettings | None:
     length = float(np.linalg.norm(pose[3:]))
     if not np.isfinite(pose).all() or length < 1e-6:
         return None
-    fov, near, far = (_one(getattr(config, name)) for name in ("fov", "near", "far"))
+    fov, near, far = _one(config.fov), _one(config.near), _one(config.far)
     matrix = _one(config.intrinsic, 3, 3)
     intrinsic = None if matrix is None else matrix3(matrix)
     if near is None or far is None or (fov is None) == (intrinsic is None):

@@ -64,7 +64,7 @@ def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
 def segmentation_names(env: Any) -> dict[int, str]:
     """Body name of every id in a segmentation picture; 0, the background, is not among them.
 
-    Ids count the entities of a sub-scene, so they are the same in all envs that are built alike.
+    Ids count the entities of a sub-scene, so they are the same in all envs that are built from the same parts.
     Where envs differ an id that means two things is called ``a | b``.
     """
     index = scene_index(env)
@@ -93,7 +93,7 @@ def take_pictures(
 
     Raises:
         IndexError: there is no such env.
-        ValueError: there is no such camera, or it cannot give what is asked of it.
+        ValueError: there is no such camera, or it cannot give the requested modalities.
         RuntimeError: the renderer failed.
     """
     pictures: dict[int, Picture] = {}
@@ -194,7 +194,7 @@ def _varies(config: Any, components: Sequence[Any]) -> bool:
 
 
 def mount_of(env: Any, camera: Any) -> str | None:
-    """Name of the body that a camera rides on; `camera` as `cameras_of` gives it."""
+    """Name of the body that a camera is mounted on; `camera` as `cameras_of` gives it."""
     mount = camera.camera.mount
     return None if mount is None else scene_index(env).name_of(maniskill_private.objects_of(mount)[0])
 
@@ -207,7 +207,7 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
     gives = {m for ms in camera.config.shader_config.texture_names.values() for m in ms}
     for modality in modalities:
         if modality not in _MODALITIES:
-            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_MODALITIES)}")
+            raise ValueError(f"{modality!r} cannot be shown; choose from {', '.join(_MODALITIES)}")
         if modality not in gives:
             pack = camera.config.shader_config.shader_pack
             raise ValueError(f"camera {name!r} gives no {modality} with the shader pack {pack!r}")
@@ -282,7 +282,7 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
 
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
     in the default and ray tracing shaders, they are used as they are. The minimal shader's texture is
-    int16 itself: what lies beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
+    int16 itself: what is beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
     also wrap around) and read from the depth buffer instead.
     """
     if texture == "Position" and np.issubdtype(data.dtype, np.floating):

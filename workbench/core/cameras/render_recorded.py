@@ -42,7 +42,7 @@ class RecordedScene:
         for visual in geometry.visuals:
             if len(visual.mesh.faces):
                 for body in visual.bodies[visual.envs == env].tolist():
-                    # A shape of its own for each body: SAPIEN keeps it with the last that it was given to.
+                    # A shape of its own for each body: SAPIEN keeps it with the last body that got it.
                     worn.setdefault(body, sapien.render.RenderBodyComponent()).attach(_shape(visual))
         self._bodies: dict[int, sapien.Entity] = {}
         for body, shapes in worn.items():

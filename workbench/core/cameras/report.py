@@ -21,7 +21,7 @@ ENOUGH_PIXELS = 100.0
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """One object that a search can ask for: of the task, or a robot, whose single links can be asked for."""
+    """One object that a search can name: of the task, or a robot, whose single links can be named too."""
 
     name: str
     """An actor's or an articulation's."""
@@ -148,7 +148,7 @@ class CameraReport:
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
     measured_size: tuple[int, int]
-    """Of the measured pictures. In smaller ones, what is less than a pixel is not seen."""
+    """Of the measured pictures. In smaller ones, anything below a pixel is not seen."""
     envs: tuple[int, ...]
     """(E,) an env may come several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
@@ -209,7 +209,7 @@ class SearchSpace:
     """Least distance between two offered eyes, metres; None for a seventh of the box's diagonal."""
     seed: int = 0
     mount: str | None = None
-    """Name of the body that the camera rides on."""
+    """Name of the body that the camera is mounted on."""
 
     def check(self) -> None:
         """Raises ValueError for a space that cannot be searched."""

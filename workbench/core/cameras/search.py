@@ -44,7 +44,7 @@ from workbench.core.scene.scene_index import SceneIndex, read_poses, scene_index
 WIDE_MARGIN = 0.1
 """Share of the picture's shorter side that is enough between an object and the border."""
 ROOM = 0.1
-"""Metres that must be free before the lens: the camera's own body is there."""
+"""Metres that must be free in front of the lens: the camera's own body is there."""
 FROM_THE_ROBOT = 0.2
 """Least distance in metres of an eye from the origin of every robot link, in the searched envs."""
 FROM_ITS_MOUNT = 0.05
@@ -69,7 +69,7 @@ def suggest_cameras(
 ) -> tuple[OfferedPlacement, ...]:
     """The best placements found, best first, for envs that are already reset; the envs stay as they are.
 
-    Placements that stand apart are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
+    Placements at a distance from each other are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
     there are not more, or if the search is cancelled. The same seed gives the same result.
 
     Args:
@@ -89,7 +89,7 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
     """Score of a placement: the mean of the average env's mark and the worst env's, 0 to 1.
 
     An env's mark is that of its worst object (`ObjectSeen.marks`), up to a fifth less near the border, and less where
-    something is right before the lens.
+    something is right in front of the lens.
     """
     marks = []
     for thing in report.wanted_objects(objects):
@@ -202,7 +202,7 @@ class _Search:
         return measured
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
-        """The best that stand apart."""
+        """The best that are not close to each other."""
         chosen: list[tuple[float, _Candidate, CameraReport]] = []
         for entry in sorted(self.found, key=lambda entry: -entry[0]):
             if entry[0] > 0 and not any(self._near(entry[1], other[1]) for other in chosen):

@@ -79,7 +79,7 @@ def temporary_camera(
     size = size or own
     k = scaled_intrinsic(intrinsic_of(settings), own, size)
     if not 0 < near < far:
-        raise ValueError(f"the near plane must lie before the far plane, and both ahead: {near} m, {far} m")
+        raise ValueError(f"the near plane must be before the far plane, and both ahead: {near} m, {far} m")
     scene = env.scene
     sub_scene = scene.sub_scenes[env_index]
     render_system = sub_scene.render_system

@@ -80,7 +80,7 @@ def list_objects(env: Any) -> tuple[SceneObject, ...]:
 
 
 def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
-    """The objects that a search can ask for, as plain data."""
+    """The objects that a search can name, as plain data."""
     names, objects = scene_index(env).names, list_objects(env)
     seen = tuple(
         ObjectToSee(
@@ -246,7 +246,7 @@ def measure(
 ) -> CameraReport:
     """Render and count pixels: a report of one env.
 
-    Boxes and frustums ignore what stands before an object, so it is rendered. The segmentation gives each pixel's object; a
+    Boxes and frustums ignore what is in front of an object, so it is rendered. The segmentation gives each pixel's object; a
     second picture without the robot gives what the robot covers; one of each object alone gives what the border cuts and
     what other things cover. The robot's meshes are nearly all of a picture's cost (30 ms with a Panda on a software
     driver, 2 ms without), so the further pictures are almost free. An object that the task hides from sensors counts as

@@ -30,7 +30,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
     """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
 
     The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's batched
-    tensors. Costs about 1 ms a section for a Panda on a table, and does not change how the episode goes on.
+    tensors. Costs about 1 ms a section for a Panda on a table, and does not change how the episode continues.
 
     Raises:
         IndexError: there is no such env.
@@ -65,7 +65,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
 
 
 def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
-    """The last observation; a flattened one (N, D) split by the names of what it was made of."""
+    """The last observation; a flattened one (N, D) split by the names of its entries."""
     leaves: list[Leaf] = []
     for name, value in flat_entries({} if task.obs is None else task.obs):
         # With pictures, ManiSkill's flattened part is called "state".

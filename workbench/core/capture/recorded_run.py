@@ -67,7 +67,7 @@ def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray
     lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
     with np.errstate(invalid="ignore"):
         metres = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
-        # From the chord between the quaternions: the arc cosine of their product cannot tell angles below 3e-4 from
+        # From the chord between the quaternions: the arc cosine of their product cannot distinguish angles below 3e-4 from
         # none in single precision. q and -q are the same rotation.
         p, q = a[..., 3:], b[..., 3:]
         chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))

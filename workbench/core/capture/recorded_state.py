@@ -49,7 +49,7 @@ def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> di
 def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     """Put a recorded state into each of these envs, except its `state_mismatches`; the other envs are not touched.
 
-    The env may be of other code (an actor gone, an arm with another joint), so states are matched by name and shape and
+    The env may have other code (an actor gone, an arm with another joint), so states are matched by name and shape and
     written by ManiSkill's own setters. Fetches the tensors.
     """
     missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
@@ -68,8 +68,8 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
 def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
     """Set controllers and drive targets of these envs' robots to the present joint positions.
 
-    ``get_state_dict`` has controllers only if they keep a target of their own. The others would drive a restored robot
-    back to where it stood before.
+    ``get_state_dict`` has controllers only if they keep their own target. The others would drive a restored robot
+    back to where it was before.
     """
     chosen = [int(i) for i in env_idx]
     if env.agent is None or not chosen:

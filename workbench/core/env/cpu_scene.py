@@ -32,8 +32,8 @@ from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
     in_ascending_order,
-    others,
     seeded,
+    untouched_envs,
 )
 from workbench.core.env.strict import StrictMixin
 from workbench.core.maniskill_private import asks_for_a_gpu, install_row_lookups, substeps_are_unwatched
@@ -105,7 +105,7 @@ class BatchedCpuScene(ManiSkillScene):
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
-        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body has not; it moves with its entity.
+        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body does not have; it moves with its entity.
         self.gpu_sim_enabled = False
         try:
             return super()._sapien_add_camera(*args, **kwargs)
@@ -213,7 +213,7 @@ class BatchedCpuMixin:
         """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
 
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        untouched = others(self, options)
+        untouched = untouched_envs(self, options)
         options, seeds = in_ascending_order(options or {}, seed, self)
         # ManiSkill takes a list of seeds for those of the whole batch.
         if not untouched or seeds is None or len(seeds) == 1:
@@ -382,7 +382,7 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
         cls, place = _culprit(task, BaseEnv, silent=True)
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
-            f"{in_brackets(place)}. Call it there, behind what the hooks need of it: ManiSkill builds the scene and resets in it.",
+            f"{in_brackets(place)}. Call it there, after setting what the hooks need: ManiSkill builds the scene and resets in it.",
             place,
         )
     if env.num_envs != num_envs:

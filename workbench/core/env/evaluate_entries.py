@@ -201,7 +201,7 @@ def type_text(value: Any) -> str:
 def _text(value: Any) -> tuple[str, bool]:
     """`value` as text, and whether that is all of it."""
     if isinstance(value, np.generic):
-        value = str(value)  # its repr names numpy, and Python's number has digits that it has not
+        value = str(value)  # its repr names numpy, and Python's number would have more digits
     if isinstance(value, str):
         text = str.__str__(value)
     else:
@@ -256,7 +256,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     success = evaluate.get("success")
     if isinstance(success, torch.Tensor) and reward.dtype == torch.bool and torch.equal(reward, success):
         return None
-    return f"returned {_describe(reward)}; {_floating(num_envs)}: write .float() behind it"
+    return f"returned {_describe(reward)}; {_floating(num_envs)}: append .float()"
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:

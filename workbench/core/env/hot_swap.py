@@ -62,7 +62,7 @@ def exchange_cameras(env: BaseEnv) -> None:
 def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
     """Call hooks of resets and steps as ManiSkill does, to see that they work, and undo what they did.
 
-    Their writes are not applied, so PhysX goes on as before, to the last bit. If a hook applies or steps on its own, the
+    Their writes are not applied, so PhysX continues as before, to the last bit. If a hook applies or steps on its own, the
     state is restored from a snapshot.
 
     Args:

@@ -23,7 +23,7 @@ from workbench.core.broken_rule import (
 )
 from workbench.core.maniskill_private import task_class
 from workbench.core.simulation.strict_system import envs_named
-from workbench.core.snapshots.task_attributes import Walk, look_over
+from workbench.core.snapshots.task_attributes import Walk, walk_task_values
 from workbench.core.snapshots.task_state import is_per_env, version_of
 
 MOST_LINES = 2000
@@ -49,24 +49,24 @@ class KeptRows:
     def __init__(self, env: BaseEnv, chosen: Sequence[int]) -> None:
         self.env, self._count = env, len(chosen)
         self._elsewhere = np.setdiff1d(np.arange(env.num_envs), np.asarray(chosen, dtype=np.int64))
-        walk = look_over(env)
+        walk = walk_task_values(env)
         self._single, self._groups = _paths(walk, env.num_envs)
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
-    def changes(self) -> dict[str, tuple[int, ...]]:
+    def changed_envs(self) -> dict[str, tuple[int, ...]]:
         """Paths (without ``self.``) whose rows of other envs changed, and in which envs; empty if only the rows of the envs
         being reset are left, and the others are lost."""
-        now = self._read(look_over(self.env))
+        now = self._read(walk_task_values(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
         return {path: envs for path, envs in found.items() if envs is not None}
 
-    def changed(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
+    def changed_paths(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
         """The paths whose rows of other envs changed.
 
         Args:
             seen: values at the last call, updated here: a tensor that was not written since is not compared again.
         """
-        now = self._read(look_over(self.env))
+        now = self._read(walk_task_values(self.env))
         for path, before in self.before.items():
             value = now.get(path)
             version = version_of(value) if isinstance(value, torch.Tensor) else -1
@@ -86,7 +86,7 @@ class KeptRows:
         return read
 
     def _difference(self, before: Any, now: Any) -> tuple[int, ...] | None:
-        """Envs as in `changes`; None if no row of another env changed."""
+        """Envs as in `changed_envs`; None if no row of another env changed."""
         elsewhere = self._elsewhere
         if isinstance(before, list) and isinstance(now, list):
             if len(now) == len(before):
@@ -179,10 +179,10 @@ class _Lines:
 
     def start(self) -> None:
         if sys.gettrace() is not None or not self.rows.before:
-            return  # of a debugger, or of coverage
+            return  # a debugger or coverage is tracing
         self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
-        while frame is not None:  # callers of the reset go on after it, as the task's own `reset` does
+        while frame is not None:  # callers of the reset continue after it, as the task's own `reset` does
             if self._is_the_tasks(frame):
                 frame.f_trace = self._traced
                 self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
@@ -217,7 +217,7 @@ class _Lines:
         if self._at is None or self._left == 0:
             return
         self._left -= 1
-        changed = self.rows.changed(self._seen)
+        changed = self.rows.changed_paths(self._seen)
         frame = self._at[0]
         for path in changed - self.found.keys():
             self.found[path] = (self._at, *frames_of_the_task(frame.f_back))
@@ -285,7 +285,7 @@ class ResetWatch:
         if lines is None:
             return
         self.stop()
-        found = lines.rows.changes()
+        found = lines.rows.changed_envs()
         if over or found:
             # Tracing slows a reset down: only if a line is missing.
             self._tries -= self._seeks
@@ -313,7 +313,7 @@ class ResetWatch:
         place = None
         if not frames:
             place = find_assignment(self._task, path) or place_of_hook(self._task, "_initialize_episode")
-        self._rules.breaks(rule, message, frames or None, place, subject=path)
+        self._rules.report_breach(rule, message, frames or None, place, subject=path)
 
 
 def _are(envs: Sequence[int]) -> str:

@@ -1,4 +1,4 @@
-"""Partial resets that leave the other envs alone."""
+"""Resets of some envs that change neither state nor random numbers of the others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class KeptControllers:
     """What the active controllers remember of some envs: start, target and all else with a row an env.
 
     ManiSkill 3.0.1 resets the controllers of every env in a partial reset: it sets the reset mask back to all ones before
-    ``controller.reset()``, which asks that mask. A controller with ``use_target`` then takes the present joints as its
+    ``controller.reset()``, which reads that mask. A controller with ``use_target`` then takes the present joints as its
     target in envs that are not reset. So their values are kept and put back before the first observation.
     """
 
@@ -54,7 +54,7 @@ def active_controllers(env: Any) -> list[BaseController]:
     return single
 
 
-def others(env: Any, options: dict[str, Any] | None) -> list[int]:
+def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
     """The envs that a reset with these options does not touch; empty for a reset of all."""
     chosen = _chosen(env, options or {})
     return [] if chosen is None else sorted(set(range(env.num_envs)).difference(chosen))
@@ -135,7 +135,7 @@ def explain_reset_errors(env: Any, untouched: list[int]) -> Iterator[None]:
         raise  # has the line already
     except Exception as error:
         line = _line_of_the_task(error, env)
-        lost = [] if rows is None else [path for path, envs in rows.changes().items() if not envs]
+        lost = [] if rows is None else [path for path, envs in rows.changed_envs().items() if not envs]
         if line is not None or lost:
             error.add_note(_note(env, chosen, line, lost))
         raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -58,6 +59,10 @@ class StepResult:
     @property
     def nbytes(self) -> int:
         """Roughly what it takes in memory."""
-        arrays = [self.elapsed_steps, self.reward, self.terminated, self.truncated, self.poses]
-        arrays += [*self.evaluate.values()] + ([] if self.action is None else [self.action])
-        return sum(value.nbytes for value in (*arrays, *self.others.values()))
+        return sum(map(_nbytes, vars(self).values()))
+
+
+def _nbytes(value: Mapping[str, NDArray | OtherEntry] | NDArray | OtherEntry | None) -> int:
+    if isinstance(value, Mapping):
+        return sum(map(_nbytes, value.values()))
+    return 0 if value is None else value.nbytes

@@ -18,7 +18,7 @@ from workbench.core.broken_rule import (
 )
 from workbench.core.env.evaluate_entries import wrong_evaluate, wrong_observation, wrong_reward
 from workbench.core.env.kept_rows import ResetWatch
-from workbench.core.env.partial_reset import others
+from workbench.core.env.partial_reset import untouched_envs
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.simulation.accessors import guard_scenes
 from workbench.core.simulation.strict_system import StrictCpuSystem
@@ -81,7 +81,7 @@ class StrictMixin:
     # --- partial resets ------------------------------------------------------------------------------
 
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        untouched, watch = others(self, options), self._watch
+        untouched, watch = untouched_envs(self, options), self._watch
         partial = bool(untouched)
         with self.broken_rules.during("reset", confirms=partial or self.num_envs == 1):
             watch.whole = partial and self._workbench_task.reset is not BaseEnv.reset
@@ -164,7 +164,7 @@ class StrictMixin:
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
-            # What `evaluate` stores for all envs is no fault of the reset: compare from here on.
+            # `evaluate` may store values of all envs, which is not the reset's fault: compare from here.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
 

@@ -215,7 +215,7 @@ class TaskEnv:
         return self.result(info, reward, action, terminated)
 
     def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
-        """Everything that decides how the episodes of these envs (None: of all) go on; see `snapshot`."""
+        """Everything that decides how the episodes of these envs (None: of all) continue; see `snapshot`."""
         return take_snapshot(self.env, env_idx)
 
     def restore(
@@ -313,7 +313,7 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
 
 
 def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
-    """`StepResult.sound_obs`; what is no batch of floats is sound."""
+    """`StepResult.sound_obs`; a value that is no batch of floats counts as finite."""
     sound = np.ones(num_envs, bool)
     for name, value in flat_entries(obs):
         # Pictures are large, and the simulator's own.
@@ -325,7 +325,7 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
 
 
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
-    """(N, ...), a copy; a single value, as of a task written for one env, is repeated."""
+    """(N, ...), a copy; a single value (of a task written for one env) is repeated."""
     array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
     batched = array.ndim > 0 and len(array) == num_envs
     return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()

@@ -30,7 +30,7 @@ MOST_TEXELS = 1024
 
 
 _GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
-"""Linear grey: what moves is lighter than what it stands on."""
+"""Linear grey: moving bodies are lighter than static ones."""
 _PLANE_HALF_SIZE = 50.0
 """PhysX planes are infinite; this is half the default width of ManiSkill's ground."""
 _X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -327,7 +327,7 @@ def _at_most(pixels: NDArray[np.uint8], max_size: int) -> NDArray[np.uint8]:
 
 
 def _collision_shape(shape: Any) -> tuple[Hashable, Callable[[], Mesh]]:
-    """Key, and the function that makes the mesh. PhysX's capsules, cylinders and planes lie along x."""
+    """Key, and the function that makes the mesh. PhysX's capsules, cylinders and planes are along x."""
     if isinstance(shape, physx.PhysxCollisionShapeBox):
         half = shape.half_size.tolist()
         return ("box", *half), lambda: _mesh(trimesh.creation.box(extents=2 * np.array(half)))

@@ -239,13 +239,13 @@ def _refuse(owner: Any, called: str, instead: str) -> None:
             continue
         name = owner.name if isinstance(owner, physx.PhysxArticulation) else entity.name
         if system.being_reset is not None and not bool(system.being_reset[env]):
-            system.rules.breaks(
+            system.rules.report_breach(
                 "other-env-written",
                 f"{called} on '{name}' writes env {env}, which is not being reset (on the GPU it does nothing). Use "
                 f"{instead} of ManiSkill's object, which sets those that are being reset.",
             )
         else:
-            system.rules.breaks(
+            system.rules.report_breach(
                 "behind-the-tensors",
                 f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing. Use {instead} "
                 "of ManiSkill's object, which sets all envs, or those that are being reset.",

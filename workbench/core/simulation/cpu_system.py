@@ -29,7 +29,7 @@ def _uncommon_member(name: str) -> Any:
 
     Raises:
         NotImplementedError: SAPIEN's GPU system has it.
-        AttributeError: SAPIEN's has not either.
+        AttributeError: SAPIEN's does not have it either.
     """
     if hasattr(physx.PhysxGpuSystem, name):
         raise NotImplementedError(

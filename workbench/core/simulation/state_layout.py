@@ -27,7 +27,7 @@ class StateLayout:
     ``PhysxCpuSystem.pack()`` gives float32: each dynamic or kinematic body as quaternion wxyz, position, linear and angular
     velocity; then each articulation as the same 13 numbers of its root, its qpos, its qvel, and target position and target
     velocity of each joint in turn. ``sapien.Scene.pack_poses()`` gives quaternion and position of each entity. Neither is
-    documented (found by measuring, sapien 3.0.3), so `check_layout` compares both with the getters. Envs need not be alike:
+    documented (found by measuring, sapien 3.0.3), so `check_layout` compares both with the getters. Envs need not have the same bodies:
     rows of one follow those of the other, and missing joints read a zero.
     """
 

@@ -30,7 +30,7 @@ class Stepper:
     costs float precision.
 
     *In a row*: a Panda, table and cube touch some hundreds of kB, which a walk through all envs throws out of the cache.
-    ManiSkill runs hooks between substeps, so their order changes only when no hook can tell (`merging`).
+    ManiSkill runs hooks between substeps, so their order changes only when no hook can notice it (`merging`).
 
     The thread that stepped an env also packs it, while it is in that core's cache (12 us cold, 3 us warm).
     """
@@ -314,7 +314,7 @@ def env_threads() -> EnvThreads:
 
 
 def _after_fork() -> None:
-    # Threads do not survive a fork: the child would wait for them for ever.
+    # Threads do not survive a fork: the child would wait for them without end.
     global _shared
     _shared = EnvThreads()
 

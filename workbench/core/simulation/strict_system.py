@@ -90,7 +90,7 @@ _MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
 class StrictCpuSystem(BatchedCpuSystem):
     """A `BatchedCpuSystem` that reports breaches of the rules of GPU simulation.
 
-    On the GPU ``gpu_fetch_*`` overwrites the tensors and ``gpu_apply_*`` the simulation, for all envs and without a word. So a
+    On the GPU ``gpu_fetch_*`` overwrites the tensors and ``gpu_apply_*`` the simulation, for all envs and without a message. So a
     pose that was set and not applied is lost at the next fetch, an apply after a step without a fetch puts every body of
     every env back, and a read between the two gives the past. `BatchedCpuSystem` does the first and the last as the GPU
     does; this class reports all three, and changes no bit where a rule only warns. It compares values, not calls: a pose set
@@ -136,7 +136,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             others = struct.scene._reset_mask[envs] & ~self.being_reset[envs]
             if bool(others.any()):
                 self.reported_elsewhere.add(struct.name)
-                self.rules.breaks(
+                self.rules.report_breach(
                     "other-env-written",
                     f"'{struct.name}' is written in {envs_named(envs[others])}, which "
                     "are not being reset: in _initialize_episode only the envs of env_idx may be changed.",
@@ -152,7 +152,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         if group not in self._stale:
             return
         if any(m.behind()[np.searchsorted(m.rows, index.numpy())].any() for m in self._mirrors.of[group]):
-            self.rules.breaks(
+            self.rules.report_breach(
                 "read-before-fetch",
                 f"The state of '{struct.name}' is read after the simulation moved on and before it was fetched: "
                 "on the GPU, and here, this gives the state before the step. Call self.scene._gpu_fetch_all() "
@@ -166,7 +166,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         old &= {self.index_of(body.articulation) for body in link._bodies} if old else set()
         if old:
             name = self._mirrors.qpos.names[min(old)]
-            self.rules.breaks(
+            self.rules.report_breach(
                 "link-before-update",
                 f"The pose of link '{link.name}' is read after the qpos or pose of '{name}' was set: on the GPU, "
                 "and here, it is still where it was. Call self.scene._gpu_apply_all(), "
@@ -204,17 +204,17 @@ class StrictCpuSystem(BatchedCpuSystem):
             where, frames = envs_named(mirror.envs[mine]), self._writes.frames(group, mine)
             seen_by = ", pictures do, here and on the GPU" if what == "pose" else ""
             if group == "links" and what == "pose" and not np.isin(mine, roots).any():
-                self.rules.breaks(
+                self.rules.report_breach(
                     "link-pose-set",
                     f"The pose of link '{name}' was set in {where}: physics never sees it{seen_by}. "
                     "Links follow their articulation: set its qpos or its root pose.",
                     frames,
                 )
             else:
-                self.rules.breaks(
+                self.rules.report_breach(
                     "not-applied",
                     f"The {what} of '{name}' in {where} was set and not applied: physics never sees it{seen_by}, and "
-                    "the next fetch writes it over. To have it seen, call self.scene._gpu_apply_all() and "
+                    "the next fetch overwrites it. To have it seen, call self.scene._gpu_apply_all() and "
                     "self.scene._gpu_fetch_all() after the write (under `if self.gpu_sim_enabled:`).",
                     frames,
                 )
@@ -242,7 +242,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             m.names[row] for m in mirrors for row in m.rows[(m.behind() & ~m.differs()).any(axis=1)][:1]
         ]
         if undone:
-            self.rules.breaks(
+            self.rules.report_breach(
                 "apply-before-fetch",
                 f"State is applied after the simulation moved on and before it was fetched: on the GPU this puts "
                 f"'{undone[0]}', and everything else that moved, back to before the step, in all envs. "
@@ -256,7 +256,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             name, envs = self._mirrors.qf.names[hit[0]], self._mirrors.qf.envs[hit]
             if self.rules.degree("not-applied") == "stop":
                 self._mirrors.qf.drop()
-            self.rules.breaks(
+            self.rules.report_breach(
                 "not-applied",
                 f"The joint forces (qf) of '{name}' in {envs_named(envs)} were set and not applied: on the GPU, and here, "
                 "the step does not see them. Call self.scene.px.gpu_apply_articulation_qf() after the write.",
@@ -265,10 +265,10 @@ class StrictCpuSystem(BatchedCpuSystem):
         if self.being_reset is not None:
             self.stepped_in_reset = True
             others = np.flatnonzero(~self.being_reset.numpy())
-            self.rules.breaks(
+            self.rules.report_breach(
                 "stepped-in-reset",
                 f"The simulation is stepped in _initialize_episode while {envs_named(others)} are not being reset: "
-                "their episodes are moved on as well. (With one env, as --num-envs 1 opens it, there are no others.)",
+                "their episodes advance as well. (With one env, as --num-envs 1 opens it, there are no others.)",
             )
         super().step()
 
@@ -290,7 +290,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             if len(rows) and self.rules.degree("applied-by-reset") == "stop":
                 mirror.now[rows] = mirror.seen[rows]
             for name, mine in _by_name(rows, mirror.names):
-                self.rules.breaks(
+                self.rules.report_breach(
                     "applied-by-reset",
                     f"The {mirror.what} of '{name}' in {envs_named(mirror.envs[mine])} was set outside _initialize_episode and "
                     "not applied: on the GPU, and here, the reset of other envs applies it now. Call "
@@ -317,7 +317,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             for name, mine in _by_name(changed, mirror.names):
                 if name in self.reported_elsewhere:
                     continue
-                self.rules.breaks(
+                self.rules.report_breach(
                     "other-env-written",
                     f"_initialize_episode changed the {mirror.what} of '{name}' in {envs_named(mirror.envs[mine])}, which are "
                     "not being reset: only the envs of env_idx may be changed.",

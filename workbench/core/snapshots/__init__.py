@@ -1,1 +1,1 @@
-"""Everything that decides how an episode goes on, kept and put back."""
+"""Everything that decides how an episode continues: kept and restored."""

@@ -54,7 +54,7 @@ class CpuState:
 
     ``PhysxCpuSystem.pack()`` has pose and velocity of every body, qpos, qvel and drive targets. In addition:
 
-    * *Names*: bytes of two envs mean the same only if the envs are built alike. `Contents` says what they mean; where
+    * *Names*: bytes of two envs mean the same only if the envs have the same parts. `Contents` says what they mean; where
       they differ, the bytes are put together from the target's and the source's.
     * *Sleep*: writing a pose wakes a body, which then moves by micrometres. What slept is put to sleep again. Every body is
       asked (2 us each): a velocity in the pack does not mean that one is awake (cubes of StackCube sleep with some left).
@@ -100,9 +100,9 @@ class CpuStatePlan:
     """Parts, bodies and rows of each env of a built scene."""
 
     contents: list[Contents]
-    """Of each env; envs that are alike share one object."""
+    """Of each env; envs with the same parts share one object."""
     sleepers: list[list[tuple[int, Callable[[], bool], Any]]]
-    """Of each env: index into its contents, function that tells whether it sleeps, component that can be put to sleep."""
+    """Of each env: index into its contents, function that returns whether it sleeps, component that can be put to sleep."""
     articulations: list[range]
     """Of each env: its rows in the (A, D) tensors."""
     names: dict[int, tuple[int, str]]
@@ -377,7 +377,7 @@ def _joined(
         if source is None:
             missed[str(part)] = "the snapshot has none of this name: left as it is"
         elif parts[source].joints != part.joints:
-            missed[str(part)] = "its joints are others than in the snapshot: left as it is"
+            missed[str(part)] = "its joints differ from those of the snapshot: left as it is"
             source = None
         else:
             numbers[at : at + part.size] = theirs[starts[source] : starts[source] + part.size]
@@ -430,7 +430,7 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
 
     PhysX solves contacts in the order of numbers that it gave to pairs of shapes, and reuses numbers, last returned first. So
     the last bits of a result depend on all that was ever touched in that scene, and no call takes that back (tried:
-    ``unpack``, moving everything apart and together). The same grasp, written twice into the same env, went on differently in
+    ``unpack``, moving everything apart and together). The same grasp, written twice into the same env, continued differently in
     five of eight envs. So the env's entities move, in order, into a new ``sapien.Scene`` with a new ``PhysxCpuSystem`` and the
     same ``RenderSystem``: 0.2 ms for a Panda, a table and a cube. SAPIEN's components stay the same Python objects.
 

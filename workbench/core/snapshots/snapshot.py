@@ -37,17 +37,17 @@ class Memory(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """Everything that decides how the episodes of chosen envs go on. Copies only: it can be pickled, and outlives its env.
+    """Everything that decides how the episodes of chosen envs continue. Copies only: it can be pickled, and outlives its env.
 
     Gathered from PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its controllers
     (`task_state`), elapsed steps and random generators (`rng`), a row an env: one env's state fits its own place, another
     env, or by name an env that was built again.
 
-    *Two restores of a snapshot go on alike*, to the last bit: a restored env gets a PhysX scene without a past. *A restore goes
-    on as the uninterrupted run* except for what PhysX keeps to itself: contact caches, the order in which it solves
+    *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a PhysX scene without a past. *A restore
+    continues as the uninterrupted run* except for what PhysX keeps to itself: contact caches, the order in which it solves
     contacts, and the last bit of an articulation's root. Nothing else is missing (tested: an uninterrupted run whose bodies
-    move into a new scene, with no number written, goes on as the restored one). Five steps later that is nothing for a
-    cart-pole, 1e-3 rad of a joint where a hand holds or pushes, 2e-2 rad for a humanoid that lies, and without bound where a
+    move into a new scene, with no number written, continues as the restored one). Five steps later that is nothing for a
+    cart-pole, 1e-3 rad of a joint where a hand holds or pushes, 2e-2 rad for a humanoid that lies on the ground, and without bound where a
     fall or a slip hangs on it (``tests/benchmarks/restore_distance.py``; figures in ``web_assets/docs/task_ids.md``). Writing
     an earlier state and repeating the steps does not help. Exact is a snapshot at an *exact point* (`begin_anew`, or right
     after a restore) with every step since then made again; the session goes back so (`session.worker.go_back`).
@@ -120,7 +120,7 @@ def restore_snapshot(
         env_idx: the envs to restore; None for those of the snapshot.
         source: the snapshot's envs whose state they get: one for all, or one each. None: each its own; or if the snapshot
             has a single env, that one.
-        fresh_physics: whether the envs get a PhysX scene without a past, and so go on alike to the last bit. Without it, a
+        fresh_physics: whether the envs get a PhysX scene without a past, and so continue identically, to the last bit. Without it, a
             restore is several times as fast, and later contacts may be solved in another order (`renew_physics`).
 
     Raises:
@@ -134,9 +134,7 @@ def restore_snapshot(
     px = batched_system(env.scene)
     state: Any = snapshot.simulation
     if isinstance(state, CpuState) != (px is not None):
-        raise TypeError(
-            "a snapshot of CPU simulation cannot be restored in GPU simulation, nor the other way round"
-        )
+        raise TypeError("a snapshot of CPU simulation cannot be restored in GPU simulation, or the reverse")
     if px is not None:
         carried, missed = write_cpu_state(env, targets, state, positions, fresh_physics)
     else:

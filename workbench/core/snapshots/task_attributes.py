@@ -63,7 +63,7 @@ class Walk:
     """Addresses of the simulation's tensors: a view of one is no memory of the task."""
 
 
-def look_over(env: BaseEnv) -> Walk:
+def walk_task_values(env: BaseEnv) -> Walk:
     """Everything that a task may remember.
 
     Looked for on the env, its agents and their controllers, through dicts, lists, tuples, dataclasses, Poses and objects of

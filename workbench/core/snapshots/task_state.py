@@ -11,7 +11,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.core.scene.scene_index import once_a_scene
-from workbench.core.snapshots.task_attributes import PLAIN, TaskValue, look_over
+from workbench.core.snapshots.task_attributes import PLAIN, TaskValue, walk_task_values
 
 _LARGEST_OF_BATCH = 1 << 16
 """Elements of a tensor that holds for the whole batch; a larger one is data, not state."""
@@ -56,11 +56,11 @@ class TaskState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Mark:
+class _BuiltValue:
     """A value as it was when the scene was built."""
 
     value: Any
-    """Itself."""
+    """The object, for comparison by identity."""
     version: int
     """torch's count of writes to a tensor."""
     kept: Buffer
@@ -71,14 +71,14 @@ class _Mark:
 class _Scene:
     """Values of the task when its scene was built."""
 
-    marks: dict[str, _Mark] = field(default_factory=dict)
+    values: dict[str, _BuiltValue] = field(default_factory=dict)
     paths: frozenset[str] = frozenset()
 
     def add(self, env: BaseEnv, leaves: list[TaskValue]) -> None:
         for leaf in leaves:
             version = version_of(leaf.value) if isinstance(leaf.value, torch.Tensor) else 0
-            self.marks[leaf.path] = _Mark(leaf.value, version, _kept(leaf.value, env.num_envs))
-        self.paths = frozenset(self.marks)
+            self.values[leaf.path] = _BuiltValue(leaf.value, version, _kept(leaf.value, env.num_envs))
+        self.paths = frozenset(self.values)
 
 
 @once_a_scene
@@ -88,7 +88,7 @@ def _scene_of(env: BaseEnv) -> _Scene:
 
 def note_scene(env: BaseEnv) -> None:
     """Mark what the task holds now, right after its scene was built, as part of the scene."""
-    _scene_of(env).add(env, look_over(env).leaves)
+    _scene_of(env).add(env, walk_task_values(env).leaves)
 
 
 def note_constructed(env: BaseEnv) -> None:
@@ -96,20 +96,20 @@ def note_constructed(env: BaseEnv) -> None:
 
     Else a restore into an env of the edited file would write the old file's ``self.threshold = 0.02``.
     """
-    plain = [leaf for leaf in look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))]
+    plain = [leaf for leaf in walk_task_values(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))]
     _scene_of(env).add(env, plain)
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
     """Copies of the task's state of the envs in `env_idx`, and of the whole batch."""
-    walk = look_over(env)
+    walk = walk_task_values(env)
     scene = _scene_of(env)
     buffers: dict[str, Buffer] = {}
     omitted = dict(walk.omitted)
     chosen = None if env_idx == list(range(env.num_envs)) else np.array(env_idx, np.int64)
     for leaf in walk.leaves:
         value = leaf.value
-        if not _changed(value, scene.marks.get(leaf.path)):
+        if not _changed(value, scene.values.get(leaf.path)):
             continue
         whole = isinstance(value, torch.Tensor) and not is_per_env(value, env.num_envs)
         if whole and value.numel() > _LARGEST_OF_BATCH:
@@ -141,7 +141,7 @@ def write_task_state(
     Returns:
         Paths that were carried, and paths that were not with the reason.
     """
-    walk = look_over(env)
+    walk = walk_task_values(env)
     scene = _scene_of(env)
     carried: dict[str, None] = {}
     missed = dict(state.omitted)
@@ -152,22 +152,22 @@ def write_task_state(
         here.add(leaf.path)
         kept, value, chosen = state.buffers.get(leaf.path), leaf.value, positions
         if kept is None:
-            mark = scene.marks.get(leaf.path)
-            if not _changed(value, mark):
+            built = scene.values.get(leaf.path)
+            if not _changed(value, built):
                 continue
-            if mark is None or leaf.path not in state.built:
+            if built is None or leaf.path not in state.built:
                 # A controller's start and step exist from its first action on, without meaning before it.
                 if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
                     missed[leaf.path] = "the snapshot has none of this name: left as it is"
                 continue
-            kept, chosen = mark.kept, env_idx
+            kept, chosen = built.kept, env_idx
         if id(value) in replaced and isinstance(value, (torch.Tensor, np.ndarray)):
             leaf.put(replaced[id(value)][1])
             carried[leaf.path] = None
             continue
         if not kept.per_env:
             if all_envs:
-                leaf.put(_as_found(kept, env))
+                leaf.put(_whole_value(kept, env))
                 carried[leaf.path] = None
             elif not _equal(kept.values, value):
                 missed[leaf.path] = "it holds for the whole batch, and not all envs were put back"
@@ -189,7 +189,7 @@ def write_task_state(
             value = (
                 _with_rows(None, kept, env, env_idx, positions, True)
                 if kept.per_env
-                else _as_found(kept, env)
+                else _whole_value(kept, env)
             )
             object.__setattr__(walk.owners[owner], name, value)
             carried[path] = None
@@ -211,7 +211,7 @@ def _with_rows(
     if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
         if listed:
             return "it is no list with an entry for each env now"
-        return f"it had shape ({', '.join(['N', *map(str, shape[1:])])}) and is another thing now"
+        return f"it had shape ({', '.join(['N', *map(str, shape[1:])])}) and has another shape or type now"
     if listed:
         new: Any = list(value) if fits else [None] * env.num_envs
         for i, row in zip(env_idx, rows, strict=True):
@@ -226,7 +226,7 @@ def _with_rows(
     return new
 
 
-def _as_found(kept: Buffer, env: BaseEnv) -> Any:
+def _whole_value(kept: Buffer, env: BaseEnv) -> Any:
     if kept.dtype is not None:
         return torch.from_numpy(kept.values.copy()).to(device=env.device, dtype=kept.dtype)
     return kept.values.copy() if isinstance(kept.values, (np.ndarray, list)) else kept.values
@@ -241,15 +241,15 @@ def is_per_env(value: Any, num_envs: int) -> bool:
     return isinstance(value, list) and len(value) == num_envs
 
 
-def _changed(value: Any, mark: _Mark | None) -> bool:
-    """Whether a value was written since its mark; True without a mark."""
-    if mark is None:
+def _changed(value: Any, built: _BuiltValue | None) -> bool:
+    """Whether a value was written since the scene was built; True if it did not exist then."""
+    if built is None:
         return True
-    if value is mark.value and isinstance(value, PLAIN):
+    if value is built.value and isinstance(value, PLAIN):
         return False
     if isinstance(value, torch.Tensor):
-        return value is not mark.value or version_of(value) != mark.version
-    return type(value) is not type(mark.value) or not _equal(value, mark.kept.values)
+        return value is not built.value or version_of(value) != built.version
+    return type(value) is not type(built.value) or not _equal(value, built.kept.values)
 
 
 def version_of(tensor: torch.Tensor) -> int:

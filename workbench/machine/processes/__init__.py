@@ -1,1 +1,1 @@
-"""How processes are started, spoken to, confined and ended."""
+"""How processes are started, confined and ended, and their messages."""

@@ -30,7 +30,7 @@ def child_environment(**further: str) -> dict[str, str]:
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Disable garbage collection within this, and exempt what was imported for good. Importing torch, ManiSkill and rerun takes
+    """Disable garbage collection within this, and exempt what was imported from later collections. Importing torch, ManiSkill and rerun takes
     a quarter less.
 
     Of a million objects made by imports, ten thousand are garbage. Without the exemption BaseEnv's collections at every build

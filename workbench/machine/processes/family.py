@@ -50,7 +50,7 @@ def resident_memory(pid: int) -> int:
 
 
 def allocated_memory(pid: int) -> int:
-    """Resident bytes without mapped files; 0 if it is gone. Of mapped libraries the kernel may drop hundreds of megabytes
+    """Resident bytes without mapped files; 0 if it is gone. The kernel may drop hundreds of megabytes of mapped libraries
     while something else is allocated."""
     try:
         _, resident, shared, *_ = _read(f"/proc/{pid}/statm").split()
@@ -122,10 +122,10 @@ def main() -> None:
 
 
 def begin_family(server: int) -> None:
-    """Go on in a child of this process; the process itself never returns from here, and is its keeper.
+    """Continue in a child of this process; the process itself never returns from here, and is its keeper.
 
     A task may start processes that leave the worker's group (``setsid``) or its family (two forks), which nothing finds once
-    the worker is gone. The keeper is their *subreaper*: what loses its parent below it becomes its child. When the worker
+    the worker is gone. The keeper is their *subreaper*: a process below it that loses its parent becomes its child. When the worker
     ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none, and ends as the worker
     did. It kills nothing else: a child's number is free only after its parent has waited for it. A cgroup would need rights
     that a container or an ssh login does not give.

@@ -14,7 +14,6 @@ from workbench.authoring.loading.reference import TaskName
 from workbench.core.capture.inspection import Section
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import PolicyFile
-from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.session.cameras.studio import CameraStudio
@@ -28,6 +27,7 @@ from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import (
+    Answer,
     EnterRecording,
     Event,
     Inspect,
@@ -35,6 +35,7 @@ from workbench.session.protocol.messages import (
     LoadFailed,
     Placed,
     Play,
+    Progress,
     Request,
     Reset,
     SetCapture,

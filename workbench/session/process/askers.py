@@ -11,12 +11,11 @@ from itertools import count
 from typing import Any, TypeVar
 
 from workbench.core.camera_data import CameraKey
-from workbench.jobs.pool import Answer, Progress
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import Call, Question, Unpacker, Unreadable, value_type
 from workbench.session.process.job_lane import Job, JobFailed
 from workbench.session.process.worker_process import WorkerProcess
-from workbench.session.protocol.messages import Cancel, Load, PlaceCamera, Request
+from workbench.session.protocol.messages import Answer, Cancel, Load, PlaceCamera, Progress, Request
 
 _LOOK = 0.05
 """Seconds between two checks whether the job is stopped."""

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from workbench.authoring.problem import shorten
-from workbench.jobs.pool import Answer
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Call, Unreadable
@@ -16,6 +15,7 @@ from workbench.session.process.heartbeat import Beat, Busy, Doing, busy_at, fata
 from workbench.session.process.memory_limit import format_size
 from workbench.session.process.worker_process import Output, WorkerProcess
 from workbench.session.protocol.messages import (
+    Answer,
     Event,
     ListenForDebugger,
     Load,

@@ -16,7 +16,6 @@ from workbench.core.capture.inspection import Inspection, Section
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
-from workbench.jobs.pool import Answer, Progress
 from workbench.jobs.task import ActionSource, Stepped, TaskDescription, TaskOptions
 from workbench.machine.processes.wire import Call, Question
 
@@ -332,6 +331,34 @@ class PastPictures:
 
     origin: int
     pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a `wire.Call` is."""
+
+    number: int
+    done: int
+    total: int
+    part: bytes = b""
+    """The new part of the answer since the last one, packed; see `wire.Question.part`."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of a `wire.Call`."""
+
+    number: int
+    value: bytes = b""
+    """Packed: only the caller knows its type."""
+    why: str = ""
+    """Why there is no value, for the page; empty if there is one."""
+    problem: Problem | None = None
+    """What the author's code raised, if that is the reason."""
+
+
+class CannotAnswer(Exception):
+    """Raised in a worker that has no answer; the text is a sentence for the page."""
 
 
 @dataclass(frozen=True)

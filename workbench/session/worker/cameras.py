@@ -44,9 +44,9 @@ from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.hot_swap import keep_observation_space, put_class, undone
 from workbench.core.env.task_env import TaskEnv
 from workbench.jobs.open_task import OpenedTask, blamed
-from workbench.jobs.pool import CannotAnswer
 from workbench.session.protocol.messages import (
     CameraRequest,
+    CannotAnswer,
     DrawPast,
     PastPictures,
     Pictures,

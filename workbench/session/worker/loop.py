@@ -21,7 +21,6 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import ActionChooser
 from workbench.jobs.open_task import OpenedTask, Opening, blamed, warm_up
-from workbench.jobs.pool import Answer, CannotAnswer, Progress
 from workbench.jobs.task import Restored
 from workbench.jobs.verdict import Rescore
 from workbench.machine.folders import CurrentFolder
@@ -35,7 +34,9 @@ from workbench.machine.processes.wire import Call, Question, pack
 from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
+    Answer,
     Cancel,
+    CannotAnswer,
     DrawPast,
     EnterRecording,
     Inspect,
@@ -46,6 +47,7 @@ from workbench.session.protocol.messages import (
     Loading,
     PlaceCamera,
     Play,
+    Progress,
     Quit,
     ReadPolicyAgain,
     ReloadReport,

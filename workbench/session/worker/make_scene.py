@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workbench.jobs.pool import CannotAnswer
+from workbench.session.protocol.messages import CannotAnswer
 from workbench.session.protocol.questions import MakeScene, SceneMade
 from workbench.session.worker.pacing import throttled
 

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.jobs.pool import Deal, PoolError, Processes, Share, Work
+from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
 from workbench.machine.files import new_file
 from workbench.machine.software_vulkan import ensure_render_device
 from workbench.recording.episode.episode import Episode
@@ -277,7 +277,7 @@ class _Stopped(BaseException):
     """Unwinds the blocks that delete half-written files."""
 
 
-def _make(wanted: MakeRequest, share: Share) -> None:
+def _make(wanted: MakeRequest, queue: ItemQueue) -> None:
     """Runs in the other process."""
     said_at = 0.0
 
@@ -285,14 +285,14 @@ def _make(wanted: MakeRequest, share: Share) -> None:
         nonlocal said_at
         if time.monotonic() - said_at >= SAY_EVERY:
             said_at = time.monotonic()
-            share.send_update((done, doing))
+            queue.send_update((done, doing))
 
     def look(number: int, frame: FrameType | None) -> None:
-        if share.limit() == 0:
+        if queue.limit() == 0:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             raise _Stopped
 
-    if share.next() is None:
+    if queue.next() is None:
         return
     # By a signal: encoding a film has long stretches without progress in which it must be possible to stop.
     signal.signal(signal.SIGALRM, look)
@@ -306,4 +306,4 @@ def _make(wanted: MakeRequest, share: Share) -> None:
         except (ValueError, OSError, RuntimeError) as error:
             made = str(error)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        share.send_result(0, made)
+        queue.send_result(0, made)

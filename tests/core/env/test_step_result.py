@@ -1,0 +1,26 @@
+"""The memory that a step's result takes, by which the history drops the oldest."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+
+from workbench.core.env.step_result import OtherEntry, StepResult
+
+
+def test_every_field_counts() -> None:
+    arrays = {
+        "elapsed_steps": np.zeros(3, np.int32),
+        "reward": np.zeros(3, np.float32),
+        "terminated": np.zeros(3, bool),
+        "truncated": np.zeros(3, bool),
+        "poses": np.zeros((3, 5, 7), np.float32),
+        "action": np.zeros((3, 2), np.float32),
+        "sound_obs": np.zeros(3, bool),
+    }
+    evaluate, others = {"success": np.zeros(3, bool)}, {"mean": OtherEntry("float", ("0.5",))}
+    assert {one.name for one in fields(StepResult)} == {*arrays, "evaluate", "others"}
+    step = StepResult(**arrays, evaluate=evaluate, others=others)
+    parts = [*arrays.values(), *evaluate.values(), *others.values()]
+    assert step.nbytes == sum(part.nbytes for part in parts)
