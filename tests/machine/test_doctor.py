@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from workbench.machine import doctor
+from workbench.machine import doctor, versions
 from workbench.machine.doctor import DoctorFinding, diagnose, exit_code, print_report
 
 
@@ -22,6 +22,7 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
     topics = {
         "Python",
         "packages",
+        "versions",
         "render device",
         "CUDA",
         "GPU physics",
@@ -35,9 +36,30 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
     assert all(finding.advice for finding in findings.values() if finding.ok is not True)
 
 
-def test_versions_that_must_match_are_shown(findings: dict[str, DoctorFinding]) -> None:
-    for pinned in ("mani-skill 3.0.1", "sapien 3.0.3", "viser 1.1.1", "rerun-sdk 0.41.0", "torch 2."):
-        assert pinned in findings["packages"].what
+def test_versions_are_shown_and_what_they_mean(findings: dict[str, DoctorFinding]) -> None:
+    installed = {name: versions.installed(name) for name in (*versions.TESTED, "torch", "numpy")}
+    shown = findings["packages"].what
+    assert all(f"{name} {version}" in shown for name, version in installed.items() if version is not None)
+    assert not [name for name, version in installed.items() if version is None and f"{name} " in shown]
+    maniskill = versions.maniskill()
+    assert maniskill is not None and f"ManiSkill {maniskill[1]}" in findings["versions"].what
+    assert ("nightly" in findings["versions"].what) == (maniskill[0] == "mani_skill-nightly")
+
+
+def test_a_version_that_was_not_tested_is_named_with_the_way_back(
+    child_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tested = versions.installed("viser")
+    monkeypatch.setitem(versions.TESTED, "viser", ("0.1",))
+    (finding,) = doctor._versions()
+    assert finding.ok is None and f"not tested: viser {tested}" in finding.what
+    assert finding.advice and "pip install" in finding.advice and "viser==0.1" in finding.advice
+
+
+def test_without_maniskill_the_extra_to_install_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(versions, "MANISKILL", ("mani_skill-of-another-year",))
+    (finding,) = doctor._versions()
+    assert finding.ok is False and finding.advice and "[maniskill]" in finding.advice
 
 
 def test_gpu_physics_is_looked_for_without_fetching_it(

@@ -1,4 +1,4 @@
-"""All private names of ManiSkill 3.0.1 that the core uses."""
+"""All private names of ManiSkill that the core uses, and what depends on each."""
 
 from __future__ import annotations
 
@@ -33,6 +33,73 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind
+from workbench.machine.versions import PrivateName, moved_text
+
+# --- what depends on which name ---------------------------------------------------------------------
+
+EXCHANGING = "exchanging cameras without a rebuild"
+HIDDEN = "objects that are hidden from sensors, in pictures"
+NAMED_STATE = "names of the parts of a flat state observation"
+PLACING = "placing cameras"
+POSE_CONTROL = "control modes that set the hand's pose, pd_ee_..."
+WRITING = "writing cameras into the file"
+
+_ENV = "mani_skill.envs.sapien_env:BaseEnv"
+_SCENE = "mani_skill.envs.scene:ManiSkillScene"
+_STRUCTS = "mani_skill.utils.structs"
+_POSE_CONTROLLER = "mani_skill.agents.controllers.pd_ee_pose:PDEEPosController"
+
+
+def _all(owner: str, disables: str, names: str) -> tuple[PrivateName, ...]:
+    return tuple(PrivateName(owner, name, disables) for name in names.split())
+
+
+PRIVATE_NAMES = (
+    *_all(_ENV, "", "_setup_scene _set_scene_config _load_agent _initialize_episode _after_reconfigure"),
+    *_all(
+        _ENV, "", "_clear_sim_state _step_action _before_simulation_step _after_simulation_step _sim_device"
+    ),
+    *_all(
+        _ENV, "", "_sim_freq _sim_steps_per_control _get_obs_agent _get_obs_extra _flatten_raw_obs _last_obs"
+    ),
+    *_all(_ENV, "", "_episode_seed _episode_rng _batched_episode_rng _batched_main_rng _batched_rng_backend"),
+    *_all(_ENV, "", "_enhanced_determinism _sensors _human_render_cameras"),
+    *_all(_SCENE, "", "_setup _gpu_apply_all _gpu_fetch_all _gpu_sim_initialized _needs_fetch _reset_mask"),
+    *_all(_SCENE, "", "_sapien_add_camera _sapien_update_render"),
+    *_all(f"{_STRUCTS}.base:BaseStruct", "", "_objs _scene_idxs"),
+    *_all(f"{_STRUCTS}.base:PhysxRigidBodyComponentStruct", "", "_bodies _body_data _body_data_index"),
+    *_all(f"{_STRUCTS}.articulation:Articulation", "", "_data_index"),
+    *_all(f"{_STRUCTS}.articulation_joint:ArticulationJoint", "", "_data_index _physx_articulations"),
+    *_all(f"{_STRUCTS}.render_camera:RenderCamera", "", "_render_cameras"),
+    *_all(_ENV, EXCHANGING, "_setup_sensors"),
+    *_all(_SCENE, EXCHANGING, "camera_groups"),
+    *_all(_ENV, HIDDEN, "_hidden_objects"),
+    *_all(f"{_STRUCTS}.actor:Actor", HIDDEN, "hidden before_hide_pose"),
+    *_all(_ENV, NAMED_STATE, "_get_obs_state_dict"),
+    *_all(_ENV, PLACING, "_sensor_configs _human_render_camera_configs"),
+    *_all(f"{_STRUCTS}.render_camera:RenderCamera", PLACING, "camera_group _cached_model_matrix"),
+    *_all(f"{_STRUCTS}.render_camera:RenderCamera", PLACING, "_cached_extrinsic_matrix"),
+    *_all(f"{_STRUCTS}.render_camera:RenderCamera", PLACING, "_cached_intrinsic_matrix _cached_local_pose"),
+    *_all(
+        _POSE_CONTROLLER, POSE_CONTROL, "_preprocess_action _start_qpos _target_pose _target_qpos _sim_steps"
+    ),
+    *_all(_POSE_CONTROLLER, POSE_CONTROL, "_step _step_size _check_gpu_sim_works kinematics"),
+    *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
+    *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
+)
+"""Without a name that disables nothing in particular no task can be opened."""
+
+
+@cache
+def moved_names() -> tuple[PrivateName, ...]:
+    """Those that the installed ManiSkill does not have."""
+    return tuple(each for each in PRIVATE_NAMES if not each.exists())
+
+
+def why_not(feature: str) -> str:
+    """Why the installed ManiSkill does not allow this (`PLACING`, ...; empty: any task); empty if it does."""
+    return moved_text(each for each in moved_names() if each.disables == feature)
+
 
 parse_cameras: Callable[[Any], dict[str, Any]] = (
     getattr(camera_module, "parse_camera_configs", None) or camera_module.parse_sensor_configs  # pyright: ignore
@@ -102,10 +169,11 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     find_rows(Articulation, "_data_index", "_objs", "index", torch.int32)
     find_rows(ArticulationJoint, "_data_index", "_physx_articulations", "index", torch.int32)
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
+    if why_not(POSE_CONTROL):
+        return
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
     for controller in (PDEEPosController, PDEEPoseController):
         controller._check_gpu_sim_works = check_frame(controller._check_gpu_sim_works)  # type: ignore[method-assign,assignment]
-    ManiSkillScene.get_contacts = get_contacts
 
 
 def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
@@ -302,8 +370,8 @@ def joints_of(struct: Any) -> int:
 
 
 def hidden_objects(env: Any) -> list[Any]:
-    """Actors (merged ones too) that the task hides from its sensors: ``_hidden_objects``."""
-    return env._hidden_objects
+    """Actors (merged ones too) that the task hides from its sensors: ``_hidden_objects``; none if `why_not` of `HIDDEN`."""
+    return [] if why_not(HIDDEN) else env._hidden_objects
 
 
 def pose_before_hiding(actor: Actor) -> torch.Tensor | None:

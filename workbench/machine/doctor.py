@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 from packaging.requirements import Requirement
@@ -23,7 +24,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from workbench.machine import DISTRIBUTION
+from workbench.machine import DISTRIBUTION, versions
 from workbench.machine.apt import has_apt, os_release
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
@@ -41,6 +42,16 @@ from workbench.core.backends import gpu_library_path, why_no_gpu_simulation
 cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
 print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
                   "why_not": why_no_gpu_simulation(), "library": str(gpu_library_path())}))
+"""
+
+VERSION_QUESTIONS = """
+import json
+from workbench.core import maniskill_private
+from workbench.machine.versions import moved_text
+from workbench.recording.rerun import private_api
+from workbench.ui.server import viser_private
+moved = [*maniskill_private.moved_names(), *(each for each in private_api.PRIVATE_NAMES if not each.exists())]
+print(json.dumps({"moved": moved_text(moved), "viser": viser_private.missing_names()}))
 """
 
 
@@ -65,6 +76,7 @@ def diagnose() -> list[DoctorFinding]:
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
         ("packages", _packages),
+        ("versions", _versions),
         ("render device", _render_device),
         ("CUDA", _gpu),
         ("cores, memory", _cores_and_memory),
@@ -131,25 +143,56 @@ def _packages() -> list[DoctorFinding]:
         requirements = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:
         return [DoctorFinding("packages", False, f"{DISTRIBUTION} is not installed", "Type: make open")]
-    shown: list[str] = []
     wrong: list[str] = []
     for requirement in requirements:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
-        try:
-            version = importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
+        version = versions.installed(requirement.name)
+        if version is None:
             wrong.append(f"{requirement} is missing")
-            continue
-        if not requirement.specifier.contains(version, prereleases=True):
+        elif not requirement.specifier.contains(version, prereleases=True):
             wrong.append(f"{requirement} is wanted, {version} is installed")
-        if any(part.operator == "==" for part in requirement.specifier) or requirement.name == "torch":
-            shown.append(f"{requirement.name} {version}")
-    what = ", ".join([f"workbench {importlib.metadata.version(DISTRIBUTION)}", *shown])
+    shown = [name for name in (*versions.TESTED, "torch", "numpy") if versions.installed(name) is not None]
+    what = ", ".join(f"{name} {versions.installed(name)}" for name in (DISTRIBUTION, *shown))
     if wrong:
-        advice = "Type: pip install -c constraints.txt -e .  (in a clone: make open)"
+        advice = "Type: pip install -c constraints.txt -e '.[maniskill]'  (in a clone: make open)"
         return [DoctorFinding("packages", False, f"{what}. {'; '.join(wrong)}", advice)]
     return [DoctorFinding("packages", True, what)]
+
+
+def _versions() -> list[DoctorFinding]:
+    """The installed ManiSkill, and whether it and the packages beside it have the private names that are used."""
+    topic = "versions"
+    if versions.maniskill() is None:
+        advice = "Type: pip install 'maniskill-workbench[maniskill]', or [nightly] for its nightly build"
+        return [DoctorFinding(topic, False, "ManiSkill is not installed", advice)]
+    answer = _ask_child(VERSION_QUESTIONS)
+    if isinstance(answer, str):
+        return [
+            DoctorFinding(
+                topic, False, f"ManiSkill or rerun does not load: {answer}", versions.untested_text()
+            )
+        ]
+    lacking = " ".join(
+        [answer["moved"]] * bool(answer["moved"])
+        + [f"viser lacks {', '.join(answer['viser'])}: no page can be served."] * bool(answer["viser"])
+    )
+    if lacking:
+        return [DoctorFinding(topic, False if answer["viser"] else None, lacking, versions.untested_text())]
+    if untested := versions.untested():
+        names = ", ".join(f"{name} {version}" for name, version in untested.items())
+        what = f"not tested: {names}; all private names that the workbench uses are there"
+        return [
+            DoctorFinding(topic, None, what, f"If something fails: {versions.command_for_tested_versions()}")
+        ]
+    name, version = versions.maniskill() or ("", "")
+    what = f"ManiSkill {version}, its release: tested with the workbench"
+    if name == "mani_skill-nightly":
+        what = (
+            f"ManiSkill {version}, a nightly build: tested with the workbench. Of another build every private name "
+            "that the workbench uses is looked for at start, and what has moved is named."
+        )
+    return [DoctorFinding(topic, True, what)]
 
 
 def _render_device() -> list[DoctorFinding]:
@@ -171,20 +214,11 @@ def _render_device() -> list[DoctorFinding]:
 
 def _gpu() -> list[DoctorFinding]:
     """CUDA through torch, then PhysX on it, without a download by SAPIEN."""
-    child = subprocess.run(
-        python_command("-c", GPU_QUESTIONS),
-        env=child_environment(),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=CHILD_TIMEOUT_S,
-    )
-    if child.returncode != 0:
-        last = (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+    answer = _ask_child(GPU_QUESTIONS)
+    if isinstance(answer, str):
         return [
-            DoctorFinding("CUDA", False, f"torch or SAPIEN does not load: {last}", "See the lines above.")
+            DoctorFinding("CUDA", False, f"torch or SAPIEN does not load: {answer}", "See the lines above.")
         ]
-    answer = json.loads(child.stdout.strip().splitlines()[-1])
     cuda: list[str] = answer["cuda"]
     if cuda:
         found = f"{', '.join(cuda)} (torch for CUDA {answer['built']})"
@@ -215,6 +249,21 @@ def _gpu() -> list[DoctorFinding]:
             "GPU physics", True, f"not on this machine, since {answer['why_not']}: the CPU core runs the envs"
         ),
     ]
+
+
+def _ask_child(code: str) -> Any:
+    """What `code` prints last, as JSON; if it fails, the last line of its error."""
+    child = subprocess.run(
+        python_command("-c", code),
+        env=child_environment(),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=CHILD_TIMEOUT_S,
+    )
+    if child.returncode != 0:
+        return (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+    return json.loads(child.stdout.strip().splitlines()[-1])
 
 
 def _cores_and_memory() -> list[DoctorFinding]:

@@ -13,7 +13,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from workbench.authoring.camera_source.cameras import FIELDS, HOOKS, PARAMETERS, HookCamera, HookCameras
 from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import trace_call
-from workbench.authoring.source.text import Trace
+from workbench.authoring.source.text import RefusedEdit, Trace
 from workbench.core import maniskill_private
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.place import settings_of
@@ -36,7 +36,9 @@ def recording_calls(sources: Mapping[str, str]) -> Iterator[RecordedCalls]:
 
 
 def run_hooks(env: Any, sources: Mapping[str, str]) -> HookCameras:
-    """Run the camera hooks of an env whose classes were made from these texts."""
+    """Run the camera hooks of an env whose classes were made from these texts. Raises RefusedEdit."""
+    if moved := maniskill_private.why_not(maniskill_private.WRITING):
+        raise RefusedEdit(moved)
     with recording_calls(sources) as recorded:
         configs = maniskill_private.camera_configs(env)
     return HookCameras(

@@ -96,6 +96,8 @@ def _camera(env: Any, key: CameraKey) -> Any:
     camera = maniskill_private.cameras(env).get(key)
     if camera is None:
         raise ValueError(f"there is no {kind} camera {name!r}")
+    if moved := maniskill_private.why_not(maniskill_private.PLACING):
+        raise ValueError(moved)
     if not maniskill_private.camera_components(camera):
         raise ValueError(f"{name!r} is no plain camera, and only those can be placed")
     if env.scene.gpu_sim_enabled and batched_system(env.scene) is None:

@@ -166,6 +166,8 @@ def split_flat(
 
 def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], str]] | None:
     env = task.env
+    if maniskill_private.why_not(maniskill_private.NAMED_STATE):
+        return None
     with remembering(env):
         obs = maniskill_private.unflattened_state(env, env.get_info())
     parts = []

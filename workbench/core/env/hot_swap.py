@@ -34,7 +34,10 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
 
 def can_exchange_cameras(env: BaseEnv) -> bool:
-    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone."""
+    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone, nor where
+    ManiSkill has no name for it any more."""
+    if maniskill_private.why_not(maniskill_private.EXCHANGING):
+        return False
     plain = all(
         maniskill_private.camera_components(camera) for camera in maniskill_private.cameras(env).values()
     )

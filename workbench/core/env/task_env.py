@@ -12,7 +12,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import common
 from numpy.typing import NDArray
 
-from workbench.core.backends import Backend, choose_backend, keep_render_device
+from workbench.core import maniskill_private
+from workbench.core.backends import Backend, BackendUnavailable, choose_backend, keep_render_device
 from workbench.core.broken_rule import BrokenRules, warn_of
 from workbench.core.env import actions
 from workbench.core.env.assets import refuse_downloads, require_assets, robots_of
@@ -74,7 +75,7 @@ def make_env(
 
     Raises:
         MissingAssets: the task or its robot needs a download; names it and the command.
-        BackendUnavailable: ``backend="gpu"`` on a machine that cannot.
+        BackendUnavailable: ``backend="gpu"`` on a machine that cannot, or a ManiSkill that lacks names which are needed.
         Exception: raised by the author's class while it builds.
     """
     reward = {"reward_mode": default_reward_mode(task)}
@@ -93,6 +94,8 @@ def build_env(
     The class decides what the keyword arguments do not: the reward mode is then the first of
     ``SUPPORTED_REWARD_MODES``, implemented or not.
     """
+    if moved := maniskill_private.why_not(""):
+        raise BackendUnavailable(moved)
     kwargs = {**(default_kwargs or {}), **options.kwargs, "num_envs": options.num_envs}
     require_assets(task.__name__, asset_ids, robots_of(task, kwargs))
     # ManiSkill also takes None for "none".

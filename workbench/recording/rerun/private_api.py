@@ -11,6 +11,21 @@ import pyarrow as pa
 from rerun.chunk import LazyStore, RrdReader
 from rerun.error_utils import RerunWarning
 
+from workbench.machine.versions import PrivateName
+
+READING = "reading and recording .rrd files"
+BLUEPRINTS = "the layout that an .rrd opens with in rerun"
+PRIVATE_NAMES = (
+    PrivateName("rerun.chunk:LazyStore", "_internal", READING),
+    PrivateName("rerun_bindings:LazyStoreInternal", "_chunk_index", READING),
+    PrivateName("rerun:RecordingStream", "_from_native", BLUEPRINTS),
+    PrivateName("rerun_bindings", "new_blueprint", BLUEPRINTS),
+    PrivateName("rerun_bindings", "set_callback_sink_blueprint", BLUEPRINTS),
+    PrivateName("rerun_bindings", "flush_and_cleanup_orphaned_recordings", BLUEPRINTS),
+    PrivateName("rerun.blueprint:Blueprint", "_log_to_stream", BLUEPRINTS),
+)
+"""Those that this module and `append_blueprint` use."""
+
 # Opening a truncated file raises an error; this warning would repeat it in the terminal.
 warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
 

@@ -209,7 +209,7 @@ def _exchange(
 ) -> tuple[OpenedTask, ReloadReport]:
     opened, env = running.opened, running.opened.env.env
     if change.level == "cameras" and not can_exchange_cameras(env):
-        raise _MustRebuild(f"{change.reason}, and GPU simulation cannot exchange cameras")
+        raise _MustRebuild(f"{change.reason}, and cameras cannot be exchanged here")
     before = task_class(env)
     rules = opened.env.broken_rules or BrokenRules({})
     kept_rules = rules.copy()

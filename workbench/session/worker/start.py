@@ -13,6 +13,7 @@ from typing import NoReturn
 
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.processes.family import begin_family
+from workbench.machine.versions import untested_text
 
 
 def main() -> None:
@@ -47,8 +48,10 @@ def main() -> None:
             from workbench.session.worker.loop import work
 
         work(connection, heartbeat)
-    except BaseException:
+    except BaseException as error:
         traceback.print_exc()
+        if isinstance(error, ImportError) and (text := untested_text()):
+            print(f"workbench: {text}", file=sys.stderr)
         code = 1
     # Or the interpreter would wait for the task's threads, and the page for this process.
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]

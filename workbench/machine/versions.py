@@ -1,0 +1,119 @@
+"""Installed versions of the packages whose private names the workbench uses, and what has moved in them."""
+
+from __future__ import annotations
+
+import dis
+import importlib
+import importlib.metadata
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from types import CodeType
+from typing import Any
+
+MANISKILL = ("mani_skill", "mani_skill-nightly")
+"""Two distributions with the same files: the release, and the build of a night."""
+TESTED = {
+    "mani_skill": ("3.0.1",),
+    "mani_skill-nightly": ("2026.8.2.400",),
+    "sapien": ("3.0.3",),
+    "viser": ("1.1.1",),
+    "rerun-sdk": ("0.41.0",),
+}
+"""Versions with which all tests pass: those of ``constraints.txt``, and further ones of the page on versions."""
+
+
+@dataclass(frozen=True)
+class PrivateName:
+    """A name of another package that the workbench uses and that package does not promise."""
+
+    owner: str
+    """Module, or module and class: ``package.module:Class``."""
+    name: str
+    """An attribute of it; for a class, also a field that is annotated or that its methods assign."""
+    disables: str = ""
+    """What does not work without it; empty: nothing does."""
+
+    @property
+    def dotted(self) -> str:
+        return f"{self.owner.rpartition(':')[2].rpartition('.')[2]}.{self.name}"
+
+    def exists(self) -> bool:
+        """Imports its module."""
+        module, _, path = self.owner.partition(":")
+        try:
+            owner: Any = importlib.import_module(module)
+            for part in path.split(".") if path else ():
+                owner = getattr(owner, part)
+        except (ImportError, AttributeError):
+            return False
+        if hasattr(owner, self.name):
+            return True
+        return isinstance(owner, type) and any(self.name in _names_of(cls) for cls in owner.__mro__)
+
+
+@cache
+def _names_of(cls: type) -> frozenset[str]:
+    """Annotated fields of a class, and attributes that its methods assign on anything."""
+    found = set(cls.__dict__.get("__annotations__", ()))
+    for member in vars(cls).values():
+        accessors = (member.fget, member.fset) if isinstance(member, property) else (member,)
+        for function in accessors:
+            code = getattr(getattr(function, "__func__", function), "__code__", None)
+            for each in _codes(code) if code is not None else ():
+                found |= {i.argval for i in dis.get_instructions(each) if i.opname == "STORE_ATTR"}
+    return frozenset(found)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def installed(distribution: str) -> str | None:
+    """Its version; None if it is not installed."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def maniskill() -> tuple[str, str] | None:
+    """Distribution and version of the installed ManiSkill; None without one."""
+    found = ((name, installed(name)) for name in MANISKILL)
+    return next(((name, version) for name, version in found if version is not None), None)
+
+
+def untested(distributions: Iterable[str] = TESTED) -> dict[str, str]:
+    """Installed versions of these that no test was run with."""
+    found = {name: installed(name) for name in distributions}
+    return {name: v for name, v in found.items() if v is not None and v not in TESTED[name]}
+
+
+def command_for_tested_versions() -> str:
+    """The command that installs the tested versions of what is installed."""
+    wanted = [f"{name}=={TESTED[name][0]}" for name in TESTED if installed(name) is not None]
+    return f"pip install {' '.join(wanted)}"
+
+
+def untested_text() -> str:
+    """What is installed that no test was run with, and the command for the tested versions; empty if all is tested."""
+    versions = ", ".join(f"{name} {version}" for name, version in untested().items())
+    return (
+        f"Not tested with the workbench: {versions}. The tested versions: {command_for_tested_versions()}"
+        if versions
+        else ""
+    )
+
+
+def moved_text(moved: Iterable[PrivateName]) -> str:
+    """Which names have moved, what does not work without them, and the tested versions; empty if none has moved."""
+    lacking: dict[str, list[str]] = {}
+    for each in moved:
+        lacking.setdefault(each.disables or "opening a task", []).append(each.dotted)
+    if not lacking:
+        return ""
+    parts = "; ".join(f"{feature} (needs {', '.join(names)})" for feature, names in lacking.items())
+    return f"Not possible with the installed versions: {parts}. {untested_text()}".rstrip()
