@@ -239,7 +239,7 @@ def asks_for_a_gpu(caller: FrameType) -> bool:
 
 def episode_seeds(env: BaseEnv) -> np.ndarray | None:
     """(N,) seeds of the last resets; None before the first."""
-    return env._episode_seed
+    return getattr(env, "_episode_seed", None)
 
 
 def draws_its_own_seeds(env: BaseEnv) -> bool:
@@ -297,6 +297,11 @@ def last_observation(env: BaseEnv) -> Any:
     return env._last_obs
 
 
+def scene_of(env: Any) -> Any | None:
+    """The scene; None before it is built and after it is closed (nightly builds do not set it before)."""
+    return getattr(env, "scene", None)
+
+
 def open_env(env: Any) -> BaseEnv:
     """The env under its wrappers: ``base_env`` of ManiSkillVectorEnv, ``unwrapped`` of all others.
 
@@ -307,7 +312,7 @@ def open_env(env: Any) -> BaseEnv:
     env = getattr(getattr(env, "base_env", env), "unwrapped", env)
     if not isinstance(env, BaseEnv):
         raise TypeError(f"expected a ManiSkill env, not {type(env).__name__}")
-    if env.scene is None:
+    if scene_of(env) is None:
         raise RuntimeError("this env is closed: its simulation is gone")
     return env
 

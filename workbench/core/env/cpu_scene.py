@@ -36,7 +36,12 @@ from workbench.core.env.partial_reset import (
     untouched_envs,
 )
 from workbench.core.env.strict import StrictMixin
-from workbench.core.maniskill_private import asks_for_a_gpu, install_row_lookups, substeps_are_unwatched
+from workbench.core.maniskill_private import (
+    asks_for_a_gpu,
+    install_row_lookups,
+    scene_of,
+    substeps_are_unwatched,
+)
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
@@ -269,7 +274,7 @@ class BatchedCpuMixin:
         """Discard writes to the simulation's tensors that were not applied."""
         # Else every later reset would apply what a hook that raised had written (a NaN, say), and what it had applied
         # and not fetched would make the next reset raise.
-        if self.scene is not None and self.scene._gpu_sim_initialized:
+        if scene_of(self) is not None and self.scene._gpu_sim_initialized:
             px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
             px.drop_writes()
             self.scene._gpu_fetch_all()
@@ -378,7 +383,7 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
     Raises:
         ForgottenInit: ``BaseEnv.__init__`` was not called, or not with the number of envs.
     """
-    if env.scene is None:
+    if scene_of(env) is None:
         cls, place = _culprit(task, BaseEnv, silent=True)
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
