@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.history.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
 from workbench.session.live.timeline import Scope, Strip
 from workbench.session.live.view import SessionView
@@ -254,7 +254,7 @@ POINTS = 240
 LINE_HEIGHT = 30.0
 """Height of the line in the picture's units; the marks are above."""
 FLAGS = {
-    NOT_A_NUMBER: "odd",
+    REWARD_NONFINITE: "odd",
     FAIL: "fail",
     SUCCESS: "success",
     TRUNCATED: "limit",
