@@ -100,7 +100,7 @@ class Session:
         self._worker = make_worker(
             worker or WorkerOptions(),
             WarmUp(options),
-            greet=self.versions.first_requests,
+            first_requests=self.versions.first_requests,
             on_event=self._handle,
             on_death=self._on_death,
             on_busy=self._on_busy,

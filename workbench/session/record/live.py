@@ -56,17 +56,17 @@ class LiveRecorder:
         self,
         folder: Path,
         on_change: Callable[[], None],
-        on_envs: Callable[[tuple[int, ...]], None],
+        on_fewer_envs: Callable[[tuple[int, ...]], None],
         on_recovered: Callable[[str], None] = lambda message: None,
     ) -> None:
         """
         Args:
             on_change: called when `status` has changed, from any thread.
-            on_envs: called with the envs that still need capturing, when these are fewer; from a thread of its own.
+            on_fewer_envs: called with the envs that still need capturing, when these are fewer; from a thread of its own.
             on_recovered: called with a message about unfinished episodes of an earlier session, from a thread of its own.
         """
         self._folder = folder
-        self._on_change, self._on_envs, self._on_recovered = on_change, on_envs, on_recovered
+        self._on_change, self._on_fewer_envs, self._on_recovered = on_change, on_fewer_envs, on_recovered
         self._lock = threading.Lock()
         self._env_idx: tuple[int, ...] = ()
         self._gatherer: EpisodeGatherer | None = None
@@ -180,14 +180,14 @@ class LiveRecorder:
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
             # `_env_idx` stays as it is from here on: another recording may have started by now.
-            self._on_envs(())
+            self._on_fewer_envs(())
             self._on_change()
             return
         left = gatherer.env_idx
         if left != before:
             with self._lock:
                 self._env_idx = tuple(env for env in self._env_idx if env in left)
-            self._on_envs(left)
+            self._on_fewer_envs(left)
             self._on_change()
 
     def _recover(self) -> None:
