@@ -90,7 +90,7 @@ class Library:
         self._index: LibraryIndex | None = LibraryIndex(self.folder) if self.folder.is_dir() else None
         self._kept: dict[str, IndexedFiles] = {} if self._index is None else self._index.load()
         self._stopping = threading.Event()
-        self._asked = threading.Event()
+        self._scan_requested = threading.Event()
         self._thread: threading.Thread | None = None
 
     # --- the table ---------------------------------------------------------------------------------
@@ -123,12 +123,12 @@ class Library:
 
     def request_scan(self) -> None:
         """Have the watching thread check every file now."""
-        self._asked.set()
+        self._scan_requested.set()
 
     def close(self) -> None:
         """Stop watching; returns when the thread has ended."""
         self._stopping.set()
-        self._asked.set()
+        self._scan_requested.set()
         if self._thread is not None:
             self._thread.join(timeout=10.0)
         with self._changing:
@@ -140,14 +140,14 @@ class Library:
         while not self._stopping.is_set():
             began = time.monotonic()
             try:
-                self.refresh(thorough=self._asked.is_set())
+                self.refresh(thorough=self._scan_requested.is_set())
             except Exception:
                 # If the thread ended, the table would never change again.
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
-            self._asked.clear()
+            self._scan_requested.clear()
             # Scan at most a tenth of the time: a huge folder that is written to would keep the thread busy.
-            self._asked.wait(min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
+            self._scan_requested.wait(min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
 
     def refresh(self, thorough: bool = True) -> None:
         """Read the files that changed since the last call.
