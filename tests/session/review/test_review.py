@@ -308,7 +308,7 @@ def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: Non
     library = Library(tmp_path)
     library.refresh()
     review = Review(library)
-    view = opened(review, library.rows()[0].id)
+    view = opened(review, library.view().rows[0].id)
     one = view.opened[0]
     assert one.has_scene and one.length == 4 and one.first("success") == 3
     assert np.allclose(poses_of(one.episode)[:, 3, 0], np.arange(5) * 0.01)
@@ -333,7 +333,7 @@ def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) 
     broken.with_suffix(".h5").write_bytes(b"")
     library = Library(tmp_path)
     library.refresh()
-    rows = {row.seed: row for row in library.rows()}
+    rows = {row.seed: row for row in library.view().rows}
     review = Review(library)
     review.open([rows[1].id, rows[2].id])
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the half one")

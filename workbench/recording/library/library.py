@@ -98,9 +98,6 @@ class Library:
     def view(self) -> LibraryView:
         return self._view
 
-    def rows(self) -> tuple[LibraryRow, ...]:
-        return self._view.rows
-
     def row(self, id: str) -> LibraryRow | None:
         """None if the id is not in the table."""
         return self._by_id.get(id)
@@ -313,7 +310,7 @@ class Library:
                     f"{clean_text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
                     "deleted from here: delete the folder."
                 )
-            of_file = {row.id for row in self.rows() if row.place[0] == key}
+            of_file = {row.id for row in self._view.rows if row.place[0] == key}
             if not selected >= of_file:
                 raise LibraryError(
                     f"{clean_text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "

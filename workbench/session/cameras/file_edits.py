@@ -291,7 +291,7 @@ class FileEdits:
     def failed_to_load(self) -> None:
         """A version failed to load; the lock is held."""
         if self._copied is not None:
-            why = f"{self._copied} was made, but does not load: mend or delete it."
+            why = f"{self._copied} was made, but does not load: fix or delete it."
             self.view = EditState("refused", self.view.request, message=why)
         edit, undone = self.view.edit, self.view.stage == "undone"
         if self.view.loading and edit is not None:

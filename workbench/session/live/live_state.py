@@ -323,11 +323,11 @@ class LiveState:
     def policy_saved(self) -> ReadPolicyAgain:
         """Clear a problem of the policy; playing resumes if that problem had stopped it."""
         problem = self.now.problem
-        mended = problem is not None and problem.stage == "policy"
-        if mended:
+        policy_failed = problem is not None and problem.stage == "policy"
+        if policy_failed:
             self.set_problem(None)
             self._set_running()
-        return ReadPolicyAgain(play=mended and self.wants_play)
+        return ReadPolicyAgain(play=policy_failed and self.wants_play)
 
     # --- reading -------------------------------------------------------------------------------------
 

@@ -36,7 +36,7 @@ class RecordingStatus:
     being_written: int = 0
     """Ended episodes whose files are being made."""
     recovered: tuple[str, ...] = ()
-    """.rrd files of episodes that an earlier server left unfinished, repaired at the start."""
+    """.rrd files of episodes that an earlier server left unfinished, recovered at the start."""
     folder: str = ""
     last_file: str | None = None
     problem: str | None = None
@@ -191,13 +191,13 @@ class LiveRecorder:
             self._on_change()
 
     def _recover(self) -> None:
-        """Repair episodes that an earlier server left unfinished; on the finisher's thread, before all else."""
+        """Recover episodes that an earlier server left unfinished; on the finisher's thread, before all else."""
         if not self._folder.is_dir():
             return
         try:
             recovered = [str(file) for file in recover_confined(self._folder)]
         except RecordingError as error:
-            message = f"what an earlier recording left could not be mended: {error}"
+            message = f"what an earlier recording left could not be recovered: {error}"
             with self._lock:
                 self._problem = message
         else:

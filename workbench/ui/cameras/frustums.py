@@ -131,7 +131,11 @@ class CameraFrustums:
                 add, "wxyz", "position", "scale", "fov", "aspect", "thickness"
             )
         frustum.draw(wxyz, position, size, fov, aspect, thickness)
-        if picture is not None and picture is not self._drawn_pictures.get(camera.key) and picture.rgb is not None:
+        if (
+            picture is not None
+            and picture is not self._drawn_pictures.get(camera.key)
+            and picture.rgb is not None
+        ):
             # Assigning encodes and sends it, even the same picture.
             self._drawn_pictures[camera.key] = picture
             frustum.handle.image = small_image(picture)

@@ -70,7 +70,7 @@ class LibraryEdits:
             removed = [tag for tag in shared if tag not in tags]
             self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
 
-        known = sorted({tag for row in self._library.rows() for tag in row.tags})
+        known = sorted({tag for row in self._library.view().rows for tag in row.tags})
         explained = "Words, with commas between them."
         if len(rows) > 1:
             explained += " Those that all of them have stand here; others that they have stay."

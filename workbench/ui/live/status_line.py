@@ -160,7 +160,7 @@ def _news(view: SessionView) -> str:
 class RulesMark(PagePart[SessionView]):
     """The mark of broken rules below the status line; a press opens the list.
 
-    A broken rule that only warns stops nothing, so the mark stays until the file is mended.
+    A broken rule that only warns stops nothing, so the mark stays until the file is fixed.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
