@@ -337,7 +337,7 @@ def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page)
     choose(page, "base_camera · sensor")
     until(lambda: picture(page) != "", "the picture")
     press(page, "¼")
-    expect(page.get_by_text("The picture is 32 × 32 for a quick look")).to_be_visible()
+    expect(page.get_by_text("The preview is 32 × 32")).to_be_visible()
     image = page.locator("img[src^='blob:']:visible").first
     until(lambda: image.evaluate("e => e.naturalWidth") == 32, "the small picture")
     by_matrix = page.get_by_role("button", name="Place the camera by it")

@@ -144,7 +144,7 @@ def test_size_and_lens_change_the_live_camera_and_the_observation(session: Sessi
     wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
 
 
-def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
+def test_a_preview_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
     start = camera(session, BASE).now
     session.studio.set_preview_scale(0.25)
     there = replace(start, position=(0.31, 0.02, 0.55))

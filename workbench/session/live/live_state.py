@@ -156,7 +156,7 @@ class LiveState:
             self._set_running()
 
     def take(self, event: Event) -> None:
-        """Any other event."""
+        """Events other than `Loaded`, `Stepped`, `Answer` and `Progress`, which `Session._handle` passes on elsewhere."""
         now = self.now
         if isinstance(event, Loading):
             self.set(state="loading", activity=event.activity)

@@ -14,6 +14,7 @@ from workbench.session.protocol.messages import EpisodeEnd
 from workbench.ui.server.control_values import limit_text
 from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import render
 
 UNBOUNDED = 1.0
 """A dimension without bounds gets a slider from -1 to 1."""
@@ -171,10 +172,7 @@ class RunPanel(PagePart[SessionView]):
                 settle=0.8,
             )
             limit_text(self._policy.handle, 500)
-            self._policy_hint = gui.add_html(
-                '<div class="wb-note">Type <code>module:function</code> or <code>file.py:function</code>. '
-                "It is called with the observation and returns the action.</div>"
-            )
+            self._policy_hint = gui.add_html(render("policy_hint"))
             self._sliders = ActionSliders(server, session)
 
     # --- keys and buttons ------------------------------------------------------------------------
