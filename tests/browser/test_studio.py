@@ -179,7 +179,7 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     page.keyboard.press("Enter")
     # The row is replaced, and what was walked to has the focus in the new one.
     until(lambda: page.evaluate(at) == ["eye and target", "true"], "the other way to place")
-    expect(page.get_by_text("the camera goes on looking at its target")).to_be_visible()
+    expect(page.get_by_text("the camera keeps looking at its target")).to_be_visible()
     page.locator("//label[text()='Eye']/ancestor::*[.//input][1]//input").first.fill("0.6")
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "Eye") == [0.6, 0, 0.6], "the eye")

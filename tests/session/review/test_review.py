@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,8 +55,9 @@ class Shelf:
     now: float = 0.0
     extra: dict[str, tuple[Path, ...]] = field(default_factory=dict)
 
-    def rows(self) -> list[Row]:
-        return [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
+    def view(self) -> SimpleNamespace:
+        rows = [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
+        return SimpleNamespace(rows=rows)
 
     def read(self, row: Row, shapes: SharedShapes) -> Episode:
         found = self.episodes[row.id]

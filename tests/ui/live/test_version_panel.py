@@ -59,7 +59,9 @@ def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: P
     panel.draw(running(4, reload=good, stale=True, state="error", refused=problem()))
     told = panels.html()
     assert (
-        told.index("not loaded") < told.index("The version before it goes on") < told.index("only evaluate")
+        told.index("not loaded")
+        < told.index("The version before it still runs")
+        < told.index("only evaluate")
     )
     assert "push.py, line 88" in told and "KeyError" in told
     panel.draw(running(4, reload=good, stale=True, state="loading", refused=problem()))

@@ -164,7 +164,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
     """
     from workbench.recording.writing.journal import FOLDER  # with Arrow, which a server need not wait for
 
-    failed = f"Cannot recover what lies in {folder}: "
+    failed = f"Cannot recover the recordings in {folder}: "
     try:
         if not any(os.scandir(folder / FOLDER)):
             return ()

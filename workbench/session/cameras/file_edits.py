@@ -229,7 +229,9 @@ class FileEdits:
         went_back = self._update_placements(request, None if had is None else had.settings)
         if self.view.stage == "undone":
             back = (
-                f" {request.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
+                f" {request.key[1]} is where the file places it; Undo puts it where you placed it."
+                if went_back
+                else ""
             )
             self._set_state(f"{edit.names} {restored_text(edit)} before.{back}", "undone")
         elif wrong := mismatch(request, infos, edit.settings):

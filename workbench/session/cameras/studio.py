@@ -279,7 +279,7 @@ class CameraStudio:
                 names = " and ".join(key[1] for key in dropped)
                 one = len(dropped) == 1
                 self._cameras.problem = (
-                    f"{names} {'was' if one else 'were'} changed in the file, so {'it stands' if one else 'they stand'} "
+                    f"{names} {'was' if one else 'were'} changed in the file, so {'it is' if one else 'they are'} "
                     "where the file says; Undo brings your placement back."
                 )
             if self._cameras.selected is not None and self._cameras.info(self._cameras.selected) is None:

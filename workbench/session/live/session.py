@@ -215,7 +215,7 @@ class Session:
         with self._lock:
             request = self._state.policy_saved()
         # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
-        self._log("the policy's file was saved: it is read anew")
+        self._log("the policy's file was saved: it is read again")
         self._notify()
         self._send(request)
 

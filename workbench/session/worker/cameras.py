@@ -89,7 +89,7 @@ class WorkerCameras:
     changes the scene, `settle` finishes the picture under way and places the cameras that wait.
 
     A picture takes 25 to 90 ms on a software renderer; drawn in one go between two steps it would halve the step rate. So
-    a picture is begun, steps go on, and it is fetched when it should be ready by the time that the last ones took (see
+    a picture is begun, steps continue, and it is fetched when it should be ready by the time that the last ones took (see
     `begin_pictures`). Sensors come before human cameras, since the two see different objects and cannot be drawn at once,
     and each kind is sent as soon as it is ready. At most 15 rounds a second, each with a proportional pause, leave the
     browser on the same machine its share. A camera that is being dragged is drawn next, alone and without a pause.

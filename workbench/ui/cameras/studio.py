@@ -45,13 +45,13 @@ TURN = 1.0
 """Degrees by which a key turns it."""
 PLACE = (
     "move, turn: its pose. Move it, and what it looks at goes along; or turn it.\n"
-    "eye and target: move the eye, and it goes on looking at its target; or move the target."
+    "eye and target: move the eye, and it keeps looking at its target; or move the target."
 )
 ALONG = "Along which axes it is moved and turned. The camera's own: red is forward, green left, blue up."
 STEPS = "The step size of a drag."
 SIZE = "Of the preview above. The camera keeps its own."
 VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
-IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
+IN_ITS_EYE = "You look from its position. Move the view, and its handles appear."
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class StudioPanel(PagePart[SessionView]):
         self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NO_CAMERA, visible=False),
             read=lambda name: self._names.get(name),
-            send=self.select,
+            send=session.studio.select,
             shown=self._name_of,
         )
         self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))

@@ -164,7 +164,7 @@ def busy_html(busy: Busy, view: SessionView) -> str:
     """The banner's content."""
     if busy.ignores_interrupt:
         advice = (
-            "It was interrupted and goes on: it is in native code, or it catches every exception. Restart ends the "
+            "It was interrupted and continues: it is in native code, or it catches every exception. Restart ends the "
             "process; the last good version comes back where it was."
         )
     elif busy.drawing:

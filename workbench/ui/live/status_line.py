@@ -144,7 +144,7 @@ def _doing(busy: Busy) -> str:
         return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
     if busy.held:
         at = f" at {place(busy)}" if busy.file else ""
-        return f"by a debugger{at} for {busy.seconds:.0f} s; it goes on from there, not from this page"
+        return f"by a debugger{at} for {busy.seconds:.0f} s; continue from there, not from this page"
     if busy.getting_ready:
         return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"

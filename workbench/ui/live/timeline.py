@@ -164,7 +164,7 @@ class TimelinePanel(TimeBar[SessionView]):
         # last row is cut off until then, and a second press on "step" would hit another button.
         self._hint = gui.add_html("")
         self._travel = gui.add_button_group("", (GO_ON,), visible=False)
-        name_control(self._travel, "way to go on")
+        name_control(self._travel, "way to continue")
 
     # --- buttons and keys --------------------------------------------------------------------------
 

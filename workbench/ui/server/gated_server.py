@@ -247,7 +247,7 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
         if listening.loopback
         else (
             f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can send "
-            "requests, and the token and everything on the page travel unencrypted. Whoever has the address with the "
+            "requests, and the token and everything on the page travel unencrypted. Anyone with the address and its "
             "token can run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
         ),
         notice=None

@@ -181,7 +181,7 @@ def _counted(
         yield picture
 
 
-# --- Making in a process of its own, while the page goes on ------------------------------------
+# --- Making in a process of its own, while the page continues ------------------------------------
 
 
 END_SECONDS = 5.0
