@@ -23,7 +23,7 @@ class StillSession:
 
 def test_level_reason_and_time_are_said() -> None:
     html = version_html(ReloadReport("patched", "only evaluate changed"), 43.2, loaded=True)
-    assert "patched" in html and "43 ms" in html and "only evaluate changed" in html and "go on" in html
+    assert "patched" in html and "43 ms" in html and "only evaluate changed" in html and "continue" in html
 
 
 def test_what_a_build_could_not_carry_is_named_up_to_a_number() -> None:

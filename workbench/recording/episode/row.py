@@ -14,7 +14,7 @@ SourceKind = Literal["workbench", "maniskill", "lerobot"]
 
 
 class UnreadableRecording(ValueError):
-    """A broken recording, or a file that is none; the message is a sentence that says what is wrong."""
+    """A broken recording, or a file that is not a recording; the message is a sentence that says what is wrong."""
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def index_path(folder: Path) -> Path:
 
 
 def _open(path: Path) -> sqlite3.Connection:
-    """Open or create the index, replacing a file that is none; in memory if `path` is not writable."""
+    """Open or create the index, replacing a file that is not an index; in memory if `path` is not writable."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(2):
