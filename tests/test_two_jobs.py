@@ -211,7 +211,9 @@ def test_of_two_that_record_into_one_folder_one_is_killed(tmp_path: Path) -> Non
         (folder / "next.may").touch()
         third = ending.enter_context(recording(folder, "next", 6))
         said, _ = third.communicate(timeout=PATIENCE)
-        assert third.returncode == 0 and re.search("1 episode that an earlier recording left .* mended", said)
+        assert third.returncode == 0 and re.search(
+            "1 episode that an earlier recording left .* recovered", said
+        )
     episodes = {episode.info.seed: episode for episode in map(read_episode, (folder / "out").glob("*.json"))}
     assert sorted(episodes) == [6, 7, 9] and not journals.exists()
     assert episodes[9].info.recovered and not episodes[6].info.recovered

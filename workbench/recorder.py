@@ -87,7 +87,7 @@ class Recorder(gym.Wrapper):
         """
         Args:
             env: as `workbench.make` gives it.
-            folder: created if it is missing. Half-written files of an earlier recording in it are repaired.
+            folder: created if it is missing. Half-written files of an earlier recording in it are recovered.
             env_idx: which envs; None for all.
             pictures: record every camera at every step, or the cameras of these names. Sensors that the env observes are
                 rendered already; any other picture takes 25 to 50 ms without a GPU.
@@ -110,8 +110,8 @@ class Recorder(gym.Wrapper):
         self._folder, self._envs, self._pictures = Path(folder).absolute(), chosen, pictures
         self._acted_by = acted_by
         if self._folder.is_dir():
-            mended = [str(files.rrd) for files in recover(self._folder)]
-            if notice := recovered_text(mended):
+            recovered = [str(files.rrd) for files in recover(self._folder)]
+            if notice := recovered_text(recovered):
                 logger.warning("%s", notice)
         self._task = TaskEnv(base)
         self._finisher = EpisodeFinisher()

@@ -147,7 +147,7 @@ def one_way(desk: Desk, way: str) -> str:
             desk.page.screenshot(path=desk.options.screenshot, type="jpeg", quality=82)
         desk.click("Interrupt")
         if HANGS[way] == "Restart":
-            deaf = desk.poke_until(lambda: desk.says("was interrupted and goes on"), trips)
+            deaf = desk.poke_until(lambda: desk.says("was interrupted and continues"), trips)
             said += f"deaf after {deaf:.1f} s; "
             calm(desk.file)
             desk.click("Restart")

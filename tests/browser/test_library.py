@@ -197,7 +197,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     page.get_by_role("button", name="Cancel").focus()
     page.keyboard.press("Enter")
     expect(page.get_by_text("Delete 1 recording (3 files")).to_be_hidden()
-    assert len(shown.opened) == opened and len(shown.library.rows()) == COUNT
+    assert len(shown.opened) == opened and len(shown.library.view().rows) == COUNT
     page.keyboard.press("Delete")
     expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
     page.keyboard.press("Escape")

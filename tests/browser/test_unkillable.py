@@ -51,7 +51,7 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     provoke(desk.file, "evaluate", "native")
     desk.button("Step").click()
     desk.button("Interrupt").click()
-    expect(desk.page.get_by_text(re.compile("was interrupted and goes on"))).to_be_visible()
+    expect(desk.page.get_by_text(re.compile("was interrupted and continues"))).to_be_visible()
     expect(desk.button("Interrupt")).to_be_hidden()
     calm(desk.file)
     desk.button("Restart").click()

@@ -61,7 +61,7 @@ class ScriptedWorker:
         options: WorkerOptions,
         warm_up: WarmUp,
         *,
-        greet: Callable[[], list[Request]],
+        first_requests: Callable[[], list[Request]],
         on_event: Callable[[Event], None],
         on_death: Callable[[Death], None],
         on_busy: Callable[[Busy | None], None],
@@ -69,7 +69,7 @@ class ScriptedWorker:
         output: Output,
     ) -> None:
         self._task, self._start, self._evaluate = task, poses, evaluate
-        self._greet, self._tell = greet, on_event
+        self._first_requests, self._tell = first_requests, on_event
         self._lived: list[StepResult] = []
         self._playing = False
         self._requests: queue.Queue[Request | None] = queue.Queue()
@@ -88,7 +88,7 @@ class ScriptedWorker:
         """It never dies."""
 
     def replace(self) -> None:
-        for request in self._greet():
+        for request in self._first_requests():
             self.send(request)
 
     def stop(self) -> None:

@@ -142,7 +142,7 @@ def record(folder: Path, task: str, policy: str, *arguments: str) -> None:
 def tag(folder: Path) -> None:
     library = Library(folder)
     library.refresh()
-    ids = [row.id for row in library.rows()]
+    ids = [row.id for row in library.view().rows]
     library.set_tags(ids, add=["good", "slips"])
     library.set_note(ids, "the box turns a little")
     library.close()

@@ -24,7 +24,7 @@ from workbench.recording.library.library import Library
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 
-# Recordings are read, mended and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
+# Recordings are read, recovered and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")
 
 SETS = sorted(path.name for path in GOLDEN.glob("v*"))
@@ -63,7 +63,7 @@ def test_they_are_small() -> None:
 def test_the_library_lists_them(place: Path, expected: dict[str, Any]) -> None:
     library = Library(place)
     library.refresh()
-    rows = {row.name: row for row in library.rows()}
+    rows = {row.name: row for row in library.view().rows}
     pictured = {name for name, row in rows.items() if library.thumbnails((row.id,))}
     library.close()
     assert sorted(rows) == sorted(f"{kind}/{name}" for kind in KINDS for name in expected[kind])
@@ -177,11 +177,11 @@ def test_an_unfinished_one_is_mended_by_the_next_that_records_there(
         *("record", task, "--out", folder, "--no-pictures", "--episodes", 1, "--num-envs", 1),
         *("--max-steps", 2, "--env", "render_backend=none"),
     )
-    assert code == Exit.DONE and "1 episode that an earlier recording left half written: mended" in err
+    assert code == Exit.DONE and "1 episode that an earlier recording left half written: recovered" in err
     assert not (folder / ".writing").exists()
-    ((_, mended),) = expected["recovered"].items()
+    ((_, recovered),) = expected["recovered"].items()
     found = [facts for facts in read_folder(folder).values() if facts["recovered"]]
-    assert_as_expected({"mended": found[0]}, {"mended": mended})
+    assert_as_expected({"recovered": found[0]}, {"recovered": recovered})
     assert len(found) == 1 and len(list(folder.glob("*.json"))) == 2
 
 

@@ -114,7 +114,7 @@ def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Pa
     review = Review(library, make_scene=SceneProcess())
     try:
         library.watch()
-        (row,) = until(library.rows, "its row")
+        (row,) = until(lambda: library.view().rows, "its row")
         review.open((row.id,))
         until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the word for it")
     finally:

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, Kind, LastEpisode, Outlier
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode, Outlier, OutlierKind
 
-FELL = Outlier(Kind.DROPPED, 12, "cube dropped 0.90 m")
+FELL = Outlier(OutlierKind.DROPPED, 12, "cube dropped 0.90 m")
 
 
 def rows_of(**changes: object) -> EnvRows:

@@ -65,7 +65,7 @@ def open_page(
             seconds more, and about 0.8 GB of memory less).
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
         debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
-            stops for it. Whoever else can log in to this machine can attach as well.
+            stops for it. Anyone who can log in to this machine can attach too.
         debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
         debug_wait: load the task only when a debugger has attached. Means --debug.
     """
@@ -106,7 +106,7 @@ def record(
 
     Args:
         debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
-            it. Whoever else can log in to this machine can attach as well.
+            it. Anyone who can log in to this machine can attach too.
     """
     from workbench.authoring.loading.reference import why_missing
 
@@ -308,7 +308,7 @@ def view(
 
     Args:
         files: one or more .rrd files.
-        web: a page, also where there is a screen; it asks nobody but this program.
+        web: a page, also where there is a screen; it contacts only this program.
         host: address to serve the page on.
         port: port of the page; 0 takes any free one.
     """

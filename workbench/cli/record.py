@@ -61,8 +61,8 @@ def record_in_terminal(what: RecordOptions) -> int:
     try:
         try_folder(what.out)
         requested, _ = with_given_actions(what)
-        if mended := recover_confined(what.out):
-            err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
+        if recovered := recover_confined(what.out):
+            err.print(f"{_episodes(len(recovered))} that an earlier recording left half written: recovered")
         for notice in hidden_modules_text(what.task):
             warn(notice)
         if (left_alone := unused_gpu_text(what.options.backend)) is not None:

@@ -267,7 +267,7 @@ def not_trusted_lines(error: NotTrusted) -> list[str]:
         named.append(f"    and {len(questions) - MOST_NAMED} more")
     return [
         *lines,
-        "Nothing was run: the recordings were not made by this installation, and nobody has agreed to the code that they name:",
+        "Nothing was run: the recordings were not made by this installation, and you have not agreed to run the code that they name:",
         *named,
         "Read it. Then run the command in a terminal, where you are asked, and where show prints the text; or add --trust, which "
         "agrees for this run; or name your own task file with --task.",

@@ -23,6 +23,7 @@ from workbench.jobs.policy import Policy, load_policy, policy_problem
 from workbench.jobs.task import ActionSource
 from workbench.machine.files import open_regular_file
 from workbench.machine.folders import CurrentFolder
+from workbench.recording.episode.row import Source
 from workbench.recording.reader.reading import find_trajectories, read_recording
 
 
@@ -251,7 +252,7 @@ def _array(file: IO[bytes], size: int) -> NDArray:
 def _demonstrations(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     runs, kwargs = list[RecordedRun](), dict[str, Any]()
     for name in find_trajectories(path):
-        episode = read_recording("maniskill", path, name)
+        episode = read_recording(Source(path, name))
         if episode.length == 0:
             continue
         run = run_of(episode)

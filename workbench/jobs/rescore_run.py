@@ -22,7 +22,7 @@ from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayabl
 from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import Source, UnreadableRecording
-from workbench.recording.reader.reading import read_source
+from workbench.recording.reader.reading import read_recording
 
 _PROGRESS_PERIOD = 0.2
 """Seconds."""
@@ -73,7 +73,7 @@ def rescore(
     *,
     use_env_states: bool = False,
     on_steps: Callable[[int], None] = lambda steps: None,
-    read: Callable[[Source], Episode] = read_source,
+    read: Callable[[Source], Episode] = read_recording,
 ) -> Iterator[Verdict[Source]]:
     """Rescore these episodes with the open task's code; gives a verdict for each, in the order in which they end.
 
@@ -83,7 +83,7 @@ def rescore(
     Args:
         use_env_states: restore every recorded state after its step, so that nothing drifts.
         on_steps: called with the number of control steps so far, over all episodes.
-        read: reads a file's episode; raises as `read_source`.
+        read: reads a file's episode; raises as `read_recording`.
 
     Raises:
         TaskError: the task's code raised.

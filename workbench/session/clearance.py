@@ -304,7 +304,7 @@ def code_files(content: TaskContent, before: Mapping[str, str] | None = None) ->
             since = Since.CHANGED if name in before else Since.NEW
         shown = content.main if paths[name] == content.main else name
         files.append(CodeFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
-    # Changed modules first, so that nobody has to find them in a long list.
+    # Changed modules first: they are hard to find in a long list.
     return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
 
 

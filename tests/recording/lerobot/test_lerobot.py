@@ -20,7 +20,7 @@ from workbench.recording.lerobot.format import Choice, frames_of
 from workbench.recording.lerobot.read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import find_all_sources, read_source
+from workbench.recording.reader.reading import find_all_sources, read_recording
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -206,8 +206,8 @@ def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Pa
     broken, whole = find_all_sources([tmp_path])
     assert (broken.name, whole.name) == ("broken#0", "whole#0")
     with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
-        read_source(broken)
-    np.testing.assert_array_equal(read_source(whole).action, episode.action)
+        read_recording(broken)
+    np.testing.assert_array_equal(read_recording(whole).action, episode.action)
 
 
 def test_a_dataset_is_in_the_library_an_episode_a_row(
@@ -217,11 +217,11 @@ def test_a_dataset_is_in_the_library_an_episode_a_row(
     library = Library(tmp_path)
     try:
         library.refresh()
-        first, second = library.rows()
+        first, second = library.view().rows
         assert (first.name, first.kind, first.success) == ("sets/push#0", "lerobot", False)
         assert (second.success, second.length, second.seed) == (True, episode.length, episode.info.seed)
         assert second.problem is None
-        np.testing.assert_array_equal(read_source(second.source).action, episode.action)
+        np.testing.assert_array_equal(read_recording(second.source).action, episode.action)
         with pytest.raises(LibraryError, match="delete the folder"):
             library.delete([first.id, second.id])
         assert is_lerobot(tmp_path / "sets" / "push")

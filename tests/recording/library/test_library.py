@@ -65,7 +65,7 @@ def read(folder: Path) -> list[LibraryRow]:
     library = Library(folder)
     library.refresh()
     library.close()
-    return list(library.rows())
+    return list(library.view().rows)
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -83,7 +83,7 @@ def test_a_recording_of_ours_is_a_row_with_what_its_description_says(
 ) -> None:
     describe(tmp_path / "monday", "a", id="ab12", tags=["good", "good", " "], note="slips")
     library.refresh()
-    (row,) = library.rows()
+    (row,) = library.view().rows
     assert (row.id, row.name, row.kind, row.task, row.seed, row.length) == (
         "ab12",
         "monday/a",
@@ -110,7 +110,7 @@ def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
     unfinished = make_episode().writer(tmp_path)
     files = made.write(tmp_path)
     library.refresh()
-    (row,) = library.rows()
+    (row,) = library.view().rows
     assert (row.id, row.task, row.seed, row.length) == (made.info.id, "Made-v1", 7, 5)
     assert (row.total_reward, row.success, row.problem) == (2.5, True, None)
     assert set(row.paths) == {files.json, files.h5, files.rrd}
@@ -118,7 +118,7 @@ def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
     library.set_note([row.id], "slips")
     read_back = read_episode(files.json)
     assert read_back.info == made.info and len(read_back.reward) == 5
-    assert [row.tags for row in library.rows()] == [("good",)]
+    assert [row.tags for row in library.view().rows] == [("good",)]
     unfinished.discard()
 
 
@@ -148,7 +148,7 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
         file.create_dataset("traj_0/obs/sensor_data/eye/depth", data=np.zeros((4, 2, 2, 1), np.int16))
         file.create_dataset("traj_0/obs/sensor_data/hand/rgb", data=seen, compression="gzip")
     library.refresh()
-    first, second = library.rows()
+    first, second = library.view().rows
     picture = library.thumbnails((first.id,)).get(first.id)
     assert picture is not None and library.thumbnails((second.id,)).get(second.id) is None
     with Image.open(io.BytesIO(picture)) as image:
@@ -217,13 +217,13 @@ def test_names_of_files_that_are_no_text_can_be_shown_and_deleted(tmp_path: Path
     describe(folder, os.fsdecode(b"a\xff\n"), id="aaaa")
     for _ in range(2):
         library.refresh()
-        (row,) = library.rows()
+        (row,) = library.view().rows
         row.name.encode()
     library.set_note(["aaaa"], "x")
     library.delete(["aaaa"])
-    assert library.rows() == ()
+    assert library.view().rows == ()
     library.undo_delete()
-    assert [row.note for row in library.rows()] == ["x"]
+    assert [row.note for row in library.view().rows] == ["x"]
 
 
 _anything = st.recursive(
@@ -322,7 +322,7 @@ def test_only_what_changed_is_read_again(
         (tmp_path / f"c{suffix}").unlink()
     library.refresh()
     assert read_keys == ["b"]
-    assert [(row.name, row.note) for row in library.rows()] == [("a", "a"), ("b", "changed")]
+    assert [(row.name, row.note) for row in library.view().rows] == [("a", "a"), ("b", "changed")]
     read_keys.clear()
     assert [row.note for row in read(tmp_path)] == ["a", "changed"]
     assert read_keys == []  # from the index
@@ -331,7 +331,7 @@ def test_only_what_changed_is_read_again(
 def test_a_folder_that_comes_later_is_looked_into_and_has_its_thumbnails(tmp_path: Path) -> None:
     library = Library(tmp_path / "later")
     library.refresh()
-    assert library.rows() == ()
+    assert library.view().rows == ()
     describe(tmp_path / "later", "a", id="ab12")
     library.refresh()
     assert library.thumbnails(["ab12"]) == {"ab12": jpeg()}
@@ -407,8 +407,10 @@ def test_without_a_place_for_the_index_it_is_in_memory(
     cache.write_text("no place here")
     library = Library(folder)
     library.refresh()
-    assert [row.name for row in library.rows()] == ["a"]
-    assert library.thumbnails([row.id for row in library.rows()]).keys() == {row.id for row in library.rows()}
+    assert [row.name for row in library.view().rows] == ["a"]
+    assert library.thumbnails([row.id for row in library.view().rows]).keys() == {
+        row.id for row in library.view().rows
+    }
     library.close()
 
 
@@ -432,7 +434,7 @@ def test_two_processes_at_once_have_the_same_rows(tmp_path: Path) -> None:
         "from workbench.recording.library.library import Library\n"
         "for _ in range(3):\n"
         "    library = Library(pathlib.Path(sys.argv[1])); library.refresh(); library.close()\n"
-        "print(*(row.id for row in library.rows()))\n"
+        "print(*(row.id for row in library.view().rows))\n"
     )
     running = [
         subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True)
@@ -486,7 +488,7 @@ def test_rows_are_shown_while_others_are_read_and_from_the_index_before_anything
 
         def publish(*arguments: Any, **changes: Any) -> None:
             real(*arguments, **changes)
-            seen.append((len(library.rows()), library.view().reading))
+            seen.append((len(library.view().rows), library.view().reading))
 
         library._publish = publish  # type: ignore[method-assign]
 
@@ -535,13 +537,13 @@ def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, l
     shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
     before = tree(tmp_path)
     library.refresh()
-    first, second = library.rows()
+    first, second = library.view().rows
     dates = [first.date, second.date]
     library.set_tags([second.id], add=["fast"])
     library.set_note([first.id], "odd")
-    assert [(row.tags, row.note) for row in library.rows()] == [((), "odd"), (("fast",), "")]
+    assert [(row.tags, row.note) for row in library.view().rows] == [((), "odd"), (("fast",), "")]
     assert tree(tmp_path).keys() - before.keys() == {"demo.notes"}
-    assert [row.date for row in library.rows()] == dates
+    assert [row.date for row in library.view().rows] == dates
     assert before.items() <= tree(tmp_path).items()
     assert [(row.tags, row.note) for row in read(tmp_path)] == [((), "odd"), (("fast",), "")]
     library.set_tags([second.id], remove=["fast"])
@@ -573,11 +575,11 @@ def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library:
     before = tree(tmp_path)
     library.refresh()
     library.delete(["aaaa", "cccc"])
-    assert [row.name for row in library.rows()] == ["b"] == [row.name for row in read(tmp_path)]
+    assert [row.name for row in library.view().rows] == ["b"] == [row.name for row in read(tmp_path)]
     assert {name for name in tree(tmp_path) if not name.startswith(".trash/")} == {"b.json", "b.h5", "b.rrd"}
     assert library.view().trash.files == 6
     library.undo_delete()
-    assert tree(tmp_path) == before and [row.name for row in library.rows()] == ["a", "b", "sub/c"]
+    assert tree(tmp_path) == before and [row.name for row in library.view().rows] == ["a", "b", "sub/c"]
     assert library.view().trash.files == 0
     with pytest.raises(LibraryError, match="trash is empty"):
         library.undo_delete()
@@ -604,14 +606,14 @@ def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
     library.refresh()
     before = tree(tmp_path)
-    first, second = library.rows()
+    first, second = library.view().rows
     for refused in (library.check_delete, library.delete):
         with pytest.raises(LibraryError, match="demo.h5 holds 2 recordings"):
             refused([first.id])
     assert tree(tmp_path) == before
     library.set_note([first.id], "x")
     library.delete([first.id, second.id])
-    assert library.rows() == () and library.view().trash.files == 3
+    assert library.view().rows == () and library.view().trash.files == 3
 
 
 def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, library: Library) -> None:
@@ -621,7 +623,7 @@ def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, librar
     library.refresh()
     with pytest.raises(LibraryError, match="Not everything was deleted"):
         library.delete(["aaaa"])
-    assert tree(tmp_path) == before and [row.id for row in library.rows()] == ["aaaa"]
+    assert tree(tmp_path) == before and [row.id for row in library.view().rows] == ["aaaa"]
 
 
 def test_a_trash_that_is_a_link_is_nobodys_trash(tmp_path: Path) -> None:
@@ -635,7 +637,7 @@ def test_a_trash_that_is_a_link_is_nobodys_trash(tmp_path: Path) -> None:
     try:
         assert library.view().trash.files == 0
         with pytest.raises(LibraryError, match="is a link"):
-            library.delete([row.id for row in library.rows()])
+            library.delete([row.id for row in library.view().rows])
         with pytest.raises(LibraryError):
             library.empty_trash()
         assert (folder / "a.json").exists() and (other / "2026" / "precious.txt").exists()

@@ -26,7 +26,7 @@ from tests.recording.foreign_h5 import write as write_h5
 from workbench.core.camera_data import CameraInfo, Picture
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.episode import Episode, EpisodeInfo
-from workbench.recording.episode.row import UnreadableRecording
+from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.lerobot.export import export_lerobot
 from workbench.recording.reader import reading
 from workbench.recording.reader.read_episode import read_episode
@@ -164,14 +164,12 @@ def look_at(folder: Path) -> list[str]:
             try:
                 if facts.kind == "lerobot":
                     if facts.trajectory is not None:
-                        said += opened(reading.read_recording("lerobot", path.parents[1], facts.trajectory))
+                        said += opened(reading.read_recording(Source(path.parents[1], facts.trajectory)))
                 elif facts.trajectory is not None:
-                    said += opened(
-                        reading.read_recording("maniskill", path.with_suffix(".h5"), facts.trajectory)
-                    )
+                    said += opened(reading.read_recording(Source(path.with_suffix(".h5"), facts.trajectory)))
                 else:
                     suffix = ".json" if ".json" in found.sizes else ".rrd" if ".rrd" in found.sizes else ".h5"
-                    said += opened(reading.read_recording("ours", path.with_suffix(suffix)))
+                    said += opened(reading.read_recording(Source(path.with_suffix(suffix))))
             except (UnreadableRecording, OSError) as error:
                 assert str(error)
                 said.append(str(error))

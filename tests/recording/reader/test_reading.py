@@ -21,7 +21,7 @@ from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
-from workbench.recording.episode.row import Facts, UnreadableRecording
+from workbench.recording.episode.row import Facts, Source, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader import reading
 from workbench.recording.reader.read_episode import read_episode
@@ -61,7 +61,7 @@ def test_pipes_and_devices_are_rows_and_not_waited_for(tmp_path: Path, library: 
     (tmp_path / "theirs.h5").unlink()
     (tmp_path / "theirs.h5").symlink_to("/dev/zero")
     library.refresh()
-    problems = {row.name: row.problem for row in library.rows()}
+    problems = {row.name: row.problem for row in library.view().rows}
     assert problems.pop("good") is None
     assert problems.pop("theirs#traj_0") == "theirs.h5 is a character device, not a regular file."
     assert problems == {
@@ -119,7 +119,7 @@ def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path)
 
 def test_an_episode_is_what_reading_it_here_gives(recorded: Any, tmp_path: Path) -> None:
     path = recorded.episode.write(tmp_path).json
-    here, there = read_episode(path), reading.read_recording("ours", path)
+    here, there = read_episode(path), reading.read_recording(Source(path))
     assert there.info == here.info and there.segmentation == here.segmentation
     assert there.action_names == here.action_names and there.broken_files == here.broken_files == ()
     for name in ("poses", "action", "reward", "terminated", "truncated"):
@@ -150,7 +150,7 @@ def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
     recorded: Any, tmp_path: Path
 ) -> None:
     path = recorded.episode.write(tmp_path).json
-    (camera, *_) = [c for c in reading.read_recording("ours", path).cameras if c.rgb is not None]
+    (camera, *_) = [c for c in reading.read_recording(Source(path)).cameras if c.rgb is not None]
     assert camera.rgb is not None
     before = camera.rgb[0]
     reader = psutil.Process(reader_of(tmp_path, episodes=True))
@@ -223,7 +223,7 @@ def test_an_episode_that_claims_more_memory_than_there_may_be_is_refused(
         whole["workbench"]["length"] = length
         path.write_text(json.dumps(whole))
         with pytest.raises(UnreadableRecording, match=says):
-            reading.read_recording("ours", path)
+            reading.read_recording(Source(path))
     assert psutil.Process().memory_info().rss < 3 << 30
 
 

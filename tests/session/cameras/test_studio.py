@@ -144,7 +144,7 @@ def test_size_and_lens_change_the_live_camera_and_the_observation(session: Sessi
     wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
 
 
-def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
+def test_a_preview_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
     start = camera(session, BASE).now
     session.studio.set_preview_scale(0.25)
     there = replace(start, position=(0.31, 0.02, 0.55))
@@ -230,7 +230,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     # Taken back is the placement too, and one step of undo brings it again.
     assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
     assert view.studio.edit_state.message.endswith(
-        "base_camera stands as it says; Undo puts it where you placed it."
+        "base_camera is where the file places it; Undo puts it where you placed it."
     )
     wait_until(session, seen_from(BASE, start), "the camera where the file has it")
     assert view.studio.undo == "took back the change of base_camera"
@@ -309,7 +309,7 @@ def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Pa
     task_file.write_text(good)
     wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
     wait_until(
-        session, said(lambda s: "stands where the file says" in s.problem), "that the placement is dropped"
+        session, said(lambda s: "is where the file says" in s.problem), "that the placement is dropped"
     )
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")

@@ -14,8 +14,8 @@ from workbench.core.camera_data import CameraKind, Picture
 from workbench.jobs.task import NO_MOMENT, Restored
 from workbench.session.history.history import (
     FAIL,
-    NOT_A_NUMBER,
     RESET,
+    REWARD_NONFINITE,
     SUCCESS,
     TRUNCATED,
     WENT_BACK,
@@ -294,7 +294,7 @@ def test_the_first_reward_of_an_episode_that_is_no_number_is_an_event() -> None:
         history.add(step)
     history.add(stepped(0, jumped=(0, 1, 2)))
     history.add(stepped(1))
-    assert history.events(1, 1, 99) == [(2, NOT_A_NUMBER), (4, RESET)]
+    assert history.events(1, 1, 99) == [(2, REWARD_NONFINITE), (4, RESET)]
     assert history.events(0, 1, 99) == [(4, RESET)]
 
 
@@ -382,7 +382,7 @@ def test_there_is_no_way_from_a_point_that_cannot_be_put_there() -> None:
 
 
 def test_what_may_happen_can_happen_at_once() -> None:
-    flags = (RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER)
+    flags = (RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE)
     assert all(sum(bool(one & other) for other in flags) == 1 for one in flags)
 
 

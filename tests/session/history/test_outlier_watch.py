@@ -9,7 +9,13 @@ import pytest
 
 from tests.ui.scenes import step_of, table_scene
 from workbench.jobs.task import Stepped
-from workbench.session.history.env_table import FASTEST, EnvTable, Kind, OutlierWatch, lowest_still_point
+from workbench.session.history.env_table import (
+    FASTEST,
+    EnvTable,
+    OutlierKind,
+    OutlierWatch,
+    lowest_still_point,
+)
 from workbench.session.history.history import History
 
 
@@ -24,7 +30,7 @@ def test_a_body_that_a_reset_puts_elsewhere_has_not_moved() -> None:
     assert not table.env_rows().outliers
     back = replace(step_of(poses), elapsed_steps=np.array([2, 9], np.int32))
     table.add(Stepped(back, np.zeros(2, bool)))
-    assert [o.kind for o in table.env_rows().outliers[0]] == [Kind.FAST]
+    assert [o.kind for o in table.env_rows().outliers[0]] == [OutlierKind.FAST]
 
 
 def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np.ndarray]:
@@ -32,7 +38,7 @@ def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np
     return OutlierWatch(geometry, step_of(poses), 0.05, reward_mode), poses
 
 
-def found(watch: OutlierWatch, poses: np.ndarray) -> dict[Kind, list[int]]:
+def found(watch: OutlierWatch, poses: np.ndarray) -> dict[OutlierKind, list[int]]:
     return {sight.kind: np.flatnonzero(sight.envs).tolist() for sight in watch.check(step_of(poses))}
 
 
@@ -49,8 +55,8 @@ def test_a_drop_is_measured_from_where_the_episode_began() -> None:
     lower = lowered(high, 0.8, [1])
     watch.begin(np.array([False, True, False]), step_of(lower))
     assert found(watch, lower) == {}, "env 1 begins 0.8 m lower: that is no drop"
-    assert found(watch, lowered(high, 0.8, [0, 1, 2])) == {Kind.DROPPED: [0, 2]}
-    assert found(watch, lowered(lower, 0.51, [1])) == {Kind.DROPPED: [1]}
+    assert found(watch, lowered(high, 0.8, [0, 1, 2])) == {OutlierKind.DROPPED: [0, 2]}
+    assert found(watch, lowered(lower, 0.51, [1])) == {OutlierKind.DROPPED: [1]}
 
 
 def test_only_envs_that_begin_are_forgiven_how_they_came_there() -> None:
@@ -58,11 +64,11 @@ def test_only_envs_that_begin_are_forgiven_how_they_came_there() -> None:
     far = poses.copy()
     far[:, 3, 0] += 5.0
     watch.begin(np.array([False, True, False]), step_of(far))
-    assert found(watch, far) == {Kind.FAST: [0, 2]}
+    assert found(watch, far) == {OutlierKind.FAST: [0, 2]}
     assert found(watch, far) == {}, "and they stand still now"
 
 
-@pytest.mark.parametrize(("by", "expected"), [(0.49, {}), (0.51, {Kind.DROPPED: [1]})])
+@pytest.mark.parametrize(("by", "expected"), [(0.49, {}), (0.51, {OutlierKind.DROPPED: [1]})])
 def test_a_drop_less_than_off_a_table_is_none(by: float, expected: dict) -> None:
     watch, poses = watched(2)
     high = lowered(poses, -2.0, [0, 1])
@@ -76,12 +82,12 @@ def test_the_worst_body_is_named_with_how_bad_it_is() -> None:
     there[1, 2, 1] += 1.5
     there[1, 3, 0] -= 2.0
     [sight] = watch.check(step_of(there))
-    assert (sight.kind, sight.reason(1)) == (Kind.FAST, "cube moved at 40 m/s")
+    assert (sight.kind, sight.reason(1)) == (OutlierKind.FAST, "cube moved at 40 m/s")
     watch, poses = watched(2)
     high = lowered(poses, -3.0, [0, 1])
     watch.begin(np.ones(2, bool), step_of(high))
     [sight] = watch.check(step_of(lowered(high, 0.75, [0])))
-    assert (sight.kind, sight.reason(0)) == (Kind.DROPPED, "cube dropped 0.75 m")
+    assert (sight.kind, sight.reason(0)) == (OutlierKind.DROPPED, "cube dropped 0.75 m")
 
 
 def test_under_the_floor_is_so_far_below_the_lowest_that_stands_still() -> None:
@@ -89,7 +95,7 @@ def test_under_the_floor_is_so_far_below_the_lowest_that_stands_still() -> None:
     geometry, _ = table_scene(2)
     floor = lowest_still_point(geometry, poses)
     there = poses.copy()
-    for z, expected in ((floor - 0.19, []), (floor - 0.21, [Kind.UNDER_FLOOR])):
+    for z, expected in ((floor - 0.19, []), (floor - 0.21, [OutlierKind.UNDER_FLOOR])):
         there[1, 2, 2] = z
         watch.begin(np.ones(2, bool), step_of(there))
         assert list(found(watch, there)) == expected
@@ -169,7 +175,7 @@ def test_poses_that_are_lost_are_named_and_bodies_that_were_never_there_are_not(
 
 def test_a_speed_below_the_limit_is_none() -> None:
     geometry, poses = table_scene(1)
-    for speed, expected in ((0.99 * FASTEST, []), (1.01 * FASTEST, [Kind.FAST])):
+    for speed, expected in ((0.99 * FASTEST, []), (1.01 * FASTEST, [OutlierKind.FAST])):
         watch = OutlierWatch(geometry, step_of(poses), 0.05, "dense")
         there = poses.copy()
         there[0, 3, 1] += speed * 0.05

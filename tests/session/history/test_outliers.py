@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, live_session, wait_until
-from workbench.session.history.env_table import Kind, Outcome
-from workbench.session.history.history import NOT_A_NUMBER
+from workbench.session.history.env_table import Outcome, OutlierKind
+from workbench.session.history.history import REWARD_NONFINITE
 from workbench.session.live.session import Session
 
 BROKEN = '''
@@ -100,13 +100,13 @@ def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -
 def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each: Session) -> None:
     found = {env: {o.kind for o in outliers} for env, outliers in one_of_each.env_rows().outliers.items()}
     assert found == {
-        1: {Kind.FAST},
-        2: {Kind.NOT_A_NUMBER},
-        3: {Kind.UNDER_FLOOR, Kind.DROPPED},
-        4: {Kind.DROPPED},
-        5: {Kind.REWARD},
-        6: {Kind.NOT_A_NUMBER},
-        7: {Kind.NOT_A_NUMBER},
+        1: {OutlierKind.FAST},
+        2: {OutlierKind.NOT_A_NUMBER},
+        3: {OutlierKind.UNDER_FLOOR, OutlierKind.DROPPED},
+        4: {OutlierKind.DROPPED},
+        5: {OutlierKind.REWARD},
+        6: {OutlierKind.NOT_A_NUMBER},
+        7: {OutlierKind.NOT_A_NUMBER},
     }
 
 
@@ -120,7 +120,7 @@ def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is NaN", 1)
     assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is NaN or infinite", 2)
     one_of_each.change(selected_env=6)
-    [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
+    [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & REWARD_NONFINITE]
     assert odd[0] == one_of_each.view().timeline.first + 1
 
 

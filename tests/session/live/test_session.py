@@ -185,7 +185,7 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     for action in ("0.25", "0.75"):
         policy.write_text(text.format(action))
         wait_until(session, lambda v, a=float(action): np.allclose(v.step.action, a), "the new one's action")
-    assert sum("it is read anew" in text for text in session.view().printed.texts) >= 2
+    assert sum("it is read again" in text for text in session.view().printed.texts) >= 2
     policy.write_text(text.format("0.25 +"))
     view = wait_until(session, lambda v: v.problem is not None and not v.playing, "the problem")
     assert (view.problem.stage, view.problem.file, view.problem.line) == ("policy", str(policy), 2)

@@ -44,7 +44,7 @@ class Minded:
         self.worker = Supervisor(
             options,
             WarmUp(OPTIONS),
-            greet=self._greet,
+            first_requests=self._first_requests,
             on_event=self._take,
             on_death=self.deaths.append,
             on_busy=self.busy.append,
@@ -52,7 +52,7 @@ class Minded:
             output=lambda stream, piece: False,
         )
 
-    def _greet(self) -> list[Request]:
+    def _first_requests(self) -> list[Request]:
         self.greeted += 1
         return [do(f"say hello {self.greeted}"), *self.greeting]
 
@@ -310,19 +310,19 @@ def test_of_the_last_that_a_worker_sent_what_cannot_be_taken_is_told_and_a_new_o
 
 def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
     with minded() as one:
-        greet = one.worker._greet
+        first_requests = one.worker._first_requests
         failures = iter(range(2))
 
         def fails() -> list[Request]:
             if next(failures, None) is not None:
                 raise RuntimeError("nothing to say")
-            return greet()
+            return first_requests()
 
-        one.worker._greet = fails
+        one.worker._first_requests = fails
         one.worker.replace()
         one.until_dead(3)
         assert [death.why for death in one.deaths[1:]] == [
-            "was lost by the thread that minds it (RuntimeError: nothing to say)"
+            "was lost by the thread that supervises it (RuntimeError: nothing to say)"
         ] * 2
         assert [death.gives_up for death in one.deaths] == [False, False, False]
         one.until_greeted(2)
@@ -331,15 +331,15 @@ def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytes
 
 def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody_asks() -> None:
     with minded() as one:
-        greet = one.worker._greet
+        first_requests = one.worker._first_requests
         failures = iter(range(3))
 
         def fails() -> list[Request]:
             if next(failures, None) is not None:
                 raise RuntimeError("nothing to say")
-            return greet()
+            return first_requests()
 
-        one.worker._greet = fails
+        one.worker._first_requests = fails
         one.worker.replace()
         one.until_dead(4)
         assert [death.gives_up for death in one.deaths] == [False, False, False, True]
@@ -368,7 +368,7 @@ def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
         one.until_greeted(1)
         assert [death.gives_up for death in one.deaths] == [False, False, True, False]
         assert {death.why for death in one.deaths} == {
-            "was lost by the thread that minds it (OSError: no more processes)"
+            "was lost by the thread that supervises it (OSError: no more processes)"
         }
     finally:
         one.worker.stop()

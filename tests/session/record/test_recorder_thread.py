@@ -1,4 +1,4 @@
-"""The recorder's own threads: what it mends at the start, and what it does when something of it fails."""
+"""The recorder's own threads: what it recovers at the start, and what it does when something of it fails."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
     try:
         until(lambda: said, "a word of it")
         (rrd,) = tmp_path.glob("*.rrd")
-        assert said == [f"1 episode that an earlier session left half written was mended: {rrd}"]
+        assert said == [f"1 episode that an earlier session left half written was recovered: {rrd}"]
         assert recorder.status().recovered == (str(rrd),)
         assert rrd.name in recording_html(recorder.status())
     finally:
@@ -60,7 +60,7 @@ def test_what_is_stopped_in_the_middle_of_an_episode_is_written(child_process: N
 
 def test_of_many_that_were_mended_three_are_named() -> None:
     assert recovered_text([]) == ""
-    said = "4 episodes that an earlier session left half written were mended: a, b, c and 1 more"
+    said = "4 episodes that an earlier session left half written were recovered: a, b, c and 1 more"
     assert recovered_text(list("abcd")) == said
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,8 +55,9 @@ class Shelf:
     now: float = 0.0
     extra: dict[str, tuple[Path, ...]] = field(default_factory=dict)
 
-    def rows(self) -> list[Row]:
-        return [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
+    def view(self) -> SimpleNamespace:
+        rows = [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
+        return SimpleNamespace(rows=rows)
 
     def read(self, row: Row, shapes: SharedShapes) -> Episode:
         found = self.episodes[row.id]
@@ -308,7 +310,7 @@ def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: Non
     library = Library(tmp_path)
     library.refresh()
     review = Review(library)
-    view = opened(review, library.rows()[0].id)
+    view = opened(review, library.view().rows[0].id)
     one = view.opened[0]
     assert one.has_scene and one.length == 4 and one.first("success") == 3
     assert np.allclose(poses_of(one.episode)[:, 3, 0], np.arange(5) * 0.01)
@@ -333,7 +335,7 @@ def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) 
     broken.with_suffix(".h5").write_bytes(b"")
     library = Library(tmp_path)
     library.refresh()
-    rows = {row.seed: row for row in library.rows()}
+    rows = {row.seed: row for row in library.view().rows}
     review = Review(library)
     review.open([rows[1].id, rows[2].id])
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the half one")

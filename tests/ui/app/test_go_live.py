@@ -81,7 +81,7 @@ def desk(
     place = Workplace(gated_server, folder, no_other, TaskOptions(), session=live)
     library, review = place.shelf.library, place.shelf.review
     library.refresh()
-    review.open([row.id for row in sorted(library.rows(), key=lambda row: row.seed or 0)])
+    review.open([row.id for row in sorted(library.view().rows, key=lambda row: row.seed or 0)])
     until(lambda: len(review.view().opened) == 2, "the recordings", seen=lambda: review.view().problems)
     desk = Desk(place, live, other, panels)
     yield desk

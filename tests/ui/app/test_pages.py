@@ -94,7 +94,7 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
     place.pages.start("review")
     try:
         until(lambda: "can be seen again" in " ".join(place.shelf.review.view().problems), "the word for it")
-        until(lambda: [row.seed for row in place.shelf.library.rows()] == [8], "its row")
+        until(lambda: [row.seed for row in place.shelf.library.view().rows] == [8], "its row")
     finally:
         place.close()
 
@@ -113,7 +113,7 @@ def test_what_is_open_in_the_review_is_open_when_one_comes_back(place: Workplace
     place.pages.start("review")
     review, library = place.shelf.review, place.shelf.library
     library.refresh()
-    review.open([library.rows()[0].id])
+    review.open([library.view().rows[0].id])
     place.pages.show("live")
     assert place.pages.wait_for("live", timeout=60)
     place.pages.show("review")

@@ -49,7 +49,7 @@ class Shown:
         self.page.redraw()
 
     def open(self, *seeds: int) -> None:
-        rows = {-1 if row.seed is None else row.seed: row.id for row in self.library.rows()}
+        rows = {-1 if row.seed is None else row.seed: row.id for row in self.library.view().rows}
         self.review.open([rows[seed] for seed in seeds])
         until(
             lambda: len(self.review.view().opened) == len(seeds) and not self.review.view().loading,
@@ -252,7 +252,7 @@ def test_what_is_known_of_a_recording_is_told_and_what_is_not_is_left_out(shown:
 
 def test_a_scene_is_framed_as_it_was_drawn_while_another_recording_comes(shown: Shown) -> None:
     shown.open(1)
-    shown.review.open(tuple(row.id for row in shown.library.rows() if row.seed in (1, 2)))
+    shown.review.open(tuple(row.id for row in shown.library.view().rows if row.seed in (1, 2)))
     until(lambda: len(shown.review.view().opened) == 2, "the other recording")
     shown.panels.command("Frame what is shown")
     shown.draw()

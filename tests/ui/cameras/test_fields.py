@@ -152,7 +152,7 @@ def test_an_eye_is_typed_alone_where_there_are_two_handles(desk: Desk) -> None:
     now = desk.types("Eye", (0.6, 0.0, 0.61))
     assert now.position == (0.6, 0.0, 0.61)
     np.testing.assert_allclose(target_of(now), TARGET, atol=1e-9)
-    assert "goes on looking at its target" in desk.panels.html("wb-")
+    assert "keeps looking at its target" in desk.panels.html("wb-")
     assert desk.panels.shows("Target") and not desk.panels.shows("Looks at")
 
 

@@ -249,14 +249,14 @@ def test_tags_note_and_deletion_are_asked_for_and_done(
     assert json.loads((tmp_path / f"r{second[2:]}.json").read_text())["workbench"]["note"] == "look again"
     table.press("action 3")
     table.panels.press("Cancel")
-    assert len(library.rows()) == COUNT
+    assert len(library.view().rows) == COUNT
     table.press("action 3")
     table.panels.press("Delete")
     table.draw()
-    assert len(library.rows()) == COUNT - 2 and table.selected() == ()
+    assert len(library.view().rows) == COUNT - 2 and table.selected() == ()
     assert "In the trash: 6 files" in table.panels.html()
     table.press("undo")
-    assert len(library.rows()) == COUNT and "In the trash" not in table.panels.html()
+    assert len(library.view().rows) == COUNT and "In the trash" not in table.panels.html()
 
 
 def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: Library) -> None:

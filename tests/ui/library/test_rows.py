@@ -172,7 +172,7 @@ def test_a_row_is_read_from_the_file_that_holds_it() -> None:
     ours = row("a", paths=(Path("x/a.json"), Path("x/a.h5"))).source
     theirs = row("b", kind="maniskill", trajectory="traj_1", paths=(Path("x/b.json"), Path("x/b.h5"))).source
     dataset = row("c", kind="lerobot", trajectory="3", paths=(Path("x/set/meta/info.json"),)).source
-    assert (ours.kind, ours.path, ours.part, ours.stem) == ("ours", Path("x/a.json"), None, "a")
+    assert (ours.kind, ours.path, ours.part, ours.stem) == ("workbench", Path("x/a.json"), None, "a")
     assert (theirs.kind, theirs.path, theirs.part, theirs.stem) == (
         "maniskill",
         Path("x/b.h5"),

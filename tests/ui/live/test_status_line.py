@@ -5,7 +5,7 @@ from dataclasses import replace
 from tests.drive.panels import Panels
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import EMPTY, problem, running
-from workbench.session.history.env_table import Kind, Outlier
+from workbench.session.history.env_table import Outlier, OutlierKind
 from workbench.ui.live.status_line import StatusLine, flagged_text, status_values
 from workbench.ui.widgets.templates import render
 
@@ -56,7 +56,7 @@ def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_f
     panels: Panels,
 ) -> None:
     """A reward that was NaN in most envs left a green "running"."""
-    lost = Outlier(Kind.NOT_A_NUMBER, 3, "the reward is <b>NaN</b>")
+    lost = Outlier(OutlierKind.NOT_A_NUMBER, 3, "the reward is <b>NaN</b>")
     rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), []
     line = StatusLine(panels.server, lambda: rows, lambda: went.append("first"))
     line.draw(running(6))

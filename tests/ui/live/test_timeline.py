@@ -71,7 +71,7 @@ def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(live
     assert lived.panels.part("Timeline").seen
     lived.step(4)
     assert lived.ends() == (-4, 0, 0)
-    assert not lived.panels.shows("way to go on"), "nobody is in the past"
+    assert not lived.panels.shows("way to continue"), "nobody is in the past"
     assert lived.panels.control("step to take").options == panel.WALK, "nothing was before the first reset"
     assert "live" in lived.strip()
 
@@ -86,12 +86,12 @@ def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Env
     assert lived.past.shown == 2
     assert np.array_equal(lived.hand(), there)
     assert "2 steps ago" in lived.panels.html("wb-status") and "2 steps ago" in lived.strip()
-    travel = lived.panels.control("way to go on")
+    travel = lived.panels.control("way to continue")
     assert travel.options == ("Continue from here: env 0", "all envs", "env 0 into all envs")
-    assert lived.panels.shows("way to go on") and lived.ends() == (-4, 0, -2)
+    assert lived.panels.shows("way to continue") and lived.ends() == (-4, 0, -2)
     lived.panels.command("What is live")
     lived.draw()
-    assert "live" in lived.strip() and not lived.panels.shows("way to go on")
+    assert "live" in lived.strip() and not lived.panels.shows("way to continue")
 
 
 def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
@@ -186,7 +186,7 @@ def test_a_value_that_no_slider_has_is_refused(lived: EnvMoment) -> None:
     assert lived.past.shown is None
     lived.panels.claim(SLIDER, -3)
     assert lived.past.shown == lived.past.first
-    lived.panels.claim("way to go on", "rm -rf")
+    lived.panels.claim("way to continue", "rm -rf")
     lived.panels.claim("step to take", "rm -rf")
     assert len(lived.panels.client.notices) == 4
     assert lived.past.shown == lived.past.first and lived.past.last == 3

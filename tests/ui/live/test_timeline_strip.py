@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.ui.scenes import running
-from workbench.session.history.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.timeline import Strip, TimelineView
 from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
 from workbench.ui.live.timeline import (
@@ -138,10 +138,15 @@ def test_fail_is_drawn_before_success() -> None:
 
 
 def test_of_very_many_events_the_newest_are_drawn() -> None:
-    events = ((100, NOT_A_NUMBER), (101, FAIL), *((102 + k, RESET) for k in range(97)), *((199, RESET),) * 52)
+    events = (
+        (100, REWARD_NONFINITE),
+        (101, FAIL),
+        *((102 + k, RESET) for k in range(97)),
+        *((199, RESET),) * 52,
+    )
     html = strip_html(strip(events=events, branches=()), running(4, timeline=past()))
     assert len(marks(html)) == 150 and [style for _, style, _ in marks(html)[:2]] == ["fail", "reset"]
-    both = strip_html(strip(events=((190, NOT_A_NUMBER | RESET),)), running(4, timeline=past()))
+    both = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
 
 

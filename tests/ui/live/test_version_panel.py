@@ -23,7 +23,7 @@ class StillSession:
 
 def test_level_reason_and_time_are_said() -> None:
     html = version_html(ReloadReport("patched", "only evaluate changed"), 43.2, loaded=True)
-    assert "patched" in html and "43 ms" in html and "only evaluate changed" in html and "go on" in html
+    assert "patched" in html and "43 ms" in html and "only evaluate changed" in html and "continue" in html
 
 
 def test_what_a_build_could_not_carry_is_named_up_to_a_number() -> None:
@@ -59,7 +59,9 @@ def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: P
     panel.draw(running(4, reload=good, stale=True, state="error", refused=problem()))
     told = panels.html()
     assert (
-        told.index("not loaded") < told.index("The version before it goes on") < told.index("only evaluate")
+        told.index("not loaded")
+        < told.index("The version before it still runs")
+        < told.index("only evaluate")
     )
     assert "push.py, line 88" in told and "KeyError" in told
     panel.draw(running(4, reload=good, stale=True, state="loading", refused=problem()))

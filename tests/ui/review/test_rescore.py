@@ -158,7 +158,7 @@ def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) ->
 def test_a_row_opens_its_episode_at_the_first_difference(
     rescoring: Rescoring, library: Library, review: Review
 ) -> None:
-    rows = {row.seed: row for row in library.rows()}
+    rows = {row.seed: row for row in library.view().rows}
     given = [
         verdict(rows[seed].id, seed=seed, first_difference=seed + 1, returns=(0.0, float(seed)))
         for seed in (1, 2, 3)
@@ -242,6 +242,6 @@ def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -
 
 
 def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:
-    rows = library.rows()
+    rows = library.view().rows
     found = episode_files(library, ["no such", rows[0].id, rows[0].id])
     assert [(file.id, file.path) for file in found] == [(rows[0].id, rows[0].paths[0])]

@@ -10,7 +10,7 @@ from tests.drive.episodes import BODY, geometry_of, made, poses_of
 from workbench.recording.episode.episode import Episode
 from workbench.session.review.view import Opened, find_events
 from workbench.ui.review.scene import SEE_THROUGH, review_scene
-from workbench.ui.scene.glb import group_by_wearers
+from workbench.ui.scene.glb import group_visuals
 
 
 def opened(*episodes: Episode) -> tuple[Opened, ...]:
@@ -20,7 +20,7 @@ def opened(*episodes: Episode) -> tuple[Opened, ...]:
 def test_side_by_side_shares_shapes_and_has_places() -> None:
     scene = review_scene(opened(made(10), made(4, speed=0.02)), ghosts=False)
     assert scene is not None
-    assert len(group_by_wearers(scene.geometry)) == 4, "what looks the same is one node"
+    assert len(group_visuals(scene.geometry)) == 4, "what looks the same is one node"
     assert all(len(visual.envs) == 2 for visual in scene.geometry.visuals)
     assert not np.allclose(scene.layout.offsets[0], scene.layout.offsets[1])
     poses = scene.poses((7, 3))

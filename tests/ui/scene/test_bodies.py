@@ -9,7 +9,7 @@ from tests.ui.scenes import table_scene
 from workbench.core.scene.shapes import Material
 from workbench.ui.scene.bodies import SceneView
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.glb import group_by_wearers
+from workbench.ui.scene.glb import group_visuals
 
 
 def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:
@@ -20,7 +20,7 @@ def test_one_node_for_everything_that_the_same_bodies_wear(server: viser.ViserSe
     geometry, poses = table_scene(4)
     view = SceneView(server)
     view.build(geometry, lay_out(geometry, poses), poses)
-    assert len(view.handles) == len(group_by_wearers(geometry)) == 4
+    assert len(view.handles) == len(group_visuals(geometry)) == 4
 
 
 def test_bodies_stand_at_their_pose_plus_their_env_s_place(server: viser.ViserServer) -> None:

@@ -9,7 +9,7 @@ import trimesh
 
 from tests.ui.scenes import box_mesh, table_scene
 from workbench.core.scene.shapes import Material, Mesh, fingerprint
-from workbench.ui.scene.glb import LAYER, as_glb, face_limit, group_by_wearers, lift_painted_layers
+from workbench.ui.scene.glb import LAYER, as_glb, face_limit, group_visuals, lift_painted_layers
 
 
 def read_back(glb: bytes) -> list[Any]:
@@ -19,7 +19,7 @@ def read_back(glb: bytes) -> list[Any]:
 
 def test_parts_of_one_body_become_one_node() -> None:
     geometry, _ = table_scene(3)
-    groups = group_by_wearers(geometry)
+    groups = group_visuals(geometry)
     assert [len(group.visuals) for group in groups] == [1, 1, 2, 1]
 
 

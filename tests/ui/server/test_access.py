@@ -27,8 +27,8 @@ GATE = AccessRules(TOKEN)
 KNOWN = RequestParts(path="/", host=["localhost:8080"], cookie=["workbench-token-8080=right"])
 
 
-def why(verdict: Decision) -> Why | None:
-    return verdict.why if isinstance(verdict, RefusedRequest) else None
+def why(decision: Decision) -> Why | None:
+    return decision.why if isinstance(decision, RefusedRequest) else None
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_each_refusal_is_a_sentence_without_the_requests_words() -> None:
         replace(KNOWN, path=f"/?token={evil}"),
         replace(KNOWN, cookie=[f"other={evil}"]),
     ]
-    reasons = [verdict.reason for one in asked if isinstance(verdict := decide(GATE, one), RefusedRequest)]
+    reasons = [decision.reason for one in asked if isinstance(decision := decide(GATE, one), RefusedRequest)]
     assert len(set(reasons)) == len(asked)
     for reason in reasons:
         assert evil not in reason and reason[0].isupper() and reason.endswith(".")

@@ -287,22 +287,22 @@ def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, c
 @unhurried
 @given(hosts)
 def test_without_a_token_only_loopback_hosts_are_let_in(host):
-    verdict = decide(AccessRules(token=None), RequestParts(path="/", host=[host]))
+    decision = decide(AccessRules(token=None), RequestParts(path="/", host=[host]))
     name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
     loopback = name.lower() == "localhost" or name.startswith(("127.", "["))
-    assert isinstance(verdict, RefusedRequest) or loopback
+    assert isinstance(decision, RefusedRequest) or loopback
 
 
 @unhurried
 @given(st.text(max_size=60))
 def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
     rules = AccessRules(token="right")
-    verdict = decide(rules, RequestParts(path=f"{path}?token=right", host=["localhost:8080"]))
-    if isinstance(verdict, Entered):
-        assert verdict.location.startswith("/")
-        assert verdict.location[1:2] not in ("/", "\\")
-        assert verdict.location.isascii() and verdict.location.isprintable()
-        assert "token=right" not in verdict.location
+    decision = decide(rules, RequestParts(path=f"{path}?token=right", host=["localhost:8080"]))
+    if isinstance(decision, Entered):
+        assert decision.location.startswith("/")
+        assert decision.location[1:2] not in ("/", "\\")
+        assert decision.location.isascii() and decision.location.isprintable()
+        assert "token=right" not in decision.location
 
 
 @unhurried
@@ -328,9 +328,9 @@ def test_a_link_from_another_site_with_the_token_goes_on_by_a_page():
         fetch_mode=["navigate"],
         fetch_dest=["document"],
     )
-    verdict = decide(rules, link)
-    assert isinstance(verdict, Entered) and verdict.by_page
-    assert '"' not in verdict.location and ">" not in verdict.location
+    decision = decide(rules, link)
+    assert isinstance(decision, Entered) and decision.by_page
+    assert '"' not in decision.location and ">" not in decision.location
 
 
 def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():

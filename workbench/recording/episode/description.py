@@ -61,7 +61,7 @@ def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed:
     """`describe`, with what belongs into the ``.json`` alone.
 
     Args:
-        folder: where the recording will lie.
+        folder: of the recording.
         files: its other two files.
         sealed: add this installation's seal.
     """

@@ -380,7 +380,7 @@ def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str
 
 # --- tags and notes -----------------------------------------------------------------------------------
 #
-# They are the only part of a library that a person typed, and the index is discarded without asking, so they lie with
+# They are the only part of a library that a person typed, and the index is discarded without asking, so they are stored with
 # the recordings: in the `.json` of ours; of other programs' files, which they rewrite themselves (ManiSkill's recorder
 # after each episode), in `NAME.notes`, which `mv NAME.*` moves along.
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-SourceKind = Literal["ours", "maniskill", "lerobot"]
+SourceKind = Literal["workbench", "maniskill", "lerobot"]
 """Which of the three readers opens a recording."""
 
 
 class UnreadableRecording(ValueError):
-    """A broken recording, or a file that is none; the message is a sentence that says what is wrong."""
+    """A broken recording, or a file that is not a recording; the message is a sentence that says what is wrong."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Source:
     """Where a recording is."""
 
     path: Path
-    """A file of ours, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
+    """A file of a workbench recording, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
     part: str | None = None
     """Which of several: ``traj_3``, or the number of the dataset's episode."""
     id: str = ""
@@ -39,7 +39,7 @@ class Source:
     @property
     def kind(self) -> SourceKind:
         if self.part is None:
-            return "ours"
+            return "workbench"
         return "maniskill" if self.path.suffix == ".h5" else "lerobot"
 
 

@@ -101,7 +101,7 @@ def read_lerobot(folder: Path, index: int) -> Episode:
     """Episode `index` of the dataset in this folder, without a scene.
 
     A dataset lacks the state after the last action: it is NaN here, without a picture. Films are decoded when a camera is
-    first accessed. A dataset is untrusted: its paths must lie in its folder, and claimed sizes are bounded.
+    first accessed. A dataset is untrusted: its paths must be in its folder, and claimed sizes are bounded.
 
     Raises:
         UnreadableRecording: it cannot be read; the message says what is wrong.

@@ -45,9 +45,9 @@ class LibraryIndex:
     """The index of one folder; thread-safe. Its methods do not fail.
 
     Everything in it can be read again from the files, so a broken index is deleted, and a process that finds it locked
-    for `LOCKED_SECONDS` goes on without it. SQLite survives two processes at once and being killed.
+    for `LOCKED_SECONDS` continues without it. SQLite survives two processes at once and being killed.
 
-    It lies in the user's cache folder, or in memory if that is not writable. Not in the library's folder: a folder from
+    It is in the user's cache folder, or in memory if that is not writable. Not in the library's folder: a folder from
     elsewhere could bring an index along that is a link to another program's database, or that has a journal naming
     files to delete.
     """
@@ -135,7 +135,7 @@ def index_path(folder: Path) -> Path:
 
 
 def _open(path: Path) -> sqlite3.Connection:
-    """Open or create the index, replacing a file that is none; in memory if `path` is not writable."""
+    """Open or create the index, replacing a file that is not an index; in memory if `path` is not writable."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(2):

@@ -90,16 +90,13 @@ class Library:
         self._index: LibraryIndex | None = LibraryIndex(self.folder) if self.folder.is_dir() else None
         self._kept: dict[str, IndexedFiles] = {} if self._index is None else self._index.load()
         self._stopping = threading.Event()
-        self._asked = threading.Event()
+        self._scan_requested = threading.Event()
         self._thread: threading.Thread | None = None
 
     # --- the table ---------------------------------------------------------------------------------
 
     def view(self) -> LibraryView:
         return self._view
-
-    def rows(self) -> tuple[LibraryRow, ...]:
-        return self._view.rows
 
     def row(self, id: str) -> LibraryRow | None:
         """None if the id is not in the table."""
@@ -123,12 +120,12 @@ class Library:
 
     def request_scan(self) -> None:
         """Have the watching thread check every file now."""
-        self._asked.set()
+        self._scan_requested.set()
 
     def close(self) -> None:
         """Stop watching; returns when the thread has ended."""
         self._stopping.set()
-        self._asked.set()
+        self._scan_requested.set()
         if self._thread is not None:
             self._thread.join(timeout=10.0)
         with self._changing:
@@ -140,14 +137,14 @@ class Library:
         while not self._stopping.is_set():
             began = time.monotonic()
             try:
-                self.refresh(thorough=self._asked.is_set())
+                self.refresh(thorough=self._scan_requested.is_set())
             except Exception:
                 # If the thread ended, the table would never change again.
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
-            self._asked.clear()
+            self._scan_requested.clear()
             # Scan at most a tenth of the time: a huge folder that is written to would keep the thread busy.
-            self._asked.wait(min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
+            self._scan_requested.wait(min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
 
     def refresh(self, thorough: bool = True) -> None:
         """Read the files that changed since the last call.
@@ -313,7 +310,7 @@ class Library:
                     f"{clean_text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
                     "deleted from here: delete the folder."
                 )
-            of_file = {row.id for row in self.rows() if row.place[0] == key}
+            of_file = {row.id for row in self._view.rows if row.place[0] == key}
             if not selected >= of_file:
                 raise LibraryError(
                     f"{clean_text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "

@@ -47,7 +47,7 @@ class RefusedH5(ValueError):
     """The file is refused; the message follows the file's name.
 
     HDF5 by itself follows external links, external storage and virtual datasets into other files of the machine, loads
-    filter plugins, and allocates whatever size a dataset claims, terabytes in a file of 8 kB. The classes of this module
+    filter plugins, and allocates the size that a dataset claims, terabytes in a file of 8 kB. The classes of this module
     follow hard links, and soft links within the file, read plain numbers only, and compare a dataset's size with its
     storage before anything is allocated.
     """

@@ -106,7 +106,7 @@ def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path]
     """Write ManiSkill's metadata of the episode, and ours under ``workbench``, to `path`. Raises OSError.
 
     Args:
-        folder: where the recording will lie.
+        folder: of the recording.
         files: its other two files.
         sealed: add this installation's seal.
     """

@@ -18,7 +18,6 @@ from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import (
     LibraryEntry,
     Source,
-    SourceKind,
     UnreadableRecording,
     clean_facts,
     clean_text,
@@ -99,13 +98,7 @@ def read_rows(
             yield found, _entries(found, answer)
 
 
-def read_recording(
-    kind: SourceKind,
-    path: Path,
-    part: str = "",
-    shapes: SharedShapes | None = None,
-    folder: Path | None = None,
-) -> Episode:
+def read_recording(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
     """An episode; its pictures are read on access.
 
     Recordings may come from anybody, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++
@@ -113,7 +106,6 @@ def read_recording(
     only this recording fails.
 
     Args:
-        part: which one of the file or dataset; empty for a workbench recording.
         shapes: shapes to share with other recordings.
         folder: what the process may read; by default the file's folder.
 
@@ -121,21 +113,21 @@ def read_recording(
         UnreadableRecording: it cannot be read; the message says what is wrong.
         OSError: the system refuses its files.
     """
-    path = Path(path).absolute()
+    path, kind = source.path.absolute(), source.kind
     folder = folder or (path if kind == "lerobot" else path.parent)
     files = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
     reader = _reader(folder, episodes=True)
     reader.allow(_link_targets(files))
     shapes = SharedShapes() if shapes is None else shapes
     sharing, known = _shapes.of(shapes)
-    request = OpenEpisode(kind, path, part, sharing)
+    request = OpenEpisode(kind, path, source.part or "", sharing)
     read, process = _request(reader, request, EpisodeRead, path.name)
     opened = _OpenEpisode(reader, request, process, read.opened, path.name)
     try:
         episode = unpack_episode(read, opened.picture, process, shapes, known)
     except InvalidEpisode as error:
         raise UnreadableRecording(f"{path.name} is a recording, but a broken one: {error}.") from error
-    if kind == "ours":
+    if kind == "workbench":
         found = task_file(read.source_path, episode.info.task, path.parent)
         if found is not None:
             episode.info = replace(episode.info, source_file=found)
@@ -172,7 +164,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
     """
     from workbench.recording.writing.journal import FOLDER  # with Arrow, which a server need not wait for
 
-    failed = f"Cannot recover what lies in {folder}: "
+    failed = f"Cannot recover the recordings in {folder}: "
     try:
         if not any(os.scandir(folder / FOLDER)):
             return ()
@@ -206,7 +198,7 @@ def recovered_text(paths: Sequence[str]) -> str:
     named = ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
     return (
         f"{len(paths)} episode{'' if one else 's'} that an earlier session left half written "
-        f"{'was' if one else 'were'} mended: {named}"
+        f"{'was' if one else 'were'} recovered: {named}"
     )
 
 
@@ -319,11 +311,6 @@ class _OpenEpisode:
 
 
 # --- recordings by path ------------------------------------------------------------------------------
-
-
-def read_source(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
-    """The episode; arguments and errors as of `read_recording`."""
-    return read_recording(source.kind, source.path, source.part or "", shapes, folder)
 
 
 def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:

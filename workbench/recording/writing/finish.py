@@ -108,7 +108,9 @@ def recover(folder: Path) -> list[EpisodeFiles]:
     folder = Path(folder)
     if (folder / FOLDER).is_symlink():
         # `_remove_strays` would delete files of another folder.
-        raise RecordingError(f"Cannot recover what lies in {folder}: {FOLDER} is a link to another folder")
+        raise RecordingError(
+            f"Cannot recover the recordings in {folder}: {FOLDER} is a link to another folder"
+        )
     made: list[EpisodeFiles] = []
     failed: Exception | None = None
     try:
@@ -122,12 +124,12 @@ def recover(folder: Path) -> list[EpisodeFiles]:
         _remove_strays(folder)
         remove_empty_folder(folder)
     except OSError as error:
-        raise RecordingError(f"Cannot recover what lies in {folder}: {reason(error, folder)}") from error
+        raise RecordingError(f"Cannot recover the recordings in {folder}: {reason(error, folder)}") from error
     if isinstance(failed, RecordingError | MemoryError):
         raise failed
     if failed is not None:
         why = reason(failed, folder) if isinstance(failed, OSError) else f"{failed}."
-        raise RecordingError(f"Cannot recover all that lies in {folder}: {why}") from failed
+        raise RecordingError(f"Cannot recover all recordings in {folder}: {why}") from failed
     return made
 
 

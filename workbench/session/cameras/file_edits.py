@@ -229,7 +229,9 @@ class FileEdits:
         went_back = self._update_placements(request, None if had is None else had.settings)
         if self.view.stage == "undone":
             back = (
-                f" {request.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
+                f" {request.key[1]} is where the file places it; Undo puts it where you placed it."
+                if went_back
+                else ""
             )
             self._set_state(f"{edit.names} {restored_text(edit)} before.{back}", "undone")
         elif wrong := mismatch(request, infos, edit.settings):
@@ -291,7 +293,7 @@ class FileEdits:
     def failed_to_load(self) -> None:
         """A version failed to load; the lock is held."""
         if self._copied is not None:
-            why = f"{self._copied} was made, but does not load: mend or delete it."
+            why = f"{self._copied} was made, but does not load: fix or delete it."
             self.view = EditState("refused", self.view.request, message=why)
         edit, undone = self.view.edit, self.view.stage == "undone"
         if self.view.loading and edit is not None:

@@ -32,9 +32,9 @@ Previewed = tuple[StepResult | None, DrawCamera]
 class CameraStudio:
     """Places cameras and previews them. All methods are thread-safe and return at once; `view` has the results.
 
-    A placement is here (with undo), in the worker's live cameras, and at last in the author's file. The one here counts:
-    after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If the author
-    changed the camera in the file, the file counts.
+    A placement is here (with undo), in the worker's live cameras, and at last in the author's file. This one is
+    authoritative: after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If
+    the author changed the camera in the file, the file counts.
 
     A preview is drawn by a temporary camera with the same lens (`core.cameras.temporary`): 1280 x 720 takes long without a
     GPU, 64 x 64 shows little, and another size of the env's camera would change the observation.
@@ -69,7 +69,7 @@ class CameraStudio:
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
         self.reports = CameraReports(self._cameras, asker, background, self._notify, past, load)
-        self._preview_lane = JobLane("studio-quick-look", self._notify, self._preview_failed)
+        self._preview_lane = JobLane("studio-preview", self._notify, self._preview_failed)
         self._preview_scale = 1.0
         self._preview: Picture | None = None
         self._preview_problem = ""
@@ -164,12 +164,12 @@ class CameraStudio:
             with self._lock:
                 self._preview = picture
 
-        self._preview_lane.start("a quick look", work)
+        self._preview_lane.start("a preview", work)
 
     def _preview_failed(self, job: Job, failure: JobFailed) -> None:
         """The last preview stays; the next change draws again."""
         with self._lock:
-            self._preview_problem = f"The quick look failed: {failure}."
+            self._preview_problem = f"The preview failed: {failure}."
 
     # --- calibration files -----------------------------------------------------------------------------
 
@@ -279,7 +279,7 @@ class CameraStudio:
                 names = " and ".join(key[1] for key in dropped)
                 one = len(dropped) == 1
                 self._cameras.problem = (
-                    f"{names} {'was' if one else 'were'} changed in the file, so {'it stands' if one else 'they stand'} "
+                    f"{names} {'was' if one else 'were'} changed in the file, so {'it is' if one else 'they are'} "
                     "where the file says; Undo brings your placement back."
                 )
             if self._cameras.selected is not None and self._cameras.info(self._cameras.selected) is None:

@@ -28,7 +28,7 @@ ROUNDING = 1e-4
 """3.0000002 / 3 is not out of range."""
 
 
-class Kind(Enum):
+class OutlierKind(Enum):
     NOT_A_NUMBER = "NaN or infinite"
     FAST = "fast"
     UNDER_FLOOR = "under the floor"
@@ -40,7 +40,7 @@ class Kind(Enum):
 class Outlier:
     """The first outlier of a kind in an env's episode."""
 
-    kind: Kind
+    kind: OutlierKind
     step: int
     """Control step of the episode."""
     reason: str
@@ -51,7 +51,7 @@ class Outlier:
 class OutlierSighting:
     """The envs with an outlier of one kind in one control step."""
 
-    kind: Kind
+    kind: OutlierKind
     envs: NDArray[np.bool_]
     """(N,)"""
     reason: Callable[[int], str]
@@ -94,20 +94,22 @@ class OutlierWatch:
             wrong: Any = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
             found.append(
                 OutlierSighting(
-                    Kind.NOT_A_NUMBER, wrong, lambda env, of=values, name=name: f"{name} {_nan_text(of[env])}"
+                    OutlierKind.NOT_A_NUMBER,
+                    wrong,
+                    lambda env, of=values, name=name: f"{name} {_nan_text(of[env])}",
                 )
             )
         if step.sound_obs is not None:
             found.append(
                 OutlierSighting(
-                    Kind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is NaN or infinite"
+                    OutlierKind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is NaN or infinite"
                 )
             )
         with np.errstate(invalid="ignore"):
             out = (step.reward < self._low - ROUNDING) | (step.reward > self._high + ROUNDING)
         out &= np.isfinite(step.reward)
         found.append(
-            OutlierSighting(Kind.REWARD, out, lambda env: self._reward_text(float(step.reward[env])))
+            OutlierSighting(OutlierKind.REWARD, out, lambda env: self._reward_text(float(step.reward[env])))
         )
         return [sight for sight in found if sight.envs.any()]
 
@@ -132,18 +134,22 @@ class OutlierWatch:
 
         return [
             OutlierSighting(
-                Kind.NOT_A_NUMBER,
+                OutlierKind.NOT_A_NUMBER,
                 lost.any(axis=1),
                 lambda e: f"the pose of {first(lost, e)} {_nan_text(step.poses[e, int(lost[e].argmax())])}",
             ),
             OutlierSighting(
-                Kind.FAST, fast.any(axis=1), lambda e: "{} moved at {:.3g} m/s".format(*worst(speed, e))
+                OutlierKind.FAST,
+                fast.any(axis=1),
+                lambda e: "{} moved at {:.3g} m/s".format(*worst(speed, e)),
             ),
             OutlierSighting(
-                Kind.UNDER_FLOOR, under.any(axis=1), lambda e: f"{first(under, e)} is under the floor"
+                OutlierKind.UNDER_FLOOR, under.any(axis=1), lambda e: f"{first(under, e)} is under the floor"
             ),
             OutlierSighting(
-                Kind.DROPPED, dropped.any(axis=1), lambda e: "{} dropped {:.2f} m".format(*worst(drop, e))
+                OutlierKind.DROPPED,
+                dropped.any(axis=1),
+                lambda e: "{} dropped {:.2f} m".format(*worst(drop, e)),
             ),
         ]
 
@@ -162,11 +168,11 @@ def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> f
     lowest = [np.inf]
     static = np.array([kind == "static" for kind in geometry.body_kinds], bool)
     for visual in geometry.visuals:
-        worn = np.flatnonzero(static[visual.bodies])
-        if not len(worn) or not len(visual.mesh.vertices):
+        instances = np.flatnonzero(static[visual.bodies])
+        if not len(instances) or not len(visual.mesh.vertices):
             continue
         # All envs have the same ground; they differ in what is on it. So one env is enough.
-        p, (w, x, y, z) = np.split(poses[visual.envs[worn[0]], visual.bodies[worn[0]]], [3])
+        p, (w, x, y, z) = np.split(poses[visual.envs[instances[0]], visual.bodies[instances[0]]], [3])
         up = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
         lowest.append(float((visual.mesh.vertices @ up).min() + p[2]))
     finite = [height for height in lowest if np.isfinite(height)]
@@ -183,7 +189,7 @@ def _numbers(step: StepResult) -> list[tuple[str, NDArray]]:
 
 KEPT_REWARDS = 100
 """The newest steps of an episode whose rewards a row holds."""
-LOST_REWARD = (Kind.REWARD, Kind.NOT_A_NUMBER)
+NONFINITE_REWARD_KEY = (OutlierKind.REWARD, OutlierKind.NOT_A_NUMBER)
 """Key in `EnvRows.first` of a reward that is NaN or infinite."""
 Outliers = Mapping[int, tuple[Outlier, ...]]
 """By env, oldest first; only envs with outliers."""
@@ -237,8 +243,8 @@ class EnvRows:
     followed: NDArray[np.bool_]
     """(N,) whether the episode was followed from its start; otherwise `total` is NaN."""
     first: Mapping[Hashable, NDArray[np.int32]]
-    """(N,) the first step at which it was true (0: after the reset); -1: never. By bool entry of ``evaluate``, by `Kind`
-    of outlier, and by `LOST_REWARD`."""
+    """(N,) the first step at which it was true (0: after the reset); -1: never. By bool entry of ``evaluate``, by
+    `OutlierKind`, and by `NONFINITE_REWARD_KEY`."""
     outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
@@ -335,7 +341,7 @@ class EnvTable:
         now, first, outliers = self._now, dict(self._now.first), self._now.outliers
         for name, so in _flags(step):
             _note_first(first, name, so, step)
-        _note_first(first, LOST_REWARD, ~np.isfinite(step.reward), step)
+        _note_first(first, NONFINITE_REWARD_KEY, ~np.isfinite(step.reward), step)
         for sight in self._watch.check(step):
             for env in np.flatnonzero(_note_first(first, sight.kind, sight.envs, step)).tolist():
                 outlier = Outlier(sight.kind, int(step.elapsed_steps[env]), sight.reason(env))

@@ -1,4 +1,4 @@
-"""The history: every control step of every env since the task was built, within a memory limit."""
+"""The history: the moments since the env was built, within a memory limit."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.packing import WholeSnapshot
 from workbench.jobs.task import NO_MOMENT, Restored, Stepped
 from workbench.session.history.curves import Columns, RecentSteps
-from workbench.session.history.env_table import KEPT_REWARDS, LOST_REWARD, EnvRows, EnvTable
+from workbench.session.history.env_table import KEPT_REWARDS, NONFINITE_REWARD_KEY, EnvRows, EnvTable
 from workbench.session.protocol.messages import PastPictures, Pictures, WayBack
 
-RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
+RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
 """Event flags of an env at a moment. Success, fail and a NaN or infinite reward: only the first in an episode."""
 _OVERHEAD = 2500
 """Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
@@ -33,7 +33,7 @@ _RECENT = 200
 
 
 @dataclass
-class PartSet:
+class SnapshotPartSet:
     """The parts of a snapshot, shared by all moments that have the same."""
 
     keys: tuple[int, ...]
@@ -43,7 +43,7 @@ class PartSet:
     """Number of moments with these parts."""
 
 
-class SharedParts:
+class SnapshotParts:
     """Reference-counted store of snapshot parts.
 
     A snapshot comes as a body and the keys of its parts (`core.snapshots.packing`), most of which the moment before has
@@ -53,16 +53,16 @@ class SharedParts:
     def __init__(self) -> None:
         self._parts: dict[int, bytes] = {}
         self._references: dict[int, int] = {}
-        self._last = PartSet((), ())
+        self._last = SnapshotPartSet((), ())
         self.used = 0
         """Bytes."""
 
-    def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> PartSet:
+    def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> SnapshotPartSet:
         """Parts of the next moment; `keys` is None if they are those of the moment before."""
         self._parts.update(new_parts)
         if keys is not None and keys != self._last.keys:
             known = self._parts.keys() >= {*keys}
-            self._last = PartSet(keys, tuple(self._parts[key] for key in keys) if known else None)
+            self._last = SnapshotPartSet(keys, tuple(self._parts[key] for key in keys) if known else None)
         parts = self._last
         if parts.content is not None and parts.moments == 0:
             for key in parts.keys:
@@ -72,7 +72,7 @@ class SharedParts:
         parts.moments += 1
         return parts
 
-    def release(self, parts: PartSet) -> None:
+    def release(self, parts: SnapshotPartSet) -> None:
         """A moment with these parts was dropped."""
         parts.moments -= 1
         if parts.moments == 0 and parts.content is not None:
@@ -105,7 +105,7 @@ class Moment:
     """`Stepped.number`."""
     snapshot: WholeSnapshot | None
     """Of the whole batch, or None; shares its bytes with other moments."""
-    parts: PartSet
+    parts: SnapshotPartSet
     size: int
     """Bytes, without parts and pictures."""
     rows: EnvRows
@@ -164,7 +164,8 @@ class History:
     what an env went through without a jump: it starts from a snapshot and has all actions, so it can be replayed. An
     *episode* goes from a reset on through the moments that the env was put back to.
 
-    Memory is bounded; the oldest moments are dropped first.
+    Memory is bounded: pictures beyond half the limit are dropped first, the oldest of them first; then the oldest
+    moments.
     """
 
     def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
@@ -179,7 +180,7 @@ class History:
         self.limit = limit
         self._moments: deque[Moment] = deque()
         self._next_serial = first_serial
-        self._parts = SharedParts()
+        self._parts = SnapshotParts()
         self._used = 0
         self._pictures_used = 0
         self._pictured: deque[int] = deque()
@@ -473,7 +474,7 @@ class History:
             # Success or fail in a restored state is no event of this moment: it happened at the origin.
             return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
         event_flags = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
-        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (NOT_A_NUMBER, LOST_REWARD)):
+        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, NONFINITE_REWARD_KEY)):
             if what in rows.first:
                 event_flags[rows.first[what] == step.elapsed_steps] |= flag
         return event_flags

@@ -156,7 +156,7 @@ class LiveState:
             self._set_running()
 
     def take(self, event: Event) -> None:
-        """Any other event."""
+        """Events other than `Loaded`, `Stepped`, `Answer` and `Progress`, which `Session._handle` passes on elsewhere."""
         now = self.now
         if isinstance(event, Loading):
             self.set(state="loading", activity=event.activity)
@@ -323,11 +323,11 @@ class LiveState:
     def policy_saved(self) -> ReadPolicyAgain:
         """Clear a problem of the policy; playing resumes if that problem had stopped it."""
         problem = self.now.problem
-        mended = problem is not None and problem.stage == "policy"
-        if mended:
+        policy_failed = problem is not None and problem.stage == "policy"
+        if policy_failed:
             self.set_problem(None)
             self._set_running()
-        return ReadPolicyAgain(play=mended and self.wants_play)
+        return ReadPolicyAgain(play=policy_failed and self.wants_play)
 
     # --- reading -------------------------------------------------------------------------------------
 

@@ -101,7 +101,7 @@ class Session:
         self._worker = make_worker(
             worker or WorkerOptions(),
             WarmUp(options),
-            greet=self.versions.first_requests,
+            first_requests=self.versions.first_requests,
             on_event=self._handle,
             on_death=self._on_death,
             on_busy=self._on_busy,
@@ -216,7 +216,7 @@ class Session:
         with self._lock:
             request = self._state.policy_saved()
         # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
-        self._log("the policy's file was saved: it is read anew")
+        self._log("the policy's file was saved: it is read again")
         self._notify()
         self._send(request)
 

@@ -237,7 +237,7 @@ class Beat:
 
 def make_heartbeat() -> int:
     """Shared memory as a file descriptor for the child; the caller closes it."""
-    fd = os.memfd_create("workbench-pulse")
+    fd = os.memfd_create("workbench-heartbeat")
     os.ftruncate(fd, mmap.PAGESIZE)
     return fd
 

@@ -13,7 +13,7 @@ from workbench.machine.processes.watched_thread import report_failure, watched_t
 
 @dataclass(frozen=True)
 class JobProgress:
-    """How far a background job is."""
+    """Progress of a background job."""
 
     what: str
     done: int

@@ -162,7 +162,7 @@ class Supervisor:
     """Runs one worker after the other, and reports why each ended.
 
     The author's code may crash its process, exit it, loop for ever or fill the memory; the page must survive that. One
-    thread starts a worker, sends it the requests of `greet`, hands on its events and checks it ten times a second. When it
+    thread starts a worker, sends it the requests of `first_requests`, hands on its events and checks it ten times a second. When it
     ends, the thread reports why and takes the next, from the spare if there is one.
 
     Only two things make it end a worker unasked: memory above the limit, and a load that waits behind work that cannot
@@ -175,7 +175,7 @@ class Supervisor:
         options: WorkerOptions,
         warm_up: WarmUp,
         *,
-        greet: Callable[[], list[Request]],
+        first_requests: Callable[[], list[Request]],
         on_event: Callable[[Event], None],
         on_death: Callable[[Death], None],
         on_busy: Callable[[Busy | None], None],
@@ -185,13 +185,18 @@ class Supervisor:
         """The callbacks are called on this object's threads, and may call `send`, `replace` and `interrupt`.
 
         Args:
-            greet: requests for each new worker: the state that the previous one had.
+            first_requests: requests for each new worker: the state that the previous one had.
             on_busy: called about once a second during a long piece of work, and with None when it is done.
             own_files: the author's files, to find their line on a stack.
             output: as for `WorkerProcess`.
         """
         self._options, self._warm_up = options, warm_up
-        self._greet, self._on_event, self._on_death, self._on_busy = greet, on_event, on_death, on_busy
+        self._first_requests, self._on_event, self._on_death, self._on_busy = (
+            first_requests,
+            on_event,
+            on_death,
+            on_busy,
+        )
         self._own_files, self._output = own_files, output
         self._condition = threading.Condition()
         self._worker: WorkerProcess | None = None
@@ -227,7 +232,7 @@ class Supervisor:
         return self._load_sent is not None
 
     def send(self, request: Request) -> None:
-        """Send to the current worker. Between two workers the request is lost; `greet` must include its effect."""
+        """Send to the current worker. Between two workers the request is lost; `first_requests` must include its effect."""
         with self._condition:
             worker = self._worker
             if isinstance(request, Load) and self._load_sent is None:
@@ -277,14 +282,14 @@ class Supervisor:
             return self._run_worker()
         except Exception as error:
             # Not in a new thread: the kernel ends a worker with the thread that started it.
-            report_failure("The thread that minds the worker failed and is started again", error)
+            report_failure("The thread that supervises the worker failed and is started again", error)
             with self._condition:
                 worker, self._worker = self._worker, None
                 self._deaths += 1
                 gives_up = self._deaths >= _MOST_DEATHS
             if worker is not None:
                 worker.stop(grace=0.0)
-            why = f"was lost by the thread that minds it ({type(error).__name__}: {shorten(str(error))})"
+            why = f"was lost by the thread that supervises it ({type(error).__name__}: {shorten(str(error))})"
         try:
             self._on_death(Death(why, False, False, None, "", gives_up))
         except Exception as failure:
@@ -310,7 +315,7 @@ class Supervisor:
             first = self._lives == 0
             worker.send(ListenForDebugger(self._options.debug_port, self._options.debug_wait and first))
         self._lives += 1
-        for request in self._greet():
+        for request in self._first_requests():
             worker.send(request)
         state = _WorkerState()
         try:

@@ -283,7 +283,7 @@ def signal_main_thread(pid: int, number: signal.Signals) -> None:
     """Send a signal to the main thread of a process, in which Python's handlers run.
 
     The kernel delivers a signal for the whole process to any thread, on a busy machine also to one of torch's or the
-    renderer's. CPython 3.11 then notes the signal without waking the main thread, whose endless loop goes on until
+    renderer's. CPython 3.11 then notes the signal without waking the main thread, whose endless loop continues until
     another Python thread wants to run: never.
     """
     if _libc.tgkill(pid, pid, int(number)) != 0:

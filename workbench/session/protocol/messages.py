@@ -111,7 +111,7 @@ class ReadPolicyAgain:
 
 @dataclass(frozen=True)
 class PlaceCamera(Question["Placed"]):
-    """Change a camera's pose, lens, size or shader in all envs; answered with `Placed`.
+    """Change a camera's pose, lens, size or shader in all envs; followed by a `Placed`.
 
     Of several waiting requests for one camera only the last is carried out.
     """
@@ -145,7 +145,7 @@ class WayBack:
 
 @dataclass(frozen=True)
 class Restore:
-    """Put envs back to a moment of the history; answered with a `Stepped` that has `Stepped.restored`."""
+    """Put envs back to a moment of the history; followed by a `Stepped` that has `Stepped.restored`."""
 
     snapshot: bytes
     """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
@@ -165,7 +165,7 @@ class Restore:
 
 @dataclass(frozen=True)
 class EnterRecording:
-    """Put envs into a state of a recorded episode; answered with a `Stepped` that has `Stepped.restored`."""
+    """Put envs into a state of a recorded episode; followed by a `Stepped` that has `Stepped.restored`."""
 
     run: RecordedRun
     """Up to the state."""
@@ -180,7 +180,7 @@ class EnterRecording:
 
 @dataclass(frozen=True)
 class DrawPast:
-    """Draw one env at a past moment without touching its simulation; answered with `PastPictures`."""
+    """Draw one env at a past moment without touching its simulation; followed by `PastPictures`."""
 
     poses: NDArray[np.float32]
     """(B, 7) of that env's bodies, as in `StepResult.poses`."""
@@ -208,7 +208,7 @@ class ListenForDebugger:
 
 @dataclass(frozen=True)
 class Inspect:
-    """Read one env's state once, between two control steps; answered with an `Inspection`."""
+    """Read one env's state once, between two control steps; followed by an `Inspection`."""
 
     env: int
     sections: tuple[Section, ...]
@@ -312,7 +312,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Placed:
-    """The answer to `PlaceCamera`. Later pictures of that camera show it as placed."""
+    """The result of `PlaceCamera`. Later pictures of that camera show it as placed."""
 
     key: CameraKey
     settings: CameraSettings | None
@@ -327,7 +327,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class PastPictures:
-    """The answer to `DrawPast`."""
+    """The result of `DrawPast`."""
 
     origin: int
     pictures: tuple[Picture, ...]

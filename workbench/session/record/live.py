@@ -36,7 +36,7 @@ class RecordingStatus:
     being_written: int = 0
     """Ended episodes whose files are being made."""
     recovered: tuple[str, ...] = ()
-    """.rrd files of episodes that an earlier server left unfinished, repaired at the start."""
+    """.rrd files of episodes that an earlier server left unfinished, recovered at the start."""
     folder: str = ""
     last_file: str | None = None
     problem: str | None = None
@@ -56,17 +56,17 @@ class LiveRecorder:
         self,
         folder: Path,
         on_change: Callable[[], None],
-        on_envs: Callable[[tuple[int, ...]], None],
+        on_fewer_envs: Callable[[tuple[int, ...]], None],
         on_recovered: Callable[[str], None] = lambda message: None,
     ) -> None:
         """
         Args:
             on_change: called when `status` has changed, from any thread.
-            on_envs: called with the envs that still need capturing, when these are fewer; from a thread of its own.
+            on_fewer_envs: called with the envs that still need capturing, when these are fewer; from a thread of its own.
             on_recovered: called with a message about unfinished episodes of an earlier session, from a thread of its own.
         """
         self._folder = folder
-        self._on_change, self._on_envs, self._on_recovered = on_change, on_envs, on_recovered
+        self._on_change, self._on_fewer_envs, self._on_recovered = on_change, on_fewer_envs, on_recovered
         self._lock = threading.Lock()
         self._env_idx: tuple[int, ...] = ()
         self._gatherer: EpisodeGatherer | None = None
@@ -180,24 +180,24 @@ class LiveRecorder:
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
             # `_env_idx` stays as it is from here on: another recording may have started by now.
-            self._on_envs(())
+            self._on_fewer_envs(())
             self._on_change()
             return
         left = gatherer.env_idx
         if left != before:
             with self._lock:
                 self._env_idx = tuple(env for env in self._env_idx if env in left)
-            self._on_envs(left)
+            self._on_fewer_envs(left)
             self._on_change()
 
     def _recover(self) -> None:
-        """Repair episodes that an earlier server left unfinished; on the finisher's thread, before all else."""
+        """Recover episodes that an earlier server left unfinished; on the finisher's thread, before all else."""
         if not self._folder.is_dir():
             return
         try:
             recovered = [str(file) for file in recover_confined(self._folder)]
         except RecordingError as error:
-            message = f"what an earlier recording left could not be mended: {error}"
+            message = f"what an earlier recording left could not be recovered: {error}"
             with self._lock:
                 self._problem = message
         else:

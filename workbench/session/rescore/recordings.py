@@ -29,7 +29,7 @@ from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.made_here import made_here
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.episode.side_files import side_files_text
-from workbench.recording.reader.reading import read_source
+from workbench.recording.reader.reading import read_recording
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared, recorded_content
 from workbench.session.process.askers import Background
 from workbench.session.process.job_lane import Job, JobFailed
@@ -167,11 +167,11 @@ def with_renderer(options: TaskOptions) -> TaskOptions:
 
 
 def _info_of(source: Source) -> EpisodeInfo:
-    """Read from the small .json if it is there, else by `read_source`, which reads pictures and meshes too. Raises as that."""
+    """Read from the small .json if it is there, else by `read_recording`, which reads pictures and meshes too. Raises as that."""
     try:
         return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
-        return read_source(source).info
+        return read_recording(source).info
 
 
 MOST_AT_ONCE = 16

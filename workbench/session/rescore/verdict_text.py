@@ -119,13 +119,13 @@ def drift_summary(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
     furthest = max(known, key=lambda verdict: verdict.metres or 0.0)
     metres, radians = furthest.metres or 0.0, max(verdict.radians for verdict in known)
     if metres == 0 and radians == 0:
-        return "Every body is where it was, to the last bit: what differs comes of the code."
+        return "Every body is where it was, to the last bit: the differences come from the code."
     amount = f"{length(metres)} and {math.degrees(radians):.2g}°"
     if not (far := count_drifted(known)):
         return f"States drifted by at most {amount}: the rewards are comparable."
     return (
         f"In {counted(far, 'episode')} bodies came up to {amount} from where they were, furthest in {furthest.of.name}: "
-        f"what differs there may come of that, and not of the code.{advice}"
+        f"differences there may come from that, and not from the code.{advice}"
     )
 
 

@@ -75,7 +75,7 @@ def difference(
     """How `b` differs from `a`.
 
     Args:
-        anchors: The state of each that lies at position 0.
+        anchors: The state of each that is at position 0.
         tolerance: Metres above which a body's pose differs.
     """
     begin = max(-anchors[0], -anchors[1])

@@ -18,7 +18,7 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
-from workbench.recording.reader.reading import read_source
+from workbench.recording.reader.reading import read_recording
 from workbench.session.process.job_lane import Stopped
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
@@ -80,7 +80,7 @@ class Review:
         Args:
             library: finds recordings by their ids.
             read: reads the recording of a row, sharing shapes with others; raises OSError or UnreadableRecording with a
-                sentence. None for `read_source`.
+                sentence. None for `read_recording`.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
             most_bytes: of memory for the recordings of one opening; None for `MEMORY_SHARE`.
@@ -88,7 +88,7 @@ class Review:
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._make_scene, self._clock = library, make_scene, clock
-        self._read = read or (lambda row, shapes: read_source(row.source, shapes, library.folder))
+        self._read = read or (lambda row, shapes: read_recording(row.source, shapes, library.folder))
         self._memory = memory
         self._changed = threading.Condition()
         self._view = ReviewView()
@@ -134,7 +134,7 @@ class Review:
             ids: rows of the library; those beyond `MOST_OPEN` are left out, with a message.
             state: of the first recording, to begin at.
         """
-        rows = {row.id: row for row in self._library.rows()}
+        rows = {row.id: row for row in self._library.view().rows}
         wanted = [rows[id] for id in dict.fromkeys(ids) if id in rows]
         missing = len(dict.fromkeys(ids)) - len(wanted)
         problems: list[str] = []

@@ -86,7 +86,7 @@ class ReviewView:
     alignments: tuple[str, ...] = (START,)
     """What the open recordings can be aligned at."""
     anchors: tuple[int, ...] = ()
-    """The state of each that lies at position 0."""
+    """The state of each that is at position 0."""
     position: int = 0
     first: int = 0
     last: int = 0

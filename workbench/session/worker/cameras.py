@@ -89,18 +89,18 @@ class WorkerCameras:
     changes the scene, `settle` finishes the picture under way and places the cameras that wait.
 
     A picture takes 25 to 90 ms on a software renderer; drawn in one go between two steps it would halve the step rate. So
-    a picture is begun, steps go on, and it is fetched when it should be ready by the time that the last ones took (see
+    a picture is begun, steps continue, and it is fetched when it should be ready by the time that the last ones took (see
     `begin_pictures`). Sensors come before human cameras, since the two see different objects and cannot be drawn at once,
     and each kind is sent as soon as it is ready. At most 15 rounds a second, each with a proportional pause, leave the
     browser on the same machine its share. A camera that is being dragged is drawn next, alone and without a pause.
     """
 
-    def __init__(self, held: GuardedTask, on_first: Callable[[bool], None]) -> None:
+    def __init__(self, task: GuardedTask, on_first: Callable[[bool], None]) -> None:
         """
         Args:
             on_first: called with False before the first picture of the process, and with True when it is ready.
         """
-        self._held, self._on_first = held, on_first
+        self._task, self._on_first = task, on_first
         self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
         """The env and the cameras that the page shows."""
         self._there: tuple[CameraRequest, ...] = ()
@@ -141,25 +141,25 @@ class WorkerCameras:
         self, opened: OpenedTask, question: CameraQuestion, on_progress: Callable[[int, int], None]
     ) -> object:
         self.settle()
-        self._held.heartbeat.begin("drawing")
+        self._task.heartbeat.begin("drawing")
         try:
-            return answer_question(opened, self._placed, question, on_progress, self._held.line.waits)
+            return answer_question(opened, self._placed, question, on_progress, self._task.line.waits)
         except (ValueError, IndexError, RuntimeError) as error:
             raise CannotAnswer(str(error)) from error
         finally:
-            self._held.heartbeat.begin("idle")
+            self._task.heartbeat.begin("idle")
 
     def draw_past(self, request: DrawPast) -> None:
-        opened = self._held.opened
+        opened = self._task.opened
         if opened is None:
             return
         self.settle()  # the same scene is about to be drawn
         try:
             pictures = take_pictures(opened.env.env, request.env, request.cameras, request.poses)
         except (RuntimeError, ValueError, IndexError) as error:
-            self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
+            self._task.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
-        self._held.line.send(PastPictures(request.origin, pictures))
+        self._task.line.send(PastPictures(request.origin, pictures))
 
     def capture(self, opened: OpenedTask, request: CaptureMoment) -> Captured:
         """Put the envs back to a past moment and read what the history lacks: env states, observations and pictures.
@@ -176,7 +176,7 @@ class WorkerCameras:
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
         drawn: list[Picture] = []
         for env in request.env_idx:
-            if self._held.line.waits():
+            if self._task.line.waits():
                 raise CannotAnswer("it was cancelled")
             drawn += step_pictures(opened.env, [env], wanted)
         return Captured(columns, tuple(drawn))
@@ -186,7 +186,7 @@ class WorkerCameras:
     def update_watched(self) -> None:
         """Watch the requested cameras that the version has; call when either may have changed."""
         self.settle()
-        opened = self._held.opened
+        opened = self._task.opened
         if opened is None:
             return
         known = {camera.key for camera in opened.description.cameras}
@@ -216,8 +216,8 @@ class WorkerCameras:
 
     def put_back(self) -> None:
         """Place the placed cameras again; call when the scene's cameras may be new ones."""
-        if self._held.opened is not None:
-            self._placed.put_back(self._held.opened.env.env)
+        if self._task.opened is not None:
+            self._placed.put_back(self._task.opened.env.env)
 
     def forget_placed(self) -> None:
         """Forget all placements: the cameras belong to another version."""
@@ -227,7 +227,7 @@ class WorkerCameras:
 
     def wait(self, now: float) -> float | None:
         """Seconds until `make` has something to do; None if no camera is watched."""
-        if self._held.opened is None:
+        if self._task.opened is None:
             return None
         if self._begun is not None:
             return 0.0 if self._may_block else max(0.0, self._begun.ready_at - now)
@@ -243,19 +243,19 @@ class WorkerCameras:
         """Place the cameras that wait. No picture may be under way."""
         wanted, self._to_place = self._to_place, {}
         for request in wanted.values():
-            if self._held.opened is not None:
-                self._held.line.send(self._place(self._held.opened, request))
+            if self._task.opened is not None:
+                self._task.line.send(self._place(self._task.opened, request))
 
     def make(self, may_block: bool) -> None:
         """Fetch a picture that is ready and begin the next."""
         self._may_block = may_block
-        opened, wait = self._held.opened, self.wait(time.monotonic())
+        opened, wait = self._task.opened, self.wait(time.monotonic())
         if opened is None or wait is None or wait > 0:
             return
         if not self._renderer_ready and self._begun is None:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._on_first(False)
-        self._held.heartbeat.begin("drawing")
+        self._task.heartbeat.begin("drawing")
         try:
             made = None if self._begun is None else self._fetch(self._begun)
             if made is None:
@@ -263,11 +263,11 @@ class WorkerCameras:
             self._begin(opened.env)
         except RuntimeError as error:
             self._watch(())  # until other cameras are requested, or another version is loaded
-            self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
+            self._task.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
         if made is None:
             return
-        self._held.line.send(made)
+        self._task.line.send(made)
         if not self._renderer_ready:
             self._renderer_ready = True
             self._on_first(True)
@@ -302,12 +302,12 @@ class WorkerCameras:
             pictures = begin_pictures(env.env, min(self._watched[0], env.num_envs - 1), requested)
             at = time.monotonic()
             ready_at = at + self._expected.get(requested, 0.0)
-            self._begun = _Begun(pictures, requested, self._held.steps.number, at, ready_at)
+            self._begun = _Begun(pictures, requested, self._task.steps.number, at, ready_at)
 
     def _place(self, opened: OpenedTask, request: PlaceCamera) -> Placed:
         key, env = request.key, opened.env.env
         try:
-            with self._held.interrupts.shielded():
+            with self._task.interrupts.shielded():
                 reshaped = self._placed.place(env, key, request.settings)
         except (ValueError, RuntimeError) as error:
             return Placed(key, request.settings, None, why_not=str(error))
@@ -317,12 +317,12 @@ class WorkerCameras:
             for info in list_cameras(env)
             if (before := described.get(info.key)) is not None
         )
-        self._held.opened = replace(opened, description=replace(opened.description, cameras=infos))
+        self._task.opened = replace(opened, description=replace(opened.description, cameras=infos))
         self.scene_changed()
         # A person moves this camera: if it is watched, its picture comes first.
         self._hurried |= {key} & {camera.key for camera in self._there}
         if reshaped and key[0] == "sensor" and opened.env.observes_pictures:
-            self._held.guarded(_observe_again)
+            self._task.guarded(_observe_again)
         info = next((info for info in infos if info.key == key), None)
         return Placed(key, request.settings, info, reshaped)
 

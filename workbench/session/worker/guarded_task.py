@@ -55,7 +55,7 @@ class ServerConnection:
 
     def drop_steps(self) -> None:
         """Drop waiting control steps, which were pressed while a hook hung and would make it hang again. Call before the
-        page is told of the interrupt: what is pressed after that is meant."""
+        page is told of the interrupt: steps that are pressed after that are kept."""
         with self._interrupts.shielded():
             waiting = [*self._queue, *self._requests(0.0)]
             self._queue = deque(without_steps(waiting))

@@ -100,8 +100,8 @@ class Worker:
         self._interrupts = Interrupts()
         self._line = ServerConnection(connection, self._interrupts)
         self._steps = StepEvents()
-        self._held = GuardedTask(self._line, self._interrupts, heartbeat, self._steps, self._pause)
-        self._cameras = WorkerCameras(self._held, self._on_first_picture)
+        self._task = GuardedTask(self._line, self._interrupts, heartbeat, self._steps, self._pause)
+        self._cameras = WorkerCameras(self._task, self._on_first_picture)
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
@@ -125,8 +125,8 @@ class Worker:
             ReadPolicyAgain: self._read_policy_again,
             PlaceCamera: self._cameras.place,
             SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
-            Restore: lambda request: self._held.guarded(partial(self._go, request)),
-            EnterRecording: lambda request: self._held.guarded(partial(self._go, request)),
+            Restore: lambda request: self._task.guarded(partial(self._go, request)),
+            EnterRecording: lambda request: self._task.guarded(partial(self._go, request)),
             DrawPast: self._cameras.draw_past,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
@@ -145,13 +145,13 @@ class Worker:
                     self._call(request)
                     continue
                 work = partial(self._handlers[type(request)], request)
-                self._held.run(_DOING.get(type(request)), work)
+                self._task.run(_DOING.get(type(request)), work)
             now = time.monotonic()
             if self._playing and self._pacer.due(now):
                 self._pacer.spend()
-                self._held.run("stepping", self._control_step)
+                self._task.run("stepping", partial(self._task.guarded, self._step_once))
             if self._cameras.placing_due:
-                self._held.run("stepping", self._cameras.place_waiting)
+                self._task.run("stepping", self._cameras.place_waiting)
             self._cameras.make(may_block=not self._playing)
             self._send_status(time.monotonic())
             if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
@@ -163,7 +163,7 @@ class Worker:
         """Always answer, or the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
-        problem = self._held.run(doing, lambda: answers.append(self._answer(call)))
+        problem = self._task.run(doing, lambda: answers.append(self._answer(call)))
         if problem is not None:
             answers = [Answer(call.number, why=problem.message, problem=problem)]
         self._line.send(answers[0])
@@ -177,8 +177,8 @@ class Worker:
         except CannotAnswer as error:
             return Answer(call.number, why=str(error))
         except TaskError as error:
-            if self._held.drop_steps_if_interrupted(error):
-                self._held.restore_last_step()
+            if self._task.drop_steps_if_interrupted(error):
+                self._task.restore_last_step()
             return Answer(call.number, why=str(error), problem=error.problem)
 
     def _value(self, question: Question[Any], report: Callable[..., None]) -> object:
@@ -190,7 +190,7 @@ class Worker:
             return loaded[0]
         if isinstance(question, MakeScene):
             return self._scene.scene(question, report)
-        opened = self._held.opened
+        opened = self._task.opened
         if opened is None:
             raise CannotAnswer("no task is loaded")
         if isinstance(question, CameraQuestion):
@@ -224,14 +224,14 @@ class Worker:
         try:
             self._load_version(request, self._line.send)
         except TaskError as error:
-            self._held.drop_steps_if_interrupted(error)
-            self._line.send(LoadFailed(error.problem, self._held.opened is not None, error.classes))
+            self._task.drop_steps_if_interrupted(error)
+            self._line.send(LoadFailed(error.problem, self._task.opened is not None, error.classes))
 
     def _load_version(self, request: Load, send: Callable[[Loaded], None]) -> None:
         self._cameras.settle()
         with self._start_folder.again():
-            self._held.requested_file = named_file(request.task)
-        before, running = self._held.opened, None
+            self._task.requested_file = named_file(request.task)
+        before, running = self._task.opened, None
         if before is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, before, self._last)
         try:
@@ -257,7 +257,7 @@ class Worker:
     def _replace_task(
         self, opened: OpenedTask, report: ReloadReport | None, request: Load, send: Callable[[Loaded], None]
     ) -> None:
-        before, self._held.opened = self._held.opened, opened
+        before, self._task.opened = self._task.opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):
             self._cameras.forget_placed()
@@ -298,15 +298,15 @@ class Worker:
             wait_for_debugger(self._heartbeat.hold)
 
     def _play(self, request: Play) -> None:
-        self._playing = request.playing and self._held.opened is not None
+        self._playing = request.playing and self._task.opened is not None
         self._pacer.start(time.monotonic())
         self._rate.clear()
         self._send_status(None)
 
     def _reset(self, request: Reset) -> None:
-        if self._held.opened is not None:
+        if self._task.opened is not None:
             seeds = self._seeds(request)
-            self._held.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
+            self._task.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
 
     def _seeds(self, request: Reset) -> int | list[int] | None:
         # The random actions restart with the seed, or a reset with it would not repeat an episode.
@@ -327,7 +327,7 @@ class Worker:
             old.policy,
             old.policy_folder,
         ):
-            self._held.run("importing the policy", self._use_action_source)
+            self._task.run("importing the policy", self._use_action_source)
 
     def _use_action_source(self) -> bool:
         """Set the source of actions as in the settings. Returns whether it can be used."""
@@ -336,10 +336,10 @@ class Worker:
             folder = None if s.policy_folder is None else Path(s.policy_folder)
             self._chooser.use(s.action_source, s.policy, folder)
         except TaskError as error:
-            self._held.drop_steps_if_interrupted(error)
+            self._task.drop_steps_if_interrupted(error)
             # Before a task is loaded it would look like a failed load; the first step reports it.
-            if self._held.opened is not None:
-                self._held.fail(error.problem)
+            if self._task.opened is not None:
+                self._task.fail(error.problem)
             return False
         return True
 
@@ -349,21 +349,18 @@ class Worker:
 
     def _inspect(self, request: Inspect) -> None:
         # The page may have asked before it knew of a version with fewer envs.
-        if self._held.opened is not None and request.env < self._held.opened.env.num_envs:
-            self._line.send(inspect_env(self._held.opened.env, request.env, request.sections))
+        if self._task.opened is not None and request.env < self._task.opened.env.num_envs:
+            self._line.send(inspect_env(self._task.opened.env, request.env, request.sections))
 
     def _stop(self, request: Quit) -> None:
         self._quit = True
 
     # --- stepping ----------------------------------------------------------------------------------
 
-    def _control_step(self) -> None:
-        self._held.guarded(self._step_once)
-
     def _single_step(self, request: SingleStep) -> None:
         if self._playing:
             self._pause()
-        self._control_step()
+        self._task.guarded(self._step_once)
 
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
@@ -424,7 +421,7 @@ class Worker:
                 on_step = self._throttled_status(partial(entering_text, request))
                 step, restored = enter_recording(opened, request, on_step)
         except TaskError:
-            self._held.restore_last_step()
+            self._task.restore_last_step()
             raise
         finally:
             self._cameras.put_back()
@@ -443,12 +440,12 @@ class Worker:
         restored: Restored | None = None,
         resumed: bool = False,
     ) -> None:
-        assert self._held.opened is not None
+        assert self._task.opened is not None
         self._last = step
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
         acted_by = "" if restored else self._chooser.name
-        event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored, acted_by, resumed)
+        event = self._steps.event(self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed)
         self._cameras.scene_changed()
         self._line.send(event)
 
@@ -477,7 +474,7 @@ class Worker:
     def _send_rules(self) -> None:
         """Send the rules that the task breaks, if they changed."""
         self._rules_sent = time.monotonic()
-        opened = self._held.opened
+        opened = self._task.opened
         rules = None if opened is None else opened.env.broken_rules
         serial = rules, 0 if rules is None else rules.serial
         if serial == self._rules_serial:
@@ -513,7 +510,7 @@ _DOING: dict[type, Doing] = {
 
 
 def work(connection: int, heartbeat: HeartbeatWriter) -> None:
-    """Run the process; `connection` is the file descriptor of its end of the socket pair."""
+    """Entry point of the worker process; `connection` is the file descriptor of its end of the socket pair."""
     # Tensors of a few thousand numbers: threads only wait for each other (measured: 16 PickCube envs ran 2.8 times faster
     # with one thread than with two).
     torch.set_num_threads(1)

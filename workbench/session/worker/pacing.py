@@ -18,7 +18,7 @@ class Pacer:
     """A budget of simulated time, as in mjlab's base viewer.
 
     Wall time earns simulated time (times the speed), a step spends ``control_dt`` of it, and a step is due when there is
-    enough. So the speed holds whatever a step costs and however uneven the loop is. What the machine cannot keep up with
+    enough. So the speed is right for steps of any cost, even if the loop is uneven. What the machine cannot keep up with
     is forgotten after `_LONGEST_DEBT`, or one slow picture would be followed by a burst.
     """
 

@@ -310,7 +310,7 @@ def _build(
         raise
     opening.clock.lap("restore")
     level = "restarted" if running is None else "rebuilt"
-    reason = change.reason if running is not None else "the worker was started anew"
+    reason = change.reason if running is not None else "the worker was restarted"
     report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried))
     return replace(opened, first=first, milliseconds=opening.clock.laps), report
 

@@ -25,8 +25,8 @@ class StepEvents:
     """
 
     def __init__(self) -> None:
-        self._captured: set[int] = set()
-        self._armed: set[int] = set()
+        self._recording: set[int] = set()
+        self._from_reset: set[int] = set()
         self._columns_fail = False
         self.moment: Snapshot | None = None
         """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
@@ -41,20 +41,20 @@ class StepEvents:
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
         """As `SetCapture`; an env that is captured already continues, also with `from_reset`."""
-        begun = self._captured & set(env_idx) if from_reset else set(env_idx)
-        self._captured, self._armed = begun, set(env_idx) - begun
+        begun = self._recording & set(env_idx) if from_reset else set(env_idx)
+        self._recording, self._from_reset = begun, set(env_idx) - begun
 
     @property
     def recorded(self) -> frozenset[int]:
         """The envs that are recorded, now or from their next reset."""
-        return frozenset(self._captured | self._armed)
+        return frozenset(self._recording | self._from_reset)
 
     def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
         """Whether the event of this step draws; no other picture may be under way then."""
-        begun = {env for env in self._armed if reset_mask[env] and step.elapsed_steps[env] == 0}
-        self._captured |= begun
-        self._armed -= begun
-        return bool(self._captured)
+        begun = {env for env in self._from_reset if reset_mask[env] and step.elapsed_steps[env] == 0}
+        self._recording |= begun
+        self._from_reset -= begun
+        return bool(self._recording)
 
     def event(
         self,
@@ -73,7 +73,7 @@ class StepEvents:
         if self.pictures_due(step, reset_mask):
             columns = self._state_columns(opened)
             wanted = recorded_pictures(opened.description.cameras)
-            captured = tuple(step_pictures(opened.env, sorted(self._captured), wanted))
+            captured = tuple(step_pictures(opened.env, sorted(self._recording), wanted))
         packed = self._packed_snapshot(opened)
         return Stepped(
             step,

@@ -255,7 +255,7 @@ class Page:
             return
         ray = np.array(event.ray_origin), np.array(event.ray_direction)
         if (camera := self._frustums.under_ray(*ray)) is not None:
-            self._studio.select(camera)
+            self._session.studio.select(camera)
             return
         if self._view_panel.only_selected:
             return
@@ -290,12 +290,12 @@ class Page:
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Open or close the table of envs", self._toggle_envs, "B"),
             Command("Next env whose last episode failed", lambda: self._envs.select_next("failed"), "E"),
-            Command("Next env with something odd", lambda: self._envs.select_next("flagged"), "E", "shift"),
+            Command("Next flagged env", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
             Command("Save what I just saw", self._record.save, "C", "shift"),
-            Command("Open or close the list of warnings", self._rules.toggle, "W"),
+            Command("Open or close the list of broken rules", self._rules.toggle, "W"),
             Command("Load the file again", session.versions.reload, "L"),
             Command("Interrupt what the task is doing", session.interrupt, "I"),
             Command("Restart the worker", session.versions.restart_worker, "L", "shift"),

@@ -74,7 +74,7 @@ class Workplace:
         self._imports, self._on_notice = base.imports, on_notice
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
-        self._mending: threading.Thread | None = None
+        self._recovering: threading.Thread | None = None
         self.commands: tuple[Command, ...] = ()
         """In the palette of both pages; set before the first page is shown."""
         self.session = session
@@ -98,26 +98,26 @@ class Workplace:
                 self._shelf = Shelf(library, Review(library, make_scene=scenes))
                 if self.session is None:
                     # With a live env its recorder has recovered them already, and is writing.
-                    self._mending = threading.Thread(
-                        target=self._mend, args=(self._shelf,), name="mend", daemon=True
+                    self._recovering = threading.Thread(
+                        target=self._recover, args=(self._shelf,), name="recover", daemon=True
                     )
-                    self._mending.start()
+                    self._recovering.start()
             return self._shelf
 
-    def _mend(self, shelf: Shelf) -> None:
+    def _recover(self, shelf: Shelf) -> None:
         """Recover episodes of a writer that was killed."""
         try:
-            mended = [str(file) for file in recover_confined(self._recordings)]
+            recovered = [str(file) for file in recover_confined(self._recordings)]
         except OSError as error:
             shelf.review.add_problem(str(error))
             self._on_notice(str(error))
             return
-        if mended:
-            what = "An episode that was" if len(mended) == 1 else f"{len(mended)} episodes that were"
+        if recovered:
+            what = "An episode that was" if len(recovered) == 1 else f"{len(recovered)} episodes that were"
             shelf.review.add_problem(
                 f"{what} left half written by a program that was killed can be seen again."
             )
-            self._on_notice(recovered_text(mended))
+            self._on_notice(recovered_text(recovered))
             shelf.library.request_scan()
 
     def task_files(self) -> tuple[Path, ...]:
@@ -131,8 +131,8 @@ class Workplace:
         self.pages.stop()
         with self._lock:
             if self._shelf is not None:
-                if self._mending is not None:
-                    self._mending.join(timeout=10.0)
+                if self._recovering is not None:
+                    self._recovering.join(timeout=10.0)
                 self._shelf.review.close()
                 self._shelf.library.close()
         for part in (self.sharing, self.dialog, self.rescorer.rescoring, self.go_live):

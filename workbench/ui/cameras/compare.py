@@ -33,7 +33,7 @@ class CameraCompare:
             self._other = server.gui.add_dropdown(
                 "Now, with",
                 (FILE, KEPT),
-                hint="The placement that stands beside the one that the camera has now.",
+                hint="The placement to compare with the camera's present one.",
             )
             self._keep = server.gui.add_button(
                 "Keep this placement as A",

@@ -40,7 +40,7 @@ UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
 """Digits of the shown numbers."""
 FOV, INTRINSIC = "field of view", "intrinsic matrix"
 GOES_ALONG = "What it looks at goes along with the position. To keep it: Place, eye and target."
-STAYS = "Each moves alone: the camera goes on looking at its target."
+STAYS = "Each moves alone: the camera keeps looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 """The shader packs of ManiSkill 3."""
 SMALLEST, LARGEST = 8, 4096
@@ -133,7 +133,7 @@ class CameraNumbers:
 
     def _build_orientation(self) -> None:
         self._orientation = self._gui.add_dropdown(
-            "Turned", (RPY, WXYZ, AXES), initial_value=RPY, hint="How its orientation is said below."
+            "Turned", (RPY, WXYZ, AXES), initial_value=RPY, hint="How its orientation is written below."
         )
         self._rpy = self._field(
             "Degrees",

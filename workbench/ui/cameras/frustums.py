@@ -45,7 +45,7 @@ class CameraFrustums:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._drawn: dict[CameraKey, InView] = {}
-        self._worn: dict[CameraKey, Picture] = {}
+        self._drawn_pictures: dict[CameraKey, Picture] = {}
 
     def draw(
         self,
@@ -73,7 +73,7 @@ class CameraFrustums:
         }
         for key in [key for key in self._drawn if key not in shown]:
             self._drawn.pop(key).draw()
-            self._worn.pop(key, None)
+            self._drawn_pictures.pop(key, None)
         for key, picture in shown.items():
             self._draw_one(known[key], picture, placed.get(key), offset, size)
 
@@ -131,9 +131,13 @@ class CameraFrustums:
                 add, "wxyz", "position", "scale", "fov", "aspect", "thickness"
             )
         frustum.draw(wxyz, position, size, fov, aspect, thickness)
-        if picture is not None and picture is not self._worn.get(camera.key) and picture.rgb is not None:
+        if (
+            picture is not None
+            and picture is not self._drawn_pictures.get(camera.key)
+            and picture.rgb is not None
+        ):
             # Assigning encodes and sends it, even the same picture.
-            self._worn[camera.key] = picture
+            self._drawn_pictures[camera.key] = picture
             frustum.handle.image = small_image(picture)
 
 

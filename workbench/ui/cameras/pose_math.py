@@ -234,7 +234,7 @@ class Placing:
             ValueError: it is too far away for any task.
         """
         if not all(abs(x) <= FARTHEST for x in settings.position):
-            raise ValueError(f"A camera stands within {FARTHEST:g} m of the origin.")
+            raise ValueError(f"A camera must be within {FARTHEST:g} m of the origin.")
         self._session.studio.place(key, settings, control, pause)
 
     def change(self, control: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:

@@ -38,7 +38,7 @@ class CameraReportPanel:
                 "Over",
                 OVERS,
                 hint="The envs at the moment that is shown; the selected env's episode, step by step; or freshly reset "
-                "envs with other seeds, in a process beside.",
+                "envs with other seeds, in another process.",
             )
             self._steps = server.gui.add_number(
                 "Steps",

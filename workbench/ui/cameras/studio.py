@@ -45,13 +45,13 @@ TURN = 1.0
 """Degrees by which a key turns it."""
 PLACE = (
     "move, turn: its pose. Move it, and what it looks at goes along; or turn it.\n"
-    "eye and target: move the eye, and it goes on looking at its target; or move the target."
+    "eye and target: move the eye, and it keeps looking at its target; or move the target."
 )
 ALONG = "Along which axes it is moved and turned. The camera's own: red is forward, green left, blue up."
 STEPS = "The step size of a drag."
-SIZE = "Of the picture above, for a quick look. The camera keeps its own."
+SIZE = "Of the preview above. The camera keeps its own."
 VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
-IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
+IN_ITS_EYE = "You look from its position. Move the view, and its handles appear."
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class StudioPanel(PagePart[SessionView]):
         self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NO_CAMERA, visible=False),
             read=lambda name: self._names.get(name),
-            send=self.select,
+            send=session.studio.select,
             shown=self._name_of,
         )
         self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
@@ -116,11 +116,6 @@ class StudioPanel(PagePart[SessionView]):
     def shows(self) -> str:
         """The modality to render of the chosen camera."""
         return self._picture.shows
-
-    # --- choice ------------------------------------------------------------------------------------------
-
-    def select(self, key: CameraKey | None) -> None:
-        self._session.studio.select(key)
 
     def _name_of(self, key: CameraKey | None) -> str | None:
         return next((name for name, known in self._names.items() if known == key), NO_CAMERA)
@@ -223,7 +218,7 @@ class StudioPanel(PagePart[SessionView]):
             took=f"{view.picture_milliseconds:.0f}"
             if view.picture_milliseconds and view.studio.preview_scale == 1.0
             else "",
-            quick=_quick_words(camera, view.studio.preview_scale),
+            quick=_preview_text(camera, view.studio.preview_scale),
         )
 
     def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
@@ -378,11 +373,11 @@ def _placed(camera: StudioCamera) -> CameraSettings:
     return camera.now
 
 
-def _quick_words(camera: StudioCamera, scale: float) -> str:
+def _preview_text(camera: StudioCamera, scale: float) -> str:
     if scale == 1.0 or camera.now is None:
         return ""
     width, height = round(camera.now.width * scale), round(camera.now.height * scale)
     return (
-        f"The picture is {width} × {height} for a quick look; the camera stays {camera.now.width} × "
+        f"The preview is {width} × {height}; the camera stays {camera.now.width} × "
         f"{camera.now.height}, and only that is written."
     )

@@ -117,7 +117,7 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
 ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
 WHERE = (
-    "A new sensor looks at the task's objects from the side that you look from; one for people stands where you look "
+    "A new sensor looks at the task's objects from the side that you look from; one for people is placed where you look "
     "from. Its picture comes with the change, before anything is written."
 )
 LONGEST_NAME = 64
@@ -318,7 +318,7 @@ def first_place(
         names: of the objects to see.
         places: (K, 3) of the objects in all envs, each in its env's frame.
     """
-    stays = "It stands where you look from."
+    stays = "It is placed where you look from."
     if not len(places):
         return seen_from, stays
     pose = pose_of(seen_from)

@@ -70,10 +70,10 @@ class LibraryEdits:
             removed = [tag for tag in shared if tag not in tags]
             self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
 
-        known = sorted({tag for row in self._library.rows() for tag in row.tags})
+        known = sorted({tag for row in self._library.view().rows for tag in row.tags})
         explained = "Words, with commas between them."
         if len(rows) > 1:
-            explained += " Those that all of them have stand here; others that they have stay."
+            explained += " Tags that all of them have are shown here; their other tags stay."
         if known:
             explained += f" In use: {', '.join(known[:MOST_KNOWN])}."
         self._ask("Tags", "", rows, explained, "Save", answered, ", ".join(shared))

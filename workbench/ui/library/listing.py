@@ -153,7 +153,7 @@ class LibraryList:
     def look_for(self, words: str, task: str | None) -> None:
         """List the rows with these words and of this task, if it still has recordings."""
         with self.lock:
-            known = {row.task for row in self._library.rows()}
+            known = {row.task for row in self._library.view().rows}
             words = words[:LONGEST_WORDS]
             task = task if task in known else None
             if (words, task) != (self.words, self.task):

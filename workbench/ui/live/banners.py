@@ -107,7 +107,7 @@ def _kept(view: SessionView) -> str:
     if view.state == "stopped":
         return "The worker process is gone, so nothing moves until there is a new one."
     if view.task is None:
-        return "There is no version to show yet. Mend the file and save it; the page follows."
+        return "There is no version to show yet. Fix the file and save it; the page follows."
     if view.problem is not None and view.problem.stage == "worker":
         if view.state in ("starting", "loading"):
             return "Another worker takes over; the last good version comes back where it was."
@@ -164,7 +164,7 @@ def busy_html(busy: Busy, view: SessionView) -> str:
     """The banner's content."""
     if busy.ignores_interrupt:
         advice = (
-            "It was interrupted and goes on: it is in native code, or it catches every exception. Restart ends the "
+            "It was interrupted and continues: it is in native code, or it catches every exception. Restart ends the "
             "process; the last good version comes back where it was."
         )
     elif busy.drawing:
@@ -172,7 +172,7 @@ def busy_html(busy: Busy, view: SessionView) -> str:
     else:
         advice = (
             "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process, and "
-            "the last good version comes back where it was. Saving a mended file does as much."
+            "the last good version comes back where it was. Saving a fixed file does the same."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     return render("busy", subject=subject, busy=busy, advice=advice)

@@ -77,7 +77,9 @@ def said_of(reward: NDArray[np.float32]) -> str:
     lost = nonfinite_text(reward)
     if not lost:
         return ""
-    rest = ": no curve goes on there." if not np.isfinite(reward).any() else "; the mean is of the others."
+    rest = (
+        ": every curve has a gap there." if not np.isfinite(reward).any() else "; the mean is of the others."
+    )
     return (
         f"The reward is {lost} envs{rest}"
         if len(reward) > 1

@@ -24,7 +24,7 @@ from workbench.ui.widgets.templates import place, render
 NEWS = 6.0
 """Seconds for which a new version is announced."""
 
-WORDS = {
+STATE_WORDS = {
     "starting": "starting",
     "loading": "loading",
     "running": "running",
@@ -58,7 +58,7 @@ class StatusLine(PagePart[SessionView]):
         self._env_rows, self._on_flagged = env_rows, on_flagged
         self._handle = server.gui.add_html("")
         # An element of its own: the line above is replaced four times a second, and a press on it would be lost.
-        self._standing = server.gui.add_html("", visible=False)
+        self._flagged_mark = server.gui.add_html("", visible=False)
         # At the end of the panel, after the tabs: everything after it is hidden.
         self._presses = Presses(server)
         self._clock = clock
@@ -84,11 +84,11 @@ class StatusLine(PagePart[SessionView]):
         self._handle.content = render(
             "status_line", **status_values(view, self._is_fresh(view), marked=flagged is not None)
         )
-        self._standing.visible = flagged is not None
+        self._flagged_mark.visible = flagged is not None
         if flagged is not None:
             text, hint = flagged
             press = self._presses.id_of("flagged", lambda _: self._on_flagged())
-            self._standing.content = render("standing_mark", text=text, hint=hint, press_id=press)
+            self._flagged_mark.content = render("flagged_mark", text=text, hint=hint, press_id=press)
 
 
 def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
@@ -120,7 +120,7 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
     return {
         "view": view,
         "state": view.state if busy is None else "loading",
-        "word": WORDS[_state(view, busy)],
+        "word": STATE_WORDS[_state(view, busy)],
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "activity": view.activity if busy is None else _doing(busy),
         "news": _news(view) if fresh else "",
@@ -144,7 +144,7 @@ def _doing(busy: Busy) -> str:
         return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
     if busy.held:
         at = f" at {place(busy)}" if busy.file else ""
-        return f"by a debugger{at} for {busy.seconds:.0f} s; it goes on from there, not from this page"
+        return f"by a debugger{at} for {busy.seconds:.0f} s; continue from there, not from this page"
     if busy.getting_ready:
         return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
@@ -160,7 +160,7 @@ def _news(view: SessionView) -> str:
 class RulesMark(PagePart[SessionView]):
     """The mark of broken rules below the status line; a press opens the list.
 
-    A broken rule that only warns stops nothing, so the mark stays until the file is mended.
+    A broken rule that only warns stops nothing, so the mark stays until the file is fixed.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:

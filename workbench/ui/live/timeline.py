@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.history.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
 from workbench.session.live.timeline import Scope, Strip
 from workbench.session.live.view import SessionView
@@ -164,7 +164,7 @@ class TimelinePanel(TimeBar[SessionView]):
         # last row is cut off until then, and a second press on "step" would hit another button.
         self._hint = gui.add_html("")
         self._travel = gui.add_button_group("", (GO_ON,), visible=False)
-        name_control(self._travel, "way to go on")
+        name_control(self._travel, "way to continue")
 
     # --- buttons and keys --------------------------------------------------------------------------
 
@@ -254,7 +254,7 @@ POINTS = 240
 LINE_HEIGHT = 30.0
 """Height of the line in the picture's units; the marks are above."""
 FLAGS = {
-    NOT_A_NUMBER: "odd",
+    REWARD_NONFINITE: "odd",
     FAIL: "fail",
     SUCCESS: "success",
     TRUNCATED: "limit",

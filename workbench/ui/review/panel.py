@@ -28,8 +28,8 @@ class ReviewPanel(PagePart[ReviewView]):
     Args:
         server: The page.
         review: Of the page.
-        on_step_back: Called with the id of the selected recording and the state that is shown, when a person wants to
-            go on from there live, and again when they would rather stay.
+        on_go_live: Called with the id of the selected recording and the state that is shown, when a person wants to
+            continue from there live, and again to stay in the review instead.
         going: What is waited for on the way to the live env.
     """
 
@@ -37,10 +37,10 @@ class ReviewPanel(PagePart[ReviewView]):
         self,
         server: viser.ViserServer,
         review: Review,
-        on_step_back: Callable[[str, int], None],
+        on_go_live: Callable[[str, int], None],
         going: Callable[[], str],
     ) -> None:
-        self._review, self._on_step_back, self._going = review, on_step_back, going
+        self._review, self._on_go_live, self._going = review, on_go_live, going
         gui = server.gui
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, visible=False)
         self._play.on_click(lambda _: review.toggle_play())
@@ -71,13 +71,13 @@ class ReviewPanel(PagePart[ReviewView]):
             "Align at", ("start",), initial_value="start", visible=False
         )
         self._align = Control(align, send=review.align)
-        self._never = gui.add_html("")
+        self._unaligned_note = gui.add_html("")
         self._facts = gui.add_html("")
         self._changes = ChangesOnDisk()
         self._presses = Presses(server)
         self._listed: object = None
         """What the list was drawn for."""
-        self._told: tuple[Opened, str] | None = None
+        self._facts_of: tuple[Opened, str] | None = None
         """What the facts were drawn for."""
 
     @property
@@ -94,7 +94,7 @@ class ReviewPanel(PagePart[ReviewView]):
     def enter_recording(self) -> None:
         view = self._review.view()
         if view.chosen is not None:
-            self._on_step_back(view.chosen.id, view.states[view.selected])
+            self._on_go_live(view.chosen.id, view.states[view.selected])
 
     def select_neighbour(self, step: int) -> None:
         """Select the next (1) or previous (-1) open recording, wrapping around."""
@@ -125,11 +125,12 @@ class ReviewPanel(PagePart[ReviewView]):
         if self._align.handle.options != view.alignments:
             self._align.handle.options = view.alignments
         self._align.show(view.align)
-        self._never.content = render("note", text=never_words(view)) if never_words(view) else ""
-        told = view.chosen and (view.chosen, self._changes.of(view.chosen.episode.info))
-        if self._told != told:
-            self._told = told
-            self._facts.content = facts_html(*told) if told else ""
+        unaligned = unaligned_text(view)
+        self._unaligned_note.content = render("note", text=unaligned) if unaligned else ""
+        facts_of = view.chosen and (view.chosen, self._changes.of(view.chosen.episode.info))
+        if self._facts_of != facts_of:
+            self._facts_of = facts_of
+            self._facts.content = facts_html(*facts_of) if facts_of else ""
 
     def _list_html(self, view: ReviewView) -> str:
         if not view.opened and view.loading:
@@ -144,7 +145,7 @@ class ReviewPanel(PagePart[ReviewView]):
         return render("review_opened", view=view, presses=presses, outcome_text=outcome_text)
 
 
-def never_words(view: ReviewView) -> str:
+def unaligned_text(view: ReviewView) -> str:
     """The note on recordings without the event that they are aligned at."""
     name = view.align.removeprefix("first ")
     without = [letter(i) for i, one in enumerate(view.opened) if one.first(name) is None]

@@ -103,17 +103,17 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
                 name = geometry.body_names[int(body)]
                 if name in left_out:
                     continue
-                worn = replace(visual, material=tinted(visual.material, colour(index))) if ghost else visual
+                shape = replace(visual, material=tinted(visual.material, colour(index))) if ghost else visual
                 # Recordings share their shapes (`SharedShapes`): one fingerprint for each.
                 object_ = (id(visual.mesh), id(visual.material), index if ghost else -1)
                 if object_ not in known:
-                    known[object_] = fingerprint((worn,))
+                    known[object_] = fingerprint((shape,))
                 looks = known[object_]
                 number = 0
                 # The same shape twice on one body stays two visuals, as in the recording.
                 while (looks, rows[name], number) in shapes and index in shapes[looks, rows[name], number][1]:
                     number += 1
-                shapes.setdefault((looks, rows[name], number), (worn, []))[1].append(index)
+                shapes.setdefault((looks, rows[name], number), (shape, []))[1].append(index)
     visuals = tuple(
         Visual(
             name=f"{visual.name} {number}",

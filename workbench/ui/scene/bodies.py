@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from workbench.core.scene.shapes import SceneGeometry, fingerprint
 from workbench.core.scene.simplify import reduce_mesh
 from workbench.ui.scene.env_grid import EnvLayout, InView, place_of_plane, plane_normal
-from workbench.ui.scene.glb import WornTogether, as_glb, face_limit, group_by_wearers
+from workbench.ui.scene.glb import VisualGroup, as_glb, face_limit, group_visuals
 
 NAMES = ("/envs", "/floor")
 """Roots of its nodes in viser's tree."""
@@ -58,7 +58,7 @@ class SceneView:
         shown_envs = geometry.num_envs if only_env is None else 1
         limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, triangles)
         before, self._drawn = self._drawn, {}
-        for group in group_by_wearers(geometry):
+        for group in group_visuals(geometry):
             looks = fingerprint(group.visuals)
             key = (looks, limit, sum(looks == known for known, _, _ in self._drawn))
             first = group.visuals[0]
@@ -70,7 +70,7 @@ class SceneView:
             if drawn is None:
                 self._number += 1
                 drawn = _DrawnGroup(self._server, self._number, group, limit)
-            drawn.wear(group, once)
+            drawn.set_instances(group, once)
             self._drawn[key] = drawn
         for drawn in before.values():
             drawn.handle.remove()
@@ -105,7 +105,7 @@ class SceneView:
 
 
 class _DrawnGroup:
-    def __init__(self, server: viser.ViserServer, number: int, group: WornTogether, limit: int) -> None:
+    def __init__(self, server: viser.ViserServer, number: int, group: VisualGroup, limit: int) -> None:
         glb = as_glb([(reduce_mesh(visual.mesh, limit), visual.material) for visual in group.visuals])
         # One instance far below the ground; the first move follows in the same batch.
         self.handle = server.scene.add_batched_glb(
@@ -118,9 +118,9 @@ class _DrawnGroup:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self.wear(group, None)
+        self.set_instances(group, None)
 
-    def wear(self, group: WornTogether, once: NDArray[np.float32] | None) -> None:
+    def set_instances(self, group: VisualGroup, once: NDArray[np.float32] | None) -> None:
         """Set the (env, body) pairs that it is drawn for; a floor or wall is drawn once, moved by `once` (3,)."""
         self._group, self._once = group, once
 
@@ -128,20 +128,20 @@ class _DrawnGroup:
         envs, bodies = self._group.envs, self._group.bodies
         if self._once is not None:
             envs, bodies = envs[:1], bodies[:1]
-            worn = poses[envs, bodies]
-            positions = worn[:, :3] + (self._once if only_env is None else 0)
+            instances = poses[envs, bodies]
+            positions = instances[:, :3] + (self._once if only_env is None else 0)
         elif only_env is None:
-            worn = poses[envs, bodies]
-            positions = worn[:, :3] + layout.offsets[envs]
+            instances = poses[envs, bodies]
+            positions = instances[:, :3] + layout.offsets[envs]
         else:
             mine = envs == only_env
-            worn = poses[envs[mine], bodies[mine]]
-            positions = worn[:, :3]
-        there = np.isfinite(worn).all(axis=1)
+            instances = poses[envs[mine], bodies[mine]]
+            positions = instances[:, :3]
+        there = np.isfinite(instances).all(axis=1)
         if not there.all():
-            worn, positions = worn[there], positions[there]
+            instances, positions = instances[there], positions[there]
         self.handle.visible = bool(len(positions))
         if len(positions):
             # Equal arrays are not sent again (viser compares), so bodies at rest cost no bytes.
             self.handle.batched_positions = np.ascontiguousarray(positions)
-            self.handle.batched_wxyzs = np.ascontiguousarray(worn[:, 3:])
+            self.handle.batched_wxyzs = np.ascontiguousarray(instances[:, 3:])

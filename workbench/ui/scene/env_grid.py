@@ -67,8 +67,8 @@ def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDA
     thin = int(extent.argmin())
     if extent[thin] > FLOOR_THICKNESS or np.sort(extent)[1] < FLOOR_WIDTH:
         return None
-    worn = poses[visual.envs[0], visual.bodies[0]].astype(np.float64)
-    return SO3(worn[3:]).apply(np.eye(3)[thin]) if np.isfinite(worn).all() else None
+    pose = poses[visual.envs[0], visual.bodies[0]].astype(np.float64)
+    return SO3(pose[3:]).apply(np.eye(3)[thin]) if np.isfinite(pose).all() else None
 
 
 def place_of_plane(normal: NDArray, visual: Visual, poses: NDArray, layout: EnvLayout) -> NDArray[np.float32]:
@@ -180,9 +180,9 @@ def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:
     """(K', 8, 3) corners of each instance's box in its env's frame, without absent instances."""
     low, high = visual.mesh.vertices.min(axis=0), visual.mesh.vertices.max(axis=0)
     corners = box_corners(low, high)
-    worn = poses[visual.envs, visual.bodies].astype(np.float64)
-    worn = worn[np.isfinite(worn).all(axis=1)]
-    return SO3(worn[:, None, 3:]).apply(corners[None]) + worn[:, None, :3]
+    instances = poses[visual.envs, visual.bodies].astype(np.float64)
+    instances = instances[np.isfinite(instances).all(axis=1)]
+    return SO3(instances[:, None, 3:]).apply(corners[None]) + instances[:, None, :3]
 
 
 # --- Mark of the selected env: a frame and its number ------------------------------------------

@@ -22,7 +22,7 @@ LAYER = 4e-4
 
 
 @dataclass(frozen=True)
-class WornTogether:
+class VisualGroup:
     """Visuals of exactly the same (env, body) pairs, drawn as one node.
 
     A frame then costs two messages a link instead of two a part; viser tears a frame that needs more than 128.
@@ -36,7 +36,7 @@ class WornTogether:
     """(K,)"""
 
 
-def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
+def group_visuals(geometry: SceneGeometry) -> tuple[VisualGroup, ...]:
     """The visuals of a scene, grouped by the (env, body) pairs that have them."""
     groups: dict[tuple[bytes, bytes], list[Visual]] = {}
     for visual in geometry.visuals:
@@ -44,7 +44,7 @@ def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
             key = (visual.envs.tobytes(), visual.bodies.tobytes())
             groups.setdefault(key, []).append(visual)
     return tuple(
-        WornTogether(name=group[0].name, visuals=tuple(group), envs=group[0].envs, bodies=group[0].bodies)
+        VisualGroup(name=group[0].name, visuals=tuple(group), envs=group[0].envs, bodies=group[0].bodies)
         for group in groups.values()
     )
 

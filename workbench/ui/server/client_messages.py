@@ -185,4 +185,4 @@ def _check_numbers(*numbers: float) -> None:
 
 def _check_rotation(wxyz: Quadruple) -> None:
     if not 0.5 <= math.hypot(*wxyz) <= 2.0:
-        raise ImpossibleValue("a rotation that is none")
+        raise ImpossibleValue("an invalid rotation")

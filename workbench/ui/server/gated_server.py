@@ -179,20 +179,20 @@ class _AccessCheck:
         request: Request,
     ) -> Response | None:
         asked = request_parts(request)
-        verdict = access.decide(self.rules, asked)
-        if isinstance(verdict, access.RefusedRequest):
-            self._count(verdict, connection)
-            return self._refuse(verdict.reason)
+        decision = access.decide(self.rules, asked)
+        if isinstance(decision, access.RefusedRequest):
+            self._count(decision, connection)
+            return self._refuse(decision.reason)
         if isinstance(connection, Connection):
             connection.admit()
-        if asked.websocket and isinstance(verdict, access.Admitted):
+        if asked.websocket and isinstance(decision, access.Admitted):
             return viser_hook(connection, request)
         # websockets gives up 10 s after it handed the last byte to the kernel; on a slow line megabytes are still on
         # their way then.
         connection.close_timeout = RESPONSE_SECONDS
-        if isinstance(verdict, access.Entered):
-            return entered_reply(verdict)
-        return await admitted_reply(routes, viser_hook, connection, request, verdict.authority)
+        if isinstance(decision, access.Entered):
+            return entered_reply(decision)
+        return await admitted_reply(routes, viser_hook, connection, request, decision.authority)
 
     def say_the_rest(self) -> None:
         """At the end: print what was held back, and how many requests were refused in all."""
@@ -227,11 +227,11 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
     token = secrets.token_urlsafe(32) if options.token else None
     rules = access.AccessRules(token=token, names=_our_names(options), any_address=not listening.loopback)
     told = RareLog()
-    keeper = _AccessCheck(rules, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
+    access_check = _AccessCheck(rules, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
 
     def wrap(viser_hook: viser_private.Hook) -> viser_private.AsyncHook:
-        return functools.partial(keeper.answer, routes, viser_hook)
+        return functools.partial(access_check.answer, routes, viser_hook)
 
     try:
         gated = viser_private.make_viser(listening.socket, wrap, label, RESPONSE_SECONDS, told)
@@ -246,15 +246,15 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
         warning=None
         if listening.loopback
         else (
-            f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can try the "
-            "door, and the token and everything on the page travel unencrypted. Whoever has the address with the "
+            f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can send "
+            "requests, and the token and everything on the page travel unencrypted. Anyone with the address and its "
             "token can run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
         ),
         notice=None
         if listening.path is not None or options.port in (0, listening.port)
         else f"Port {options.port} is taken by another program, so this page is on port {listening.port}.",
         _listening=listening,
-        _access_check=keeper,
+        _access_check=access_check,
         _gated=gated,
         _routes=routes,
     )
@@ -265,7 +265,7 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
     except BaseException:
         gated_server.close()
         raise
-    keeper.tells = True
+    access_check.tells = True
     gated_server.add_route("/workbench/", folder_handler(web_assets_folder()))
     return gated_server
 

@@ -172,7 +172,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
         others_write = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
         if found.st_uid not in (os.getuid(), 0) or others_write:
             raise ServerError(
-                f"Others can write into {folder}, and could put a socket of theirs in place of this one. Give a "
+                f"Others can write into {folder}, and could replace this socket with their own. Give a "
                 "folder that is yours alone, such as one made with mkdir -m 700."
             )
         fcntl.flock(handle, fcntl.LOCK_EX)

@@ -90,7 +90,7 @@ class PageGuard:
             await asyncio.sleep(0)
 
     def admits(self, raw: object) -> bool:
-        """Whether a frame goes on to viser; False drops it.
+        """Whether a frame is passed on to viser; False drops it.
 
         Raises:
             MalformedMessage: Close the connection.

@@ -35,7 +35,7 @@ from workbench.recording.films import (
     write_mp4,
 )
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
-from workbench.recording.reader.reading import read_source
+from workbench.recording.reader.reading import read_recording
 from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
 from workbench.ui.widgets.templates import counted, sentence
 
@@ -113,7 +113,7 @@ def file_name(what: What, source: str, camera: str = "") -> str:
 
 
 def _of_readable(wanted: MakeRequest, source: Source, on_progress: OnProgress) -> list[Path]:
-    episode = read_source(source)
+    episode = read_recording(source)
     try:
         return _of_one(wanted, source, episode, on_progress)
     except ValueError as error:
@@ -155,7 +155,7 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
 def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     count = len(wanted.sources)
     made = export_lerobot(
-        [(source.stem, partial(read_source, source)) for source in wanted.sources],
+        [(source.stem, partial(read_recording, source)) for source in wanted.sources],
         wanted.folder,
         wanted.export,
         lambda done, doing: on_progress(done / max(count, 1), doing),
@@ -181,7 +181,7 @@ def _counted(
         yield picture
 
 
-# --- Making in a process of its own, while the page goes on ------------------------------------
+# --- Making in a process of its own, while the page continues ------------------------------------
 
 
 END_SECONDS = 5.0

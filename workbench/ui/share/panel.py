@@ -80,7 +80,7 @@ class SharePanel:
         self._fitting = server.gui.add_checkbox(
             "Only what fits",
             True,
-            hint="Leave out recordings that cannot be read, or lack what the first one has; which is said",
+            hint="Leave out recordings that cannot be read, or lack what the first one has; the result names them",
         )
         self._task = server.gui.add_text(
             "Task", "", hint="In words, for policies that read; empty: the task's id"
