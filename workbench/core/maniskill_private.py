@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache, cached_property, wraps
 from itertools import islice
@@ -33,7 +33,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind
-from workbench.machine.versions import PrivateName, moved_text
+from workbench.machine.versions import PrivateName, moved_text, untested_text
 
 # --- what depends on which name ---------------------------------------------------------------------
 
@@ -98,7 +98,17 @@ def moved_names() -> tuple[PrivateName, ...]:
 
 def why_not(feature: str) -> str:
     """Why the installed ManiSkill does not allow this (`PLACING`, ...; empty: any task); empty if it does."""
-    return moved_text(each for each in moved_names() if each.disables == feature)
+    return _with_advice(each for each in moved_names() if each.disables == feature)
+
+
+def version_notice() -> str:
+    """What the installed ManiSkill does not allow, all together; empty if nothing."""
+    return _with_advice(moved_names())
+
+
+def _with_advice(moved: Iterable[PrivateName]) -> str:
+    text = moved_text(moved)
+    return f"{text} {untested_text()}".rstrip() if text else ""
 
 
 parse_cameras: Callable[[Any], dict[str, Any]] = (

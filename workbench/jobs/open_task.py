@@ -39,11 +39,10 @@ from workbench.core.env.assets import MissingAssets
 from workbench.core.env.cpu_scene import BatchedCpuMixin, ForgottenInit
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.maniskill_private import moved_names, parse_cameras
+from workbench.core.maniskill_private import parse_cameras, version_notice
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
-from workbench.machine.versions import moved_text
 
 
 @dataclass(frozen=True)
@@ -280,7 +279,7 @@ def describe(
 def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
     """Notices about a task that works, as sentences."""
     own = loaded.notices if loaded.followed else ()
-    of_machine = (unused_gpu_text(options.backend), moved_text(moved_names()))
+    of_machine = (unused_gpu_text(options.backend), version_notice())
     return (*own, *(text for text in of_machine if text))
 
 

@@ -100,20 +100,18 @@ def command_for_tested_versions() -> str:
 
 def untested_text() -> str:
     """What is installed that no test was run with, and the command for the tested versions; empty if all is tested."""
-    versions = ", ".join(f"{name} {version}" for name, version in untested().items())
+    names = ", ".join(f"{name} {version}" for name, version in untested().items())
     return (
-        f"Not tested with the workbench: {versions}. The tested versions: {command_for_tested_versions()}"
-        if versions
+        f"Not tested with the workbench: {names}. The tested versions: {command_for_tested_versions()}"
+        if names
         else ""
     )
 
 
 def moved_text(moved: Iterable[PrivateName]) -> str:
-    """Which names have moved, what does not work without them, and the tested versions; empty if none has moved."""
+    """What does not work, by which names that have moved; empty if none has moved."""
     lacking: dict[str, list[str]] = {}
     for each in moved:
         lacking.setdefault(each.disables or "opening a task", []).append(each.dotted)
-    if not lacking:
-        return ""
-    parts = "; ".join(f"{feature} (needs {', '.join(names)})" for feature, names in lacking.items())
-    return f"Not possible with the installed versions: {parts}. {untested_text()}".rstrip()
+    features = "; ".join(f"{feature} (needs {', '.join(names)})" for feature, names in lacking.items())
+    return f"Not possible with the installed versions: {features}." if features else ""
