@@ -179,6 +179,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     find_rows(Articulation, "_data_index", "_objs", "index", torch.int32)
     find_rows(ArticulationJoint, "_data_index", "_physx_articulations", "index", torch.int32)
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
+    ManiSkillScene.get_contacts = get_contacts
     if why_not(POSE_CONTROL):
         return
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]

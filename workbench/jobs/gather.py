@@ -18,14 +18,16 @@ from workbench.core.camera_data import Picture
 from workbench.core.capture.recorded_run import STATE, states_of
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.task import Stepped, TaskDescription
+from workbench.machine import DISTRIBUTION
 from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.versions import MANISKILL
 from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files
 from workbench.recording.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
 from workbench.recording.writing.publish import RecordingError
 
-_PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk")
+_PACKAGES = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 
 
 @dataclass

@@ -43,6 +43,7 @@ from workbench.core.maniskill_private import parse_cameras, version_notice
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
+from workbench.machine.versions import moved_text, untested, untested_text
 
 
 @dataclass(frozen=True)
@@ -279,8 +280,21 @@ def describe(
 def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
     """Notices about a task that works, as sentences."""
     own = loaded.notices if loaded.followed else ()
-    of_machine = (unused_gpu_text(options.backend), version_notice())
+    of_machine = (unused_gpu_text(options.backend), version_notice(), _rerun_notice())
     return (*own, *(text for text in of_machine if text))
+
+
+def _rerun_notice() -> str:
+    """What an untested rerun does not allow; empty if nothing."""
+    if not untested(["rerun-sdk"]):
+        return ""  # rerun is not imported to open a task: it takes 0.3 s
+    try:
+        from workbench.recording.rerun.private_api import PRIVATE_NAMES
+
+        text = moved_text(each for each in PRIVATE_NAMES if not each.exists())
+    except ImportError as error:
+        text = f"Recordings are not possible: {error}."
+    return f"{text} {untested_text()}" if text else ""
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import gzip
 import http.client
 import os
+import re
 import socket
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import psutil
 import pytest
@@ -20,7 +22,7 @@ from tests.drive.page import page_at
 from workbench.cli.terminal import print_addresses
 from workbench.machine.folders import web_assets_folder
 from workbench.ui.server import gated_server as door_module
-from workbench.ui.server import listening, viser_private
+from workbench.ui.server import listening, responses, viser_private
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import DEFAULT_PORT, ServerError
@@ -235,7 +237,6 @@ def test_nothing_is_printed_but_by_us(child_process: None):
 
 
 def test_viser_has_every_private_name_that_the_seam_relies_on(gated_server):
-    assert viser.__version__ == viser_private.WRITTEN_FOR
     assert viser_private.missing_names() == []
     for name in viser_private.PRIVATE_ATTRIBUTES:
         here = gated_server.server
@@ -257,9 +258,28 @@ def test_a_name_that_viser_took_away_is_named(name, monkeypatch):
 def test_a_viser_that_moved_opens_no_door(monkeypatch):
     before = threading.active_count()
     monkeypatch.delattr(viser._messages, "ShareUrlRequest")
-    with pytest.raises(ServerError, match=r"ShareUrlRequest.*viser==1\.1\.1"):
+    with pytest.raises(ServerError, match=r"ShareUrlRequest.*viser==\d"):
         open_server(ServerOptions(port=0))
     assert threading.active_count() == before
+
+
+def test_the_scripts_of_the_installed_page_are_the_known_ones() -> None:
+    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    first, _ = viser_private.page_scripts() or ("", "")
+    inline = re.findall(r"<script[^>]*>(.+?)</script>", page.read_text(), re.S)
+    assert f"sha256-{first}" in map(responses.hash_of, inline)
+
+
+def test_with_a_viser_whose_page_is_not_known_the_terminal_says_what_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert viser_private.unknown_page_text() == ""
+    monkeypatch.setattr(viser, "__version__", "9.9")
+    door = open_server(ServerOptions(port=0))
+    try:
+        assert door.warning and "viser 9.9 is not tested" in door.warning and "viser==" in door.warning
+    finally:
+        door.close()
 
 
 def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):

@@ -134,7 +134,7 @@ def test_what_viser_serves_besides_its_page_stays_as_it_is() -> None:
 
 
 def test_a_page_without_a_head_is_an_error_that_names_viser() -> None:
-    with pytest.raises(ValueError, match="viser .* serves a page with a </head>"):
+    with pytest.raises(ValueError, match="viser's page has no </head>"):
         with_our_head(b"<html>", False)
 
 

@@ -16,6 +16,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from workbench.machine.folders import web_assets_folder
+from workbench.machine.versions import command_for_tested_versions
 from workbench.ui.server import access, viser_private
 from workbench.ui.server.listening import DEFAULT_PORT, Listening, ServerError, listen_on_file, listen_on_port
 from workbench.ui.server.responses import (
@@ -92,7 +93,7 @@ class GatedServer:
     ssh_hint: str
     """What to type on one's own machine to reach the page over ssh."""
     warning: str | None
-    """For the terminal: what a binding wider than loopback means. None on loopback."""
+    """For the terminal: what a binding wider than loopback means, and a viser that is not known. None if neither."""
     notice: str | None
     """For the terminal: the page is on another port than usual. None if it is not."""
     _listening: Listening = field(repr=False)
@@ -238,18 +239,19 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
     except BaseException:
         listening.remove()
         raise
+    wide = (
+        f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can send requests, and "
+        "the token and everything on the page travel unencrypted. Anyone with the address and its token can run code "
+        "here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
+    )
+    if listening.loopback:
+        wide = ""
     gated_server = GatedServer(
         options=options,
         server=gated.server,
         port=listening.port,
         ssh_hint=listening.ssh_hint,
-        warning=None
-        if listening.loopback
-        else (
-            f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can send "
-            "requests, and the token and everything on the page travel unencrypted. Anyone with the address and its "
-            "token can run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
-        ),
+        warning=" ".join(filter(None, (wide, viser_private.unknown_page_text()))) or None,
         notice=None
         if listening.path is not None or options.port in (0, listening.port)
         else f"Port {options.port} is taken by another program, so this page is on port {listening.port}.",
@@ -292,6 +294,5 @@ def _test_refusal(listening: Listening) -> None:
     if status != 403:
         raise ServerError(
             f"The page is not protected: a request that must be refused got {status}. "
-            f"It is written for viser {viser_private.WRITTEN_FOR} and {viser.__version__} is installed; install "
-            f"viser=={viser_private.WRITTEN_FOR}."
+            f"viser {viser.__version__} is installed. The tested versions: {command_for_tested_versions()}"
         )

@@ -173,9 +173,7 @@ def with_our_head(page: bytes, zipped: bool) -> bytes:
     plain = gzip.decompress(page) if zipped else page
     before, head_end, after = plain.partition(b"</head>")
     if not head_end:
-        raise ValueError(
-            f"viser {viser_private.WRITTEN_FOR} serves a page with a </head>; this one has none."
-        )
+        raise ValueError("viser's page has no </head>, which every tested version has.")
     tags = f'<link rel="stylesheet" href="/workbench/{STYLES}">'
     tags += "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
     plain = before + tags.encode() + head_end + after
@@ -224,11 +222,6 @@ def content_type(name: str) -> str:
 # --- The headers that tell a browser what a served page may do --------------------------------
 
 
-VISERS_SCRIPTS = (
-    "sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=",
-    "sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE=",
-)
-"""Of viser 1.1.1: the script in its page, and the one that it unpacks."""
 HANDLERS = (
     "wb.press(event)",
     "wb.choose(event,this)",
@@ -245,13 +238,18 @@ def hash_of(script: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def _quoted(*hashes: str) -> str:
-    return " ".join(f"'{one}'" for one in hashes)
+def _scripts() -> str:
+    """Scripts in the page and its tags that may run. Of a viser whose page is not known any may (`unknown_page_text`)."""
+    known = viser_private.page_scripts()
+    if known is None:
+        return "'unsafe-inline'"
+    allowed = (*(f"sha256-{one}" for one in known), *map(hash_of, HANDLERS))
+    return " ".join(["'unsafe-hashes'", *(f"'{one}'" for one in allowed)])
 
 
 # Everything is forbidden that is not listed, and each exception is needed: `tests/ui/server/test_page_policy.py` removes
 # them one by one and finds the page broken.
-# - script-src: our own files and viser's program, by the hashes of its two scripts. Not unsafe-inline: HTML from a name,
+# - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML from a name,
 #   a note or a file that slipped past escaping still would not run. unsafe-hashes allows the handlers of our templates
 #   and no others. wasm-unsafe-eval is for the program that unpacks the server's messages. eval stays forbidden: viser
 #   needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/no_eval.js).
@@ -263,7 +261,7 @@ def _quoted(*hashes: str) -> str:
 # - frame-src 'self': rerun's viewer.
 DIRECTIVES: dict[str, str] = {
     "default-src": "'none'",
-    "script-src": f"'self' 'wasm-unsafe-eval' 'unsafe-hashes' {_quoted(*VISERS_SCRIPTS, *map(hash_of, HANDLERS))}",
+    "script-src": f"'self' 'wasm-unsafe-eval' {_scripts()}",
     "worker-src": "blob:",
     "style-src": "'self' 'unsafe-inline'",
     "img-src": "'self' data: blob:",

@@ -1,10 +1,9 @@
-"""The only module that uses private names of viser, written for viser 1.1.1: its server behind our checks."""
+"""The only module that uses private names of viser: its server behind our checks."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import logging
 import socket
 import sys
@@ -14,7 +13,6 @@ import traceback
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,18 +28,36 @@ from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from workbench.machine.versions import command_for_tested_versions
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.server.listening import ServerError
 from workbench.ui.server.page_guard import PageGuard
 from workbench.ui.server.strangers import Connection, RareLog, Strangers, close_when_stalled
 
-WRITTEN_FOR = "1.1.1"
-
 Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
-PAGE_SHA256 = "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
-"""Of viser's page: `responses` allows the scripts of this one and no others."""
+PAGES = {
+    "1.0.28": (
+        "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
+        "T4GmeBFmVWMH6DNfvEaacatK8GfHueEP37v0JapTyt8=",
+    ),
+    "1.0.29": (
+        "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
+        "ZtIA+5EurKaHyNJ07MHlcJHzGOh41jGqHSgeS7uMh9k=",
+    ),
+    "1.0.30": (
+        "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
+        "y5xJKDFoVPmhQ55naO/hOKfE938Fk3JA+ZA3XO5lX9g=",
+    ),
+    "1.1.0": ("U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=", "5Z0OMwGX2cL14pfD43ov2vozhQ3bvS8sliVyD1MG8XU="),
+    "1.1.1": ("5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=", "o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE="),
+}
+"""sha256 of the two scripts of viser's page, by viser's version: the one in the page, and the one that it unpacks.
+
+A browser that is allowed them and no others runs no script that slipped past escaping (`responses.page_policy`). It names
+the second hash in its console when it is allowed the first alone.
+"""
 
 REFUSED_FROM_CLIENTS = (
     "ShareUrlRequest",  # opens a tunnel that makes the page public, for any client
@@ -153,15 +169,25 @@ def missing_names() -> list[str]:
     return _missing(roots, PRIVATE_NAMES)
 
 
-def _page_is_known() -> bool:
-    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    return page.is_file() and hashlib.sha256(page.read_bytes()).hexdigest() == PAGE_SHA256
+def page_scripts() -> tuple[str, str] | None:
+    """Hashes of the scripts of the installed viser's page, as in `PAGES`; None if that page is not known."""
+    return PAGES.get(viser.__version__)
+
+
+def unknown_page_text() -> str:
+    """What is lost with a viser whose page is not known; empty if it is known."""
+    if page_scripts() is not None:
+        return ""
+    return (
+        f"viser {viser.__version__} is not tested with the workbench: the browser is not told which scripts are the page's, "
+        f"so one that slipped past escaping would run. The tested versions: {command_for_tested_versions()}"
+    )
 
 
 def _moved(what: str) -> ServerError:
     return ServerError(
-        f"The page cannot be made safe: {what}. The workbench needs viser {WRITTEN_FOR}, and viser {viser.__version__} is "
-        f"installed; install viser=={WRITTEN_FOR}."
+        f"The page cannot be made safe: {what}. viser {viser.__version__} is installed. The tested versions: "
+        f"{command_for_tested_versions()}"
     )
 
 
@@ -344,9 +370,6 @@ def make_viser(
     if missing:
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
-    if not _page_is_known():
-        listening.close()
-        raise _moved("its page in the browser is another one")
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     served: list[viser.ViserServer] = []
