@@ -38,15 +38,12 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 PAGES = {
-    "1.0.28": (
         "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
         "T4GmeBFmVWMH6DNfvEaacatK8GfHueEP37v0JapTyt8=",
     ),
-    "1.0.29": (
         "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
         "ZtIA+5EurKaHyNJ07MHlcJHzGOh41jGqHSgeS7uMh9k=",
     ),
-    "1.0.30": (
         "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
         "y5xJKDFoVPmhQ55naO/hOKfE938Fk3JA+ZA3XO5lX9g=",
     ),
