@@ -38,15 +38,6 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 PAGES = {
-        "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
-        "T4GmeBFmVWMH6DNfvEaacatK8GfHueEP37v0JapTyt8=",
-    ),
-        "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
-        "ZtIA+5EurKaHyNJ07MHlcJHzGOh41jGqHSgeS7uMh9k=",
-    ),
-        "U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=",
-        "y5xJKDFoVPmhQ55naO/hOKfE938Fk3JA+ZA3XO5lX9g=",
-    ),
     "1.1.0": ("U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=", "5Z0OMwGX2cL14pfD43ov2vozhQ3bvS8sliVyD1MG8XU="),
     "1.1.1": ("5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=", "o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE="),
 }
