@@ -13,10 +13,12 @@ import re
 import shlex
 import shutil
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
+from packaging.version import Version
 
 from tests.golden.make import GOLDEN
 from workbench.cli import main
@@ -142,6 +144,12 @@ def shape(value: Any) -> Any:
     return type(value).__name__
 
 
+drawn_by_tyro = pytest.mark.skipif(
+    Version(version("tyro")) < Version("1.0.16"), reason="earlier versions of tyro draw help another way"
+)
+
+
+@drawn_by_tyro
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, said = run(capsys, f"{command} --help")
@@ -149,6 +157,7 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     holds(f"help_{command}.txt", said)
 
 
+@drawn_by_tyro
 def test_every_command_is_held(capsys: pytest.CaptureFixture[str]) -> None:
     code, said = run(capsys, "--help")
     assert code == Exit.DONE
