@@ -22,6 +22,7 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
     topics = {
         "Python",
         "packages",
+        "ManiSkill",
         "render device",
         "CUDA",
         "GPU physics",

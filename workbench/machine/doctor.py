@@ -25,6 +25,7 @@ from rich.table import Table
 
 from workbench.machine import DISTRIBUTION
 from workbench.machine.apt import has_apt, os_release
+from workbench.machine.maniskill_installed import installed_maniskills, lines_if_lacking, lines_if_mixed
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 from workbench.machine.render_probe import driver_files
@@ -65,6 +66,7 @@ def diagnose() -> list[DoctorFinding]:
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
         ("packages", _packages),
+        ("ManiSkill", _maniskill),
         ("render device", _render_device),
         ("CUDA", _gpu),
         ("cores, memory", _cores_and_memory),
@@ -150,6 +152,18 @@ def _packages() -> list[DoctorFinding]:
         advice = "Type: pip install -c constraints.txt -e .  (in a clone: make open)"
         return [DoctorFinding("packages", False, f"{what}. {'; '.join(wrong)}", advice)]
     return [DoctorFinding("packages", True, what)]
+
+
+def _maniskill() -> list[DoctorFinding]:
+    """Its release, a nightly build, or both, of which one has overwritten the other."""
+    if (lacking := lines_if_lacking("A task")) is not None:
+        return [DoctorFinding("ManiSkill", False, *lacking)]
+    if (mixed := lines_if_mixed()) is not None:
+        return [DoctorFinding("ManiSkill", None, *mixed)]
+    found = ", ".join(f"{name} {version}" for name, version in installed_maniskills().items())
+    return [
+        DoctorFinding("ManiSkill", True, found or "on Python's path, and not as an installed distribution")
+    ]
 
 
 def _render_device() -> list[DoctorFinding]:
