@@ -5,12 +5,16 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 import tomllib
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
@@ -162,6 +166,26 @@ def test_the_page_is_the_only_part_that_knows_viser() -> None:
     assert knowing == {"ui"}
 
 
+def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
+    """ManiSkill brought scipy along, until it was an extra."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    ours = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
+    ours |= {"mani-skill", "mani-skill-nightly", "debugpy", "maniskill-workbench"}  # by extras, and ourselves
+    brought_by = packages_distributions()
+    names = {
+        name.split(".")[0]
+        for file in MODULES.values()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, (ast.Import, ast.ImportFrom))
+        for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
+        if name and (isinstance(node, ast.Import) or name == node.module)
+    }
+    names -= {*sys.stdlib_module_names, "pydevd", "workbench"}  # pydevd is within debugpy
+    assert "scipy" in names
+    wanting = {name for name in names if not ours & set(map(canonicalize_name, brought_by.get(name, ())))}
+    assert wanting == set()
+
+
 def test_nothing_is_imported_from_a_test() -> None:
     """Whoever changes a test would change others, and the file would be run for a helper of a line."""
     names = {file.stem for file in TESTS.rglob("*.py") if file.name.startswith("test_")}
@@ -183,6 +207,6 @@ def test_nothing_that_a_run_wrote_lies_at_the_top(child_process: None) -> None:
         pytest.skip("not a checkout")
     listed = subprocess.run(["git", "ls-files"], cwd=top, check=True, capture_output=True, text=True).stdout
     assert {path.split("/")[0] for path in listed.splitlines()} == {
-        ".ci", ".gitignore", "Makefile", "README.md", "constraints.txt", "pyproject.toml", "tasks", "tests",
+        ".ci", ".gitignore", "Containerfile", "Makefile", "README.md", "constraints.txt", "pyproject.toml", "tasks", "tests",
         "web_assets", "workbench",
     }  # fmt: skip

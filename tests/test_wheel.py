@@ -21,8 +21,10 @@ from zipfile import ZipFile
 
 import psutil
 import pytest
+from packaging.utils import canonicalize_name
 
 from tests.drive.waiting import until
+from workbench.machine.maniskill_installed import installed_maniskills
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -72,13 +74,97 @@ def test_the_installed_command_is_not_the_clone(installed: Path, tmp_path: Path)
 
 def test_a_file_elsewhere_opens_is_served_and_ends_with_ctrl_c(installed: Path, tmp_path: Path) -> None:
     (carried,) = installed.parent.glob("lib/python*/site-packages/workbench/_tasks/minimal.py")
-    task = tmp_path / "my_task.py"
-    shutil.copy(carried, task)
-    log = tmp_path / "log.txt"
+    shutil.copy(carried, tmp_path / "my_task.py")
+    _opens(installed, str(tmp_path / "my_task.py"), tmp_path)
+
+
+@pytest.mark.slow
+def test_beside_a_laboratory_s_packages_no_version_changes_and_its_task_opens(
+    wheel: Path, tmp_path: Path
+) -> None:
+    """They pin the ManiSkill that they were written for. Without an index pip could not bring another version of anything, and
+    would say so."""
+    ((name, version),) = installed_maniskills().items()
+    lab = tmp_path / "lab"
+    (lab / "lab_tasks").mkdir(parents=True)
+    (lab / "pyproject.toml").write_text(LAB_PROJECT.format(pin=f"{name}=={version}"))
+    (lab / "lab_tasks" / "__init__.py").touch()
+    (lab / "lab_tasks" / "envs.py").write_text(LAB_TASK)
+    binaries = _environment(tmp_path, but=("maniskill_workbench",))
+    pip = [str(binaries / "python"), "-m", "pip"]
+    install = [*pip, "install", "-q", "--no-index", "--no-build-isolation"]
+    _run([*install, str(lab)], tmp_path)
+    before = _versions(pip, tmp_path)
+    assert before["lab-tasks"] == "1.0" and before[canonicalize_name(name)] == version
+    assert "maniskill-workbench" not in before
+    _run([*install, str(wheel)], tmp_path)
+    after = _versions(pip, tmp_path)
+    assert after.pop("maniskill-workbench") and after == before
+    away = tmp_path / "away"
+    away.mkdir()
+    _opens(binaries, "lab_tasks.envs:LabPush", away)
+
+
+def test_without_maniskill_it_says_what_to_type(wheel: Path, tmp_path: Path) -> None:
+    """In an environment with all that this one has, but for ManiSkill."""
+    binaries = _environment(tmp_path, but=("maniskill_workbench", "mani_skill"))
+    _run([str(binaries / "python"), "-m", "pip", "install", "-q", "--no-index", str(wheel)], tmp_path)
+    workbench = str(binaries / "workbench")
+    said = _run([workbench, "open", "PickCube-v1"], tmp_path, code=2)
+    first, second = said.splitlines()
+    assert first.startswith("workbench open needs ManiSkill") and str(binaries.parent) in first
+    assert second.startswith(f"Type: {binaries}/python -m pip install 'mani_skill")
+    said = _run([str(binaries / "python"), "-c", "import workbench; workbench.make"], tmp_path, code=1)
+    assert "workbench.make needs ManiSkill" in said and "gym_env" not in said
+
+
+LAB_PROJECT = """
+[build-system]
+requires = ["hatchling"]
+build-backend = "hatchling.build"
+
+[project]
+name = "lab-tasks"
+version = "1.0"
+dependencies = ["{pin}"]
+"""
+LAB_TASK = """
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+
+@register_env("LabPush-v1", max_episode_steps=50)
+class LabPush(PushCubeEnv):
+    goal_radius = 0.15
+"""
+
+
+def _environment(folder: Path, but: tuple[str, ...]) -> Path:
+    """The ``bin`` folder of a new environment in which pip finds all that this one has, `but` what begins with such a name."""
+    venv, packages = folder / "venv", folder / "packages"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
+    packages.mkdir()
+    for path in Path(sysconfig.get_path("purelib")).iterdir():
+        if not path.name.startswith(but):
+            (packages / path.name).symlink_to(path)
+    (site_packages,) = venv.glob("lib/python*/site-packages")
+    (site_packages / "packages.pth").write_text(f"{packages}\n")
+    return venv / "bin"
+
+
+def _versions(pip: list[str], folder: Path) -> dict[str, str]:
+    """Name to version of all that pip finds."""
+    lines = _run([*pip, "list", "--format=freeze"], folder).splitlines()
+    return {canonicalize_name(line.split("==")[0]): line.split("==")[1] for line in lines}
+
+
+def _opens(binaries: Path, task: str, folder: Path) -> None:
+    """The task is opened in this folder, its page answers, and Ctrl-C ends all of it."""
+    log = folder / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(
-            [str(installed / "workbench"), "open", str(task), "--num-envs", "1", "--port", "0"],
-            cwd=tmp_path,
+            [str(binaries / "workbench"), "open", task, "--num-envs", "1", "--port", "0"],
+            cwd=folder,
             env=_clean_environment(),
             stdin=subprocess.DEVNULL,
             stdout=output,
@@ -111,12 +197,13 @@ def test_a_file_elsewhere_opens_is_served_and_ends_with_ctrl_c(installed: Path, 
         process.wait()
 
 
-def _run(command: list[str], folder: Path) -> str:
+def _run(command: list[str], folder: Path, code: int = 0) -> str:
+    """What it prints: of a command that fails, as it should, what it says of that."""
     done = subprocess.run(
         command, cwd=folder, env=_clean_environment(), capture_output=True, text=True, timeout=60
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stderr if code else done.stdout
 
 
 def _clean_environment() -> dict[str, str]:

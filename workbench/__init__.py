@@ -41,7 +41,15 @@ def __getattr__(name: str) -> Any:
     # seconds and a graphics driver.
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    try:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    except ModuleNotFoundError as error:
+        from workbench.machine.maniskill_installed import lines_if_lacking
+
+        lines = lines_if_lacking(f"{__name__}.{name}")
+        if error.name != "mani_skill" or lines is None:
+            raise
+        raise ModuleNotFoundError("\n".join(lines), name=error.name) from None
 
 
 def __dir__() -> list[str]:

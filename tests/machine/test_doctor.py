@@ -22,7 +22,7 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
     topics = {
         "Python",
         "packages",
-        "versions",
+        "ManiSkill",
         "render device",
         "CUDA",
         "GPU physics",
@@ -42,8 +42,8 @@ def test_versions_are_shown_and_what_they_mean(findings: dict[str, DoctorFinding
     assert all(f"{name} {version}" in shown for name, version in installed.items() if version is not None)
     assert not [name for name, version in installed.items() if version is None and f"{name} " in shown]
     maniskill = versions.maniskill()
-    assert maniskill is not None and f"ManiSkill {maniskill[1]}" in findings["versions"].what
-    assert ("nightly" in findings["versions"].what) == (maniskill[0] == "mani_skill-nightly")
+    assert maniskill is not None and maniskill[1] in findings["ManiSkill"].what
+    assert ("nightly" in findings["ManiSkill"].what) == (maniskill[0] == "mani_skill-nightly")
 
 
 def test_a_version_that_was_not_tested_is_named_with_the_way_back(
@@ -51,15 +51,9 @@ def test_a_version_that_was_not_tested_is_named_with_the_way_back(
 ) -> None:
     tested = versions.installed("viser")
     monkeypatch.setitem(versions.TESTED, "viser", ("0.1",))
-    (finding,) = doctor._versions()
+    (finding,) = doctor._maniskill()
     assert finding.ok is None and f"not tested: viser {tested}" in finding.what
     assert finding.advice and "pip install" in finding.advice and "viser==0.1" in finding.advice
-
-
-def test_without_maniskill_the_extra_to_install_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(versions, "MANISKILL", ("mani_skill-of-another-year",))
-    (finding,) = doctor._versions()
-    assert finding.ok is False and finding.advice and "[maniskill]" in finding.advice
 
 
 def test_gpu_physics_is_looked_for_without_fetching_it(

@@ -22,8 +22,9 @@ from workbench.cli.arguments import (
     history_bytes,
     imported,
 )
-from workbench.cli.terminal import Exit, print_problem, print_text, refuse
+from workbench.cli.terminal import Exit, print_problem, print_text, refuse, warn
 from workbench.jobs.task import RecordArguments
+from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
@@ -69,6 +70,8 @@ def open_page(
         debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
         debug_wait: load the task only when a debugger has attached. Means --debug.
     """
+    if _lacks_maniskill("open"):
+        return Exit.REFUSED
     from workbench.authoring.loading.reference import why_missing
 
     if (why := why_missing(task)) is not None:
@@ -108,6 +111,8 @@ def record(
         debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
             it. Anyone who can log in to this machine can attach too.
     """
+    if _lacks_maniskill("record"):
+        return Exit.REFUSED
     from workbench.authoring.loading.reference import why_missing
 
     if (why := why_missing(recording.task)) is not None:
@@ -202,6 +207,8 @@ def rescore(
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
             it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
+    if _lacks_maniskill("rescore"):
+        return Exit.REFUSED
     with quick_imports():
         from workbench.cli.rescore import RescoreOptions, run_rescore
 
@@ -323,6 +330,16 @@ def doctor() -> int:
     from workbench.machine.doctor import main
 
     return main()
+
+
+def _lacks_maniskill(command: str) -> bool:
+    """Say what to type where the command cannot do its work for want of ManiSkill, and warn of two that are mixed."""
+    lines = lines_if_lacking(f"workbench {command}", sys.argv[1:])
+    for line in lines or ():
+        refuse(line)
+    for line in lines_if_mixed() or ():
+        warn(line)
+    return lines is not None
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -26,6 +26,7 @@ from rich.table import Table
 
 from workbench.machine import DISTRIBUTION, versions
 from workbench.machine.apt import has_apt, os_release
+from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 from workbench.machine.render_probe import driver_files
@@ -76,7 +77,7 @@ def diagnose() -> list[DoctorFinding]:
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
         ("packages", _packages),
-        ("versions", _versions),
+        ("ManiSkill", _maniskill),
         ("render device", _render_device),
         ("CUDA", _gpu),
         ("cores, memory", _cores_and_memory),
@@ -160,12 +161,14 @@ def _packages() -> list[DoctorFinding]:
     return [DoctorFinding("packages", True, what)]
 
 
-def _versions() -> list[DoctorFinding]:
-    """The installed ManiSkill, and whether it and the packages beside it have the private names that are used."""
-    topic = "versions"
-    if versions.maniskill() is None:
-        advice = "Type: pip install 'maniskill-workbench[maniskill]', or [nightly] for its nightly build"
-        return [DoctorFinding(topic, False, "ManiSkill is not installed", advice)]
+def _maniskill() -> list[DoctorFinding]:
+    """Its release, a nightly build, or both, of which one has overwritten the other; and whether it and the packages beside
+    it have the private names that are used."""
+    topic = "ManiSkill"
+    if (lacking := lines_if_lacking("A task")) is not None:
+        return [DoctorFinding(topic, False, *lacking)]
+    if (mixed := lines_if_mixed()) is not None:
+        return [DoctorFinding(topic, None, *mixed)]
     answer = _ask_child(VERSION_QUESTIONS)
     if isinstance(answer, str):
         return [
@@ -173,24 +176,26 @@ def _versions() -> list[DoctorFinding]:
                 topic, False, f"ManiSkill or rerun does not load: {answer}", versions.untested_text()
             )
         ]
-    lacking = " ".join(
+    moved = " ".join(
         [answer["moved"]] * bool(answer["moved"])
         + [f"viser lacks {', '.join(answer['viser'])}: no page can be served."] * bool(answer["viser"])
     )
-    if lacking:
-        return [DoctorFinding(topic, False if answer["viser"] else None, lacking, versions.untested_text())]
+    if moved:
+        return [DoctorFinding(topic, False if answer["viser"] else None, moved, versions.untested_text())]
     if untested := versions.untested():
         names = ", ".join(f"{name} {version}" for name, version in untested.items())
         what = f"not tested: {names}; all private names that the workbench uses are there"
         return [
             DoctorFinding(topic, None, what, f"If something fails: {versions.command_for_tested_versions()}")
         ]
-    name, version = versions.maniskill() or ("", "")
-    what = f"ManiSkill {version}, its release: tested with the workbench"
-    if name == "mani_skill-nightly":
+    found = versions.maniskill()
+    if found is None:
+        return [DoctorFinding(topic, True, "on Python's path, and not as an installed distribution")]
+    what = f"{found[1]}, its release: tested with the workbench"
+    if found[0] == "mani_skill-nightly":
         what = (
-            f"ManiSkill {version}, a nightly build: tested with the workbench. Of another build every private name "
-            "that the workbench uses is looked for at start, and what has moved is named."
+            f"{found[1]}, a nightly build: tested with the workbench. Of another build every private name that the "
+            "workbench uses is looked for at start, and what has moved is named."
         )
     return [DoctorFinding(topic, True, what)]
 

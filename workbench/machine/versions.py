@@ -11,7 +11,9 @@ from functools import cache
 from types import CodeType
 from typing import Any
 
-MANISKILL = ("mani_skill", "mani_skill-nightly")
+from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills
+
+MANISKILL = tuple(EXTRAS)
 """Two distributions with the same files: the release, and the build of a night."""
 TESTED = {
     "mani_skill": ("3.0.1",),
@@ -82,8 +84,7 @@ def installed(distribution: str) -> str | None:
 
 def maniskill() -> tuple[str, str] | None:
     """Distribution and version of the installed ManiSkill; None without one."""
-    found = ((name, installed(name)) for name in MANISKILL)
-    return next(((name, version) for name, version in found if version is not None), None)
+    return next(iter(installed_maniskills().items()), None)
 
 
 def untested(distributions: Iterable[str] = TESTED) -> dict[str, str]:

@@ -81,6 +81,7 @@ def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys
         assert listening_addresses(gated_server.port) == {"0.0.0.0"}
         assert gated_server.warning is not None and "0.0.0.0" in gated_server.warning
         assert "0.0.0.0" not in gated_server.url  # no browser can open that
+        assert any(url.startswith("http://127.0.0.1:") for url in gated_server.addresses())  # of a container
         assert len(token_of(gated_server)) >= 43  # 256 bits
         # Where the machine has no way out, the page's own address is of no use to others.
         own = [address for host in psutil.net_if_addrs().values() for address in host]

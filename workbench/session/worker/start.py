@@ -11,6 +11,7 @@ import traceback
 from pathlib import Path
 from typing import NoReturn
 
+from workbench.machine.maniskill_installed import lines_if_lacking
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.processes.family import begin_family
 from workbench.machine.versions import untested_text
@@ -44,10 +45,14 @@ def main() -> None:
         refuse_breakpoints(OPEN_WITH_DEBUG)
     code = 0
     try:
-        with quick_imports():
-            from workbench.session.worker.loop import work
+        if (lacking := lines_if_lacking("A task")) is not None:
+            print(*lacking, sep="\n", file=sys.stderr)
+            code = 1
+        else:
+            with quick_imports():
+                from workbench.session.worker.loop import work
 
-        work(connection, heartbeat)
+            work(connection, heartbeat)
     except BaseException as error:
         traceback.print_exc()
         if isinstance(error, ImportError) and (text := untested_text()):

@@ -54,12 +54,16 @@ class Listening:
         return f"ssh -L {self.port}:{to} {_user()}@{socket.gethostname()}"
 
     def hosts_elsewhere(self) -> tuple[str, ...]:
-        """This machine's name and addresses for browsers on other machines."""
+        """This machine's name and addresses for browsers on other machines. Where every interface is listened on, loopback
+        comes last: of a container's addresses it is what works outside, by the port that is published there."""
         if self.loopback:
             return ()
         address = ipaddress.ip_address(self.bound_host.partition("%")[0])
         hosts = [socket.gethostname()]
-        hosts += _own_addresses(address.version) if address.is_unspecified else [_in_address(address)]
+        if address.is_unspecified:
+            hosts += [*_own_addresses(address.version), "127.0.0.1" if address.version == 4 else "[::1]"]
+        else:
+            hosts.append(_in_address(address))
         return tuple(dict.fromkeys(host for host in hosts if host and host != "localhost"))
 
     def connect(self, timeout: float) -> socket.socket:

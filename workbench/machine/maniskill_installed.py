@@ -1,0 +1,121 @@
+"""Which ManiSkill is installed, and what to type where that is none, or both of its distributions. Imports nothing of it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from workbench.machine import DISTRIBUTION
+
+EXTRAS: Mapping[str, str] = {"mani_skill": "maniskill", "mani_skill-nightly": "nightly"}
+"""ManiSkill's distributions, which write the same files, and the extra of ours that asks for each."""
+
+
+def lacks_maniskill() -> bool:
+    """Whether ``import mani_skill`` would find nothing. A folder of that name without code, as assets leave one, is nothing."""
+    spec = find_spec("mani_skill")
+    return spec is None or spec.origin is None
+
+
+def installed_maniskills() -> dict[str, str]:
+    """Distribution to version. Empty also for a clone of ManiSkill that is only on the path."""
+    found = {}
+    for name in EXTRAS:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple[str, str] | None:
+    """Two lines where ManiSkill is not installed: that `what` needs it, and the command to type. None where it is there.
+
+    Args:
+        arguments: of ``workbench``, as they were typed; None if it was not started by its command.
+    """
+    if not lacks_maniskill():
+        return None
+    command = command_to_install("mani_skill", arguments)
+    return f"{what} needs ManiSkill, which is not installed in {sys.prefix}.", f"Type: {command}"
+
+
+def lines_if_mixed() -> tuple[str, str] | None:
+    """Two lines where both distributions are installed: what that means, and the command to type. None if there is no such mix."""
+    found = installed_maniskills()
+    if len(found) < 2:
+        return None
+    release, nightly = (f"{name}=={version}" for name, version in found.items())
+    yes = " -y" if _uv_environment() is None else ""
+    return (
+        f"{release} and {nightly} are both installed, and one has written over files of the other: keep one of them.",
+        f"Type: {_pip('uninstall')}{yes} {' '.join(found)} && {_pip('install')} {release}  (or {nightly})",
+    )
+
+
+def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str:
+    """What installs this distribution of ManiSkill's into the environment of this process: by uv where uv has made it, else pip.
+
+    uv's environments of tools are not added to but made anew.
+    """
+    kind = _uv_environment()
+    ours = shlex.quote(f"{DISTRIBUTION}[{EXTRAS[name]}]{_came_from()}")
+    if kind == "tool":
+        return f"uv tool install --force {ours}"
+    if kind == "uvx":
+        return f"uvx --from {ours} workbench {'...' if arguments is None else shlex.join(arguments)}"
+    return f"{_pip('install')} {shlex.quote(_requirement(name))}"
+
+
+def _pip(verb: str) -> str:
+    python = shlex.quote(sys.executable)
+    return f"{python} -m pip {verb}" if _uv_environment() is None else f"uv pip {verb} --python {python}"
+
+
+def _requirement(name: str) -> str:
+    """What our own metadata asks for with this distribution's extra; its bare name where we are not installed."""
+    try:
+        lines = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        return name
+    for requirement in map(Requirement, lines):
+        if canonicalize_name(requirement.name) == canonicalize_name(name):
+            return f"{name}{requirement.specifier}"
+    return name
+
+
+def _uv_environment() -> str | None:
+    """``uvx`` (in uv's cache), ``tool`` (of ``uv tool install``) or ``venv`` where uv has made this environment; else None."""
+    prefix = Path(sys.prefix)
+    try:
+        keys = {line.partition("=")[0].strip() for line in (prefix / "pyvenv.cfg").read_text().splitlines()}
+    except OSError:
+        return None
+    if (prefix / "uv-receipt.toml").is_file():
+        return "tool"
+    if "uv" not in keys:
+        return None
+    return "uvx" if _is_in_uv_cache(prefix) else "venv"
+
+
+def _is_in_uv_cache(prefix: Path) -> bool:
+    # Wherever the cache lies, uv keeps what it made in folders of these names.
+    return any(parent.name.startswith(("archive-v", "builds-v")) for parent in prefix.resolve().parents)
+
+
+def _came_from() -> str:
+    """`` @ URL`` of the wheel or folder that we were installed from; nothing where an index gave us."""
+    try:
+        text = importlib.metadata.distribution(DISTRIBUTION).read_text("direct_url.json")
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+    url = json.loads(text).get("url") if text else None
+    return f" @ {url}" if url else ""
