@@ -211,16 +211,18 @@ def rows(text: str) -> list[list[str]]:
 def with_row(text: str, result: Result) -> str:
     """The page with this row, in place of an earlier one of the same set, Python and tests."""
     key = (result.name, result.python, result.tests)
-    lines, place = [], None
+    lines: list[str] = []
+    place = None
     for line in text.splitlines():
         (cells,) = rows(line) or [None]
         if cells is not None and (cells[0], cells[1], cells[-3]) == key:
             continue
         lines.append(line)
-        if line.startswith("|"):
+        # Behind the last row: further tables follow.
+        if line.startswith("| set |") or (place == len(lines) - 1 and line.startswith("|")):
             place = len(lines)
     if place is None:
-        raise ValueError(f"{PAGE.name} has no table")
+        raise ValueError(f"{PAGE.name} has no table of results")
     lines.insert(place, result.row())
     return "\n".join(lines) + "\n"
 

@@ -1,3 +1,3 @@
-"""What this machine has: files, text, a browser, something to render with."""
+"""What this machine has: installed versions, files, text, a browser, something to render with."""
 
 DISTRIBUTION = "maniskill-workbench"
