@@ -16,7 +16,7 @@ from workbench.core.env import actions
 from workbench.core.snapshots.snapshot import Snapshot
 from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.messages import Restore, WayBack
+from workbench.session.protocol.messages import ReplayPath, Restore
 from workbench.session.worker import go_back
 
 N = 3
@@ -52,7 +52,7 @@ class EnvMoment:
         """To `moment`, from where each env begins."""
         source = source or {i: i for i in begins}
         ways = {
-            i: WayBack(at, source[i], np.stack([a[source[i]] for a in self.actions[at:moment]]))
+            i: ReplayPath(at, source[i], np.stack([a[source[i]] for a in self.actions[at:moment]]))
             for i, at in begins.items()
         }
         starts = {at: pickle.dumps(self.snapshots[at]) for at in set(begins.values())}
@@ -111,9 +111,9 @@ def test_ways_of_several_lengths_end_together(lived: EnvMoment) -> None:
         lived.opened.env.step(lived.actions[after])
     wanted, end = lived.packed(), lived.opened.env.snapshot()
     ways = {
-        0: WayBack(100, 0, np.stack([a[0] for a in lived.actions[T : T + 3]])),
-        1: WayBack(0, 1, np.stack([a[1] for a in lived.actions[: T + 3]])),
-        2: WayBack(0, 2, np.stack([a[2] for a in lived.actions[: T + 3]])),
+        0: ReplayPath(100, 0, np.stack([a[0] for a in lived.actions[T : T + 3]])),
+        1: ReplayPath(0, 1, np.stack([a[1] for a in lived.actions[: T + 3]])),
+        2: ReplayPath(0, 2, np.stack([a[2] for a in lived.actions[: T + 3]])),
     }
     starts = {100: pickle.dumps(middle), 0: pickle.dumps(lived.snapshots[0])}
     every = tuple(range(N))

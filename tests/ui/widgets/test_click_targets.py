@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
-from workbench.ui.widgets.click_targets import NUMBERS, PARTS, Paged, Presses, in_turn, place_of
+from workbench.ui.widgets.click_targets import NUMBERS, PLACE_STEPS, Paged, Presses, in_turn, place_of
 from workbench.ui.widgets.templates import render
 
 
@@ -24,15 +24,15 @@ def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an
     assert html.count('aria-disabled="true"') == 1 and "<b>" not in html
 
 
-parts = st.integers(0, PARTS - 1)
+parts = st.integers(0, PLACE_STEPS - 1)
 
 
 @given(parts, parts, st.integers(0, 88))
 def test_a_place_comes_back_from_its_number_whatever_the_running_part(
     column: int, row: int, running: int
 ) -> None:
-    place = place_of(running * PARTS**2 + column * PARTS + row)
-    assert place == (column / (PARTS - 1), row / (PARTS - 1))
+    place = place_of(running * PLACE_STEPS**2 + column * PLACE_STEPS + row)
+    assert place == (column / (PLACE_STEPS - 1), row / (PLACE_STEPS - 1))
 
 
 @pytest.mark.parametrize("sent", [True, "12", None, -1, 0.5, math.nan, math.inf, 2**60, 1e300, (1, 2)])

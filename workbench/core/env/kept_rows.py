@@ -105,7 +105,7 @@ class KeptRows:
         return tuple(self._elsewhere[rows].tolist()) or None
 
 
-def _is_the_tasks(path: str) -> bool:
+def _is_outside_the_agent(path: str) -> bool:
     # ManiSkill resets robots and controllers (`partial_reset.KeptControllers`).
     return path != "agent" and not path.startswith(("agent.", "agent["))
 
@@ -114,7 +114,7 @@ def _paths(walk: Walk, num_envs: int) -> tuple[list[str], dict[str, list[str]]]:
     """Paths of values with a row for each env; and groups of N paths, one for each env (a list of N tensors)."""
     single, items = [], {}
     for leaf in walk.leaves:
-        if not _is_the_tasks(leaf.path):
+        if not _is_outside_the_agent(leaf.path):
             continue
         if is_per_env(leaf.value, num_envs):
             single.append(leaf.path)
@@ -183,7 +183,7 @@ class _Lines:
         self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
         while frame is not None:  # callers of the reset continue after it, as the task's own `reset` does
-            if self._is_the_tasks(frame):
+            if self._runs_task_code(frame):
                 frame.f_trace = self._traced
                 self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
             frame = frame.f_back
@@ -194,12 +194,12 @@ class _Lines:
             self._look()
             sys.settrace(None)
 
-    def _is_the_tasks(self, frame: FrameType) -> bool:
+    def _runs_task_code(self, frame: FrameType) -> bool:
         file = frame.f_code.co_filename
         return file in self._files or not is_installed(file)
 
     def _called(self, frame: FrameType, event: str, argument: Any) -> Any:
-        return self._traced if self._is_the_tasks(frame) else None
+        return self._traced if self._runs_task_code(frame) else None
 
     def _traced(self, frame: FrameType, event: str, argument: Any) -> Any:
         if event == "line":

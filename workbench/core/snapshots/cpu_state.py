@@ -17,9 +17,9 @@ from workbench.core.scene.scene_index import hidden_poses, once_a_scene, scene_i
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.state_layout import BODY
 
-_ATTEMPTS = 4
+_ROOT_POSE_ATTEMPTS = 4
 """Attempts to set a root pose; two were enough in all tasks that were tried."""
-_TRIES = 40
+_EXACT_POINT_ATTEMPTS = 40
 """Attempts to find a state that reads back as written; all but some humanoids need one."""
 _LAST_BIT = np.float32(2**-24)
 """Of the numbers of a quaternion, and of a metre."""
@@ -254,7 +254,7 @@ def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
     """
     left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     positions = list(range(len(env_idx)))
-    for attempt in range(_TRIES):
+    for attempt in range(_EXACT_POINT_ATTEMPTS):
         write_cpu_state(env, left, state, positions, fresh_physics=True)
         found = read_cpu_state(env, left)
         other = [j for j, k in enumerate(positions) if found.packed[j] != state.packed[k]]
@@ -340,7 +340,7 @@ def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: by
         articulation = px.articulation(row)
         wanted = numbers[at : at + 7]
         asked = wanted
-        for _ in range(_ATTEMPTS):
+        for _ in range(_ROOT_POSE_ATTEMPTS):
             got = _packed_pose(articulation.root_pose)
             if np.array_equal(got, wanted):
                 break

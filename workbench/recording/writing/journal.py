@@ -233,7 +233,7 @@ class _JournalThread:
         self._journals: set[Journal] = set()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self.before: list[weakref.WeakMethod[Callable[[], None]]] = []
+        self.flush_first: list[weakref.WeakMethod[Callable[[], None]]] = []
 
     def watch(self, journal: Journal) -> None:
         with self._changed:
@@ -248,8 +248,8 @@ class _JournalThread:
             self._changed.notify()
 
     def flush(self) -> None:
-        self.before = [held for held in self.before if held() is not None]
-        for held in self.before:
+        self.flush_first = [held for held in self.flush_first if held() is not None]
+        for held in self.flush_first:
             if flush := held():
                 flush()
 
@@ -279,7 +279,7 @@ def before_writing(flush: Callable[[], None]) -> None:
 
     It runs on the journals' thread and must not raise.
     """
-    _journal_thread.before.append(weakref.WeakMethod(flush))
+    _journal_thread.flush_first.append(weakref.WeakMethod(flush))
 
 
 class JournalReader:

@@ -19,7 +19,7 @@ from workbench.core.snapshots.packing import WholeSnapshot
 from workbench.jobs.task import NO_MOMENT, Restored, Stepped
 from workbench.session.history.curves import Columns, RecentSteps
 from workbench.session.history.env_table import KEPT_REWARDS, NONFINITE_REWARD_KEY, EnvRows, EnvTable
-from workbench.session.protocol.messages import PastPictures, Pictures, WayBack
+from workbench.session.protocol.messages import PastPictures, Pictures, ReplayPath
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
 """Event flags of an env at a moment. Success, fail and a NaN or infinite reward: only the first in an episode."""
@@ -372,7 +372,7 @@ class History:
             if jumped and moment.restored is None:
                 return
 
-    def replay_path(self, env: int, serial: int, most: int) -> WayBack | None:
+    def replay_path(self, env: int, serial: int, most: int) -> ReplayPath | None:
         """How to replay this env to a moment from the last exact point; None if unknown or longer than `most` steps.
 
         Exact points are resets and restored moments: from them on the same actions give the same bits.
@@ -387,7 +387,7 @@ class History:
             elif jump is None or (at not in jump.replayed and jump.origin != NO_MOMENT):
                 if moment.snapshot is None or not rows:
                     return None
-                return WayBack(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
+                return ReplayPath(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
         return None
 
     def _moments_back(self, env: int, serial: int) -> Iterator[EnvMoment]:

@@ -31,16 +31,19 @@ from workbench.session.protocol.messages import (
     Event,
     Load,
     PlaceCamera,
+    Play,
     Quit,
     Request,
+    Reset,
     Settings,
+    SingleStep,
     without_steps,
 )
 
 _ONLY_LAST = (Load, Settings)
 """Of two such requests in a row in the queue only the second matters."""
-_MOST_WAITING = 1000
-"""Length of the queue; more are dropped (a key held down on Step while the worker reads nothing)."""
+_MOST_REQUESTS = 1000
+"""Longest queue while the worker reads nothing; then steps and resets are dropped (a key is held down)."""
 _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
@@ -131,8 +134,11 @@ class WorkerProcess:
         with self._wake:
             if self._waiting and _replaces(request, self._waiting[-1]):
                 self._waiting.pop()
-            if len(self._waiting) < _MOST_WAITING:
-                self._waiting.append(request)
+            if len(self._waiting) >= _MOST_REQUESTS:
+                # Not the newest, whatever it is: a load or Pause would be lost. A step pauses first.
+                self._waiting = deque(r for r in self._waiting if not isinstance(r, (SingleStep, Reset)))
+                self._waiting.append(Play(False))
+            self._waiting.append(request)
             self._wake.notify()
 
     def receive(self, timeout: float) -> Event | None:

@@ -71,7 +71,7 @@ class Reset(Question[StepResult]):
 
 
 class CameraRequest(NamedTuple):
-    """As `take_pictures.Request`."""
+    """As `core.cameras.render.Request`."""
 
     name: str
     kind: CameraKind
@@ -132,7 +132,7 @@ class SetCapture:
 
 
 @dataclass(frozen=True)
-class WayBack:
+class ReplayPath:
     """How an env came to a moment: from the state at an exact point, by actions."""
 
     start: int
@@ -157,7 +157,7 @@ class Restore:
     """The server's number of that moment; returned unchanged."""
     undoes: int | None = None
     """The server's number of the jump that this undoes, if any; returned unchanged."""
-    ways: Mapping[int, WayBack] = field(default_factory=dict)
+    ways: Mapping[int, ReplayPath] = field(default_factory=dict)
     """For those of `env_idx` that can be replayed up to the moment."""
     starts: Mapping[int, bytes] = field(default_factory=dict)
     """Pickled snapshots of the whole batch at the beginnings of `ways`, by number of the moment."""
@@ -216,7 +216,7 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Cancel:
-    """The answer to the question before is not needed. Long work ends early when any request comes."""
+    """Nobody waits for the previous question's answer any more. Wakes the worker: long work stops as soon as a request comes."""
 
 
 @dataclass(frozen=True)

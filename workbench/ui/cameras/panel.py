@@ -23,7 +23,7 @@ from workbench.ui.widgets.images import COLOUR, MODALITIES, DepthRange, depth_sp
 from workbench.ui.widgets.parts import Clock, DrawDue
 from workbench.ui.widgets.templates import render
 
-FASTEST = 1 / 15
+PICTURE_PERIOD = 1 / 15
 """Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
 (measured: at 1,000 a second the page shows one in five seconds)."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
@@ -100,7 +100,7 @@ class CamerasPanel:
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
         self._cameras_serial = -1
-        self._due = DrawDue(FASTEST, clock)
+        self._due = DrawDue(PICTURE_PERIOD, clock)
         self._asked: tuple[CameraRequest, ...] | None = None
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
         self._frustums = server.gui.add_checkbox(
@@ -292,7 +292,7 @@ class StudioPicture:
         if key is None or picture is None or picture.env != view.selected_env or view.task is None:
             return
         if self._drawn is not None and (self._drawn[0], self._drawn[2]) == (key, kind):
-            if self._drawn[1] is picture or self._clock() - self._drawn_at < FASTEST:
+            if self._drawn[1] is picture or self._clock() - self._drawn_at < PICTURE_PERIOD:
                 return
         self._span = depth_span(self._span if self._drawn and self._drawn[0] == key else None, picture)
         coloured = in_colours(picture, kind, view.task.segmentation, self._span)

@@ -13,7 +13,7 @@ from workbench.ui.server.control_values import name_control
 from workbench.ui.server.viser_private import element_id
 from workbench.ui.widgets.templates import render
 
-PARTS = 10_000
+PLACE_STEPS = 10_000
 """Steps from one border of a picture to the other, as ``placeable.html`` counts them."""
 NUMBERS = 10**8
 """What ``choosable.html`` sends is below this."""
@@ -167,5 +167,5 @@ def _in_words(key: Hashable) -> str:
 
 def place_of(number: int) -> tuple[float, float]:
     """Column and row in 0..1 of what ``placeable.html`` sends."""
-    place = number % PARTS**2
-    return (place // PARTS) / (PARTS - 1), (place % PARTS) / (PARTS - 1)
+    place = number % PLACE_STEPS**2
+    return (place // PLACE_STEPS) / (PLACE_STEPS - 1), (place % PLACE_STEPS) / (PLACE_STEPS - 1)
