@@ -18,6 +18,7 @@ PACKAGE = Path(__file__).parents[3] / "workbench"
 ITSELF = PACKAGE / "machine" / "processes" / "child_python.py"
 SHOWN = {
     PACKAGE / "machine" / "doctor.py",
+    PACKAGE / "machine" / "maniskill_installed.py",
     PACKAGE / "authoring" / "loading" / "load.py",
     PACKAGE / "authoring" / "loading" / "reference.py",
 }
