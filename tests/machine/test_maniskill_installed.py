@@ -171,7 +171,9 @@ def test_open_warns_of_the_mix_and_goes_on(mixed: None, capsys: pytest.CaptureFi
     assert "are both installed" in said and "pip uninstall" in said and "there is no file" in said
 
 
-def test_doctor_says_both(mixed: None, lacking: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_says_both(
+    child_process: None, mixed: None, lacking: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (finding,) = doctor._maniskill()
     assert finding.ok is False and (finding.advice or "").startswith("Type: ")
     monkeypatch.undo()

@@ -13,7 +13,7 @@ from workbench.ui.scene.glb import LAYER, as_glb, face_limit, group_visuals, lif
 
 
 def read_back(glb: bytes) -> list[Any]:
-    scene = trimesh.load_scene(io.BytesIO(glb), file_type="glb")
+    scene: Any = trimesh.load(io.BytesIO(glb), file_type="glb", force="scene")
     return [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh)]
 
 
