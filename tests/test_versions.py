@@ -38,9 +38,7 @@ def test_what_the_program_takes_for_tested_is_pinned_or_in_the_table(name: str) 
 
 
 def test_each_row_of_the_table_is_of_a_set_that_the_script_knows() -> None:
-    found = rows(PAGE.read_text())
-    assert found
-    for row in found:
+    for row in rows(PAGE.read_text()):
         assert len(row) == 6 + len(SHOWN) and row[0] in SETS and row[-3] in TESTS
         assert ", 0 failed, " in row[-2]
 
