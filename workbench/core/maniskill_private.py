@@ -1,4 +1,4 @@
-"""All private names of ManiSkill that the core uses, and what depends on each."""
+"""All private names of ManiSkill and SAPIEN that the core uses, and what depends on each."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ from workbench.machine.versions import PrivateName, moved_text, untested_text
 EXCHANGING = "exchanging cameras without a rebuild"
 HIDDEN = "objects that are hidden from sensors, in pictures"
 NAMED_STATE = "names of the parts of a flat state observation"
+ELSEWHERE = "pictures of a pose that is set and not applied yet"
 PLACING = "placing cameras"
 POSE_CONTROL = "control modes that set the hand's pose, pd_ee_..."
 WRITING = "writing cameras into the file"
@@ -84,6 +85,7 @@ PRIVATE_NAMES = (
         _POSE_CONTROLLER, POSE_CONTROL, "_preprocess_action _start_qpos _target_pose _target_qpos _sim_steps"
     ),
     *_all(_POSE_CONTROLLER, POSE_CONTROL, "_step _step_size _check_gpu_sim_works kinematics"),
+    *_all("sapien.render:RenderBodyComponent", ELSEWHERE, "_internal_node"),
     *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
     *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
 )
@@ -109,6 +111,16 @@ def version_notice() -> str:
 def _with_advice(moved: Iterable[PrivateName]) -> str:
     text = moved_text(moved)
     return f"{text} {untested_text()}".rstrip() if text else ""
+
+
+def draw_at(drawn: Any, pose: NDArray[np.float32]) -> None:
+    """Draw a ``RenderBodyComponent`` at a pose (7,) until the next ``update_render``; its entity stays where it is.
+
+    Without SAPIEN's private node it is drawn where its entity is.
+    """
+    if (node := getattr(drawn, "_internal_node", None)) is not None:
+        node.set_position(pose[:3])
+        node.set_rotation(pose[3:])
 
 
 parse_cameras: Callable[[Any], dict[str, Any]] = (

@@ -11,6 +11,7 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 
+from workbench.core.maniskill_private import draw_at
 from workbench.core.simulation.state_layout import StateLayout
 
 Places = Mapping[int, tuple[Any, NDArray[np.float32]]]
@@ -64,8 +65,7 @@ def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callabl
         for entity, pose in places.values():
             for drawn in entity.components:
                 if isinstance(drawn, sapien.render.RenderBodyComponent):
-                    drawn._internal_node.set_position(pose[:3])
-                    drawn._internal_node.set_rotation(pose[3:])
+                    draw_at(drawn, pose)
 
     with temporarily(cameras):
         yield move_bodies
