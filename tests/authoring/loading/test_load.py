@@ -132,7 +132,7 @@ def test_an_unreadable_file_is_refused(write: Write, monkeypatch: pytest.MonkeyP
     path = write("push.py", PUSH, task=True)
     if os.geteuid() == 0:
         # Root reads everything: a file that goes away between the look and the reading instead.
-        monkeypatch.setattr("workbench.authoring.loading.load._check_file", Path.unlink)
+        monkeypatch.setattr("workbench.authoring.loading.load.check_task_file", Path.unlink)
     else:
         path.chmod(0)
     assert "cannot be read" in refused(path).message

@@ -36,6 +36,7 @@ from workbench.authoring.loading.reference import (
     NamedModule,
     RecordedTask,
     TaskName,
+    check_task_file,
     file_and_class,
     find_module,
     is_module_name,
@@ -157,7 +158,7 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
         return _load_named(*named, given)
     file, class_name = _parse(reference)
     if str(file) not in given:
-        _check_file(file)
+        check_task_file(file)
     return _load_file(file, class_name, given)
 
 
@@ -371,33 +372,6 @@ def _resolve(path: str | Path) -> Path:
         return Path(path).expanduser().resolve()
     except (OSError, RuntimeError, ValueError) as exc:  # no such user's home; a loop of links; a null byte
         raise task_error(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
-
-
-def _check_file(file: Path) -> None:
-    try:
-        if file.is_dir():
-            names = sorted(path.name for path in file.glob("*.py"))[:5]
-            inside = f", for example {' or '.join(names)}" if names else " (there is none in it)"
-            raise task_error(f"{file} is a folder; name a .py file in it{inside}")
-        if not file.exists():
-            raise _missing(file)
-        if not file.is_file():
-            # Reading a pipe may never end, and a device may have no end.
-            raise task_error(f"{file} is not an ordinary file")
-        if file.suffix != ".py":
-            raise task_error(
-                f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
-            )
-    except OSError as exc:
-        raise task_error(f"cannot look at the file ({exc.strerror}): {file}") from exc
-
-
-def _missing(file: Path) -> TaskError:
-    if not file.parent.is_dir():
-        return task_error(f"{file} does not exist, nor does its folder {file.parent}")
-    names = difflib.get_close_matches(file.name, [path.name for path in file.parent.glob("*.py")], n=3)
-    hint = f"; did you mean {' or '.join(names)}?" if names else ""
-    return task_error(f"{file} does not exist{hint}")
 
 
 def _unknown_id(env_id: str) -> TaskError:

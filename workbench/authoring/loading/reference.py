@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import sys
@@ -11,6 +12,7 @@ from importlib.machinery import SOURCE_SUFFIXES, ModuleSpec
 from pathlib import Path
 
 from workbench.authoring.loading.library_names import is_library, is_own_file
+from workbench.authoring.problem import TaskError, task_error
 
 _FILE = re.compile(r"(?P<file>.+\.py)(:(?P<cls>[^/\\]*))?", re.DOTALL)
 _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
@@ -85,6 +87,34 @@ def why_missing(reference: str) -> str | None:
         return not_found_text(named[0]) if find_module(named[0]) is None else None
     file = named_file(reference)
     return None if file is None or file.is_file() else f"there is no file {file}"
+
+
+def check_task_file(file: Path) -> None:
+    """Raise `TaskError`, with what to do, for a path that is no readable .py file."""
+    try:
+        if file.is_dir():
+            names = sorted(path.name for path in file.glob("*.py"))[:5]
+            inside = f", for example {' or '.join(names)}" if names else " (there is none in it)"
+            raise task_error(f"{file} is a folder; name a .py file in it{inside}")
+        if not file.exists():
+            raise _missing(file)
+        if not file.is_file():
+            # Reading a pipe may never end, and a device may have no end.
+            raise task_error(f"{file} is not an ordinary file")
+        if file.suffix != ".py":
+            raise task_error(
+                f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
+            )
+    except OSError as exc:
+        raise task_error(f"cannot look at the file ({exc.strerror}): {file}") from exc
+
+
+def _missing(file: Path) -> TaskError:
+    if not file.parent.is_dir():
+        return task_error(f"{file} does not exist, nor does its folder {file.parent}")
+    names = difflib.get_close_matches(file.name, [path.name for path in file.parent.glob("*.py")], n=3)
+    hint = f"; did you mean {' or '.join(names)}?" if names else ""
+    return task_error(f"{file} does not exist{hint}")
 
 
 def reference_to_class(reference: TaskName, file: Path, class_name: str) -> TaskName:
