@@ -19,7 +19,7 @@ from workbench.authoring.loading.reference import (
 from workbench.authoring.problem import Problem
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions, changed_options
 from workbench.session.history.env_table import EnvTable
 from workbench.session.live.timeline import Timeline
 from workbench.session.live.view import SessionView
@@ -68,10 +68,12 @@ class LiveState:
     """The next step is the first of a new scene: it does not prove that the task runs."""
     clients: int = 0
     """Pages that are open."""
+    tried_options: TaskOptions | None = None
+    """Options that a person applied and that no load has taken or refused yet."""
     wants_play: bool = False
 
     def __post_init__(self) -> None:
-        self.set(seed=self.options.seed)
+        self.set(seed=self.options.seed, options=self.options)
         self.own_file = named_file(self.reference)
         """The named file, even if it never loaded; None for an env id."""
         self.own_folder = followed_folder(self.reference)
@@ -93,6 +95,7 @@ class LiveState:
             stale: the files have changed since.
         """
         task, report, before = event.task, event.reload, self.now.task
+        self._take_options(event.options)
         kept = scene_kept(event)
         if kept and before is not None:
             # The same object, so that the page sees that it need not build the scene again.
@@ -163,11 +166,12 @@ class LiveState:
         elif isinstance(event, LoadFailed):
             self.set_problem(event.problem)
             self.problem_at_run = now.state != "loading"
+            of_options = self._refuse_options(event.options)
             self.set(
                 state="error",
                 activity="",
                 choices=event.classes or now.choices,
-                stale=now.stale or not self.problem_at_run,
+                stale=now.stale or not (self.problem_at_run or of_options),
             )
         elif isinstance(event, RulesBroken):
             self.set(rules=event if event.rows else None, rules_serial=now.rules_serial + 1)
@@ -220,6 +224,8 @@ class LiveState:
         Returns:
             The problem to show; None if the end was requested.
         """
+        if while_loading:
+            self._refuse_options(self.tried_options)
         problem = None
         if not death.asked or death.stack:
             task = self.now.task
@@ -252,6 +258,34 @@ class LiveState:
     def new_pictures(self, **changes: Any) -> None:
         """The shown pictures change."""
         self.set(pictures_serial=self.now.pictures_serial + 1, **changes)
+
+    # --- options of the envs -----------------------------------------------------------------------
+
+    def apply_options(self, options: TaskOptions) -> None:
+        """Make the envs with these at the next load."""
+        self.tried_options = options if changed_options(self.options, options) else None
+        self.set(options_refused=None)
+
+    def _take_options(self, loaded: TaskOptions | None) -> None:
+        if loaded is None:
+            return
+        self.options = replace(loaded, seed=self.options.seed)
+        self.set(options=self.options)
+        if self.tried_options is not None and not changed_options(self.tried_options, loaded):
+            self.tried_options = None
+
+    def _refuse_options(self, failed: TaskOptions | None) -> bool:
+        """Drop options with which the task failed, so that the next save does not fail for them. False if it was not them."""
+        tried = self.tried_options
+        if tried is None or failed is None or changed_options(tried, failed):
+            return False
+        self.tried_options = None
+        # Without an env there is nothing to keep: the next load tries them again.
+        if self.now.task is None:
+            self.options = replace(tried, seed=self.options.seed)
+            self.set(options=self.options)
+        self.set(options_refused=tried)
+        return True
 
     # --- requests of the page ----------------------------------------------------------------------
 
@@ -294,7 +328,8 @@ class LiveState:
         self, source: dict[str, str] | None, snapshot: bytes | None = None, level: LoadLevel = "auto"
     ) -> Load:
         """See `Load`."""
-        options = replace(self.options, seed=self.now.seed)
+        tried = self.tried_options if source is None else None
+        options = replace(tried or self.options, seed=self.now.seed)
         # The version that ran is brought back even if another class of the file was chosen since.
         reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)

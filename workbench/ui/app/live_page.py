@@ -27,6 +27,7 @@ from workbench.ui.live.timeline import TimelinePanel
 from workbench.ui.live.version_panel import VersionPanel
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
+from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
 from workbench.ui.widgets.hotkeys import Command, register
 from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
@@ -51,6 +52,7 @@ class Page:
         stage: The 3-D view; None makes one.
         commands: Further ones for the palette.
         clock: Of all parts of the page.
+        chooser: Opens another task; None for a page that keeps its own.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Page:
         stage: Stage | None = None,
         commands: tuple[Command, ...] = (),
         clock: Clock = time.monotonic,
+        chooser: Chooser | None = None,
     ) -> None:
         self._server = server
         self._session = session
@@ -83,13 +86,17 @@ class Page:
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
         )
         self._rules = RulesMark(server)
+        self._opening = None if chooser is None else OpenDialog(server, chooser, clock=clock)
+        if self._opening is not None:
+            self._opening.add_button()
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
         banner = Banner(server, session.versions.reload, session.versions.restart_worker)
         busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker)
         floating = self._envs, self._timeline, banner, busy_banner
-        self._parts = Parts((status, self._rules, *in_tabs, *floating), clock)
+        opening = () if self._opening is None else (self._opening,)
+        self._parts = Parts((status, self._rules, *in_tabs, *floating, *opening), clock)
 
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
@@ -268,7 +275,9 @@ class Page:
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
         rescored = self._rescored
+        opening = [] if self._opening is None else [Command(OPEN, self._opening.open, "O", "cmd/ctrl")]
         return [
+            *opening,
             Command("Review recordings", self._on_review, "V"),
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),

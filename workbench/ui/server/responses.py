@@ -42,6 +42,7 @@ SCRIPTS = (
     "typed_numbers.js",
     "steady_resolution.js",
     "tab_title.js",
+    "task_list.js",
 )
 """Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"
