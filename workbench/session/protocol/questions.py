@@ -171,8 +171,19 @@ class ListTasks(Question[tuple[str, ...]]):
 
 
 @dataclass(frozen=True)
-class DrawTask(Question[NDArray[np.uint8]]):
-    """A picture (H, W, 3) of a registered task after a reset, as its human camera sees it, or else its first sensor."""
+class TaskPicture:
+    """A picture of a task, or why there is none."""
+
+    pixels: NDArray[np.uint8] | None = None
+    """(H, W, 3)"""
+    why_not: str = ""
+    needs_download: bool = False
+    """The task or its robot lacks files that ManiSkill can download."""
+
+
+@dataclass(frozen=True)
+class DrawTask(Question[TaskPicture]):
+    """A picture of a registered task after a reset, as its human camera sees it, or else its first sensor."""
 
     env_id: str
 

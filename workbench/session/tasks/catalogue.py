@@ -19,7 +19,7 @@ from workbench.machine.text import short_line
 from workbench.session.tasks.recents import MOST_ENVS, RecentTask, RecentTasks
 from workbench.session.tasks.registered import RegisteredTasks, RegisteredView
 
-LONGEST_SHOWN = 120
+LONGEST_SHOWN = 300
 
 
 class Section(Enum):
@@ -51,6 +51,8 @@ class Entry:
     """How it was opened last; None for the options of this run."""
     env_id: str = ""
     """The id whose picture it has; empty for none."""
+    blank: str = ""
+    """Stands where the picture would."""
 
     def matches(self, words: list[str]) -> bool:
         """Whether it has all of these words, in lower case."""
@@ -171,10 +173,16 @@ class Catalogue:
             if self._recordings.is_dir()
             else "No episode was recorded yet; look for other folders with workbench review FOLDER",
         )
-        why_not = dict(registered.why_not)
+        why_not = registered.why_not
         for env_id in registered.ids:
-            about = f"no picture: {why_not[env_id]}" if env_id in why_not else ""
-            yield self._entry(Section.REGISTERED, env_id, env_id, about, env_id=env_id)
+            why = why_not.get(env_id)
+            entry = self._entry(
+                Section.REGISTERED, env_id, env_id, "" if why is None else why.text, env_id=env_id
+            )
+            blank = (
+                "" if why is None else "needs a download" if why.needs_download else "cannot be drawn here"
+            )
+            yield replace(entry, blank=blank)
 
     def _recent(self, task: RecentTask) -> Entry:
         file = task.file

@@ -8,8 +8,8 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -30,11 +30,14 @@ log = logging.getLogger(__name__)
 LIST_FILE = "tasks.json"
 MOST_TASKS = 2000
 MOST_TRIES = 2
-"""Attempts, over all runs, to draw a task: one that lacks a download may have it later, a broken one never works."""
+"""Attempts to draw a task ..."""
+AGAIN_AFTER = 7 * 24 * 3600.0
+"""... until this many seconds later: what it lacks may have been downloaded."""
 LONGEST_LIST, LONGEST_DRAWING = 120.0, 120.0
 """Seconds; on two cores with a software renderer most are drawn in 5."""
 PICTURES_A_PROCESS = 20
 """Then another is started: SAPIEN keeps the meshes of scenes that are gone."""
+LONGEST_WHY = 300
 WIDTH, HEIGHT = 160, 120
 LARGEST_PICTURE = 64 * 1024
 """Bytes of a cached picture; 160 x 120 take 6 kB."""
@@ -44,12 +47,20 @@ _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
 """An id. Without a dot, a slash and a colon it cannot be a file or a module, whoever wrote it into the cache."""
 
 
+class NotDrawn(msgspec.Struct, frozen=True):
+    """Why a task has no picture."""
+
+    text: str
+    needs_download: bool = False
+    tries: int = 1
+    """Attempts that failed."""
+    last: float = 0.0
+    """Unix time of the last."""
+
+
 class _Cached(msgspec.Struct):
     ids: list[str]
-    tries: dict[str, int] = {}
-    """Failed attempts to draw."""
-    why: dict[str, str] = {}
-    """What the last of them said."""
+    not_drawn: dict[str, NotDrawn] = {}
 
 
 @dataclass(frozen=True)
@@ -59,8 +70,8 @@ class RegisteredView:
     ids: tuple[str, ...] = ()
     pictures: frozenset[str] = frozenset()
     """Ids that have a picture."""
-    why_not: tuple[tuple[str, str], ...] = ()
-    """Ids that cannot be drawn, each with the reason."""
+    why_not: Mapping[str, NotDrawn] = field(default_factory=dict)
+    """By id."""
     doing: str = ""
     """``listing the tasks``, ``drawing PickCube-v1``; empty if nothing is being done."""
     problem: str = ""
@@ -70,7 +81,7 @@ class RegisteredView:
     @property
     def waiting(self) -> int:
         """Pictures that are still to be made."""
-        return len(self.ids) - len(self.pictures) - len(self.why_not)
+        return len(set(self.ids) - self.pictures - self.why_not.keys())
 
 
 class RegisteredTasks:
@@ -145,37 +156,37 @@ class RegisteredTasks:
                 return
             self._cached.ids = sorted(filter(_ID.fullmatch, ids))[:MOST_TASKS]
             self._keep()
-        self._say(ids=tuple(self._cached.ids), why_not=self._given_up())
+        self._say(ids=tuple(self._cached.ids), why_not=dict(self._cached.not_drawn))
 
     def _draw_all(self, process: Background) -> None:
-        drawn = 0
-        tries = self._cached.tries
-        for env_id in sorted(self._cached.ids, key=lambda one: tries.get(one, 0)):
-            if env_id in self._view.pictures or tries.get(env_id, 0) >= MOST_TRIES:
+        count = 0
+        # A task that failed before comes after all others.
+        for env_id in sorted(self._cached.ids, key=self._cached.not_drawn.__contains__):
+            if env_id in self._view.pictures or not self._may_try(env_id):
                 continue
             if not self._wait_until_allowed(process):
                 return
             self._say(doing=f"drawing {env_id}")
             try:
                 process.start()
-                pixels = process.ask(self._within(LONGEST_DRAWING), DrawTask(env_id))
-                _write(self._file(env_id), _jpeg(pixels))
+                drawn = process.ask(self._within(LONGEST_DRAWING), DrawTask(env_id))
+                if drawn.pixels is None:
+                    self._note_failure(env_id, drawn.why_not, drawn.needs_download)
+                    continue
+                _write(self._file(env_id), _jpeg(drawn.pixels))
             except (JobFailed, _Ended, ValueError) as failure:
                 if self._closing.is_set():
                     return
                 if isinstance(failure, _Ended):
                     process.end()  # it may be in an endless loop
-                tries[env_id] = tries.get(env_id, 0) + 1
-                self._cached.why[env_id] = str(failure)[:300]
-                self._keep()
-                self._say(why_not=self._given_up())
+                self._note_failure(env_id, str(failure))
                 continue
             except OSError as error:
                 self._say(problem=f"Pictures of tasks cannot be kept: {error}.")
                 return
             self._say(pictures=self._view.pictures | {env_id})
-            drawn += 1
-            if drawn % PICTURES_A_PROCESS == 0:
+            count += 1
+            if count % PICTURES_A_PROCESS == 0:
                 process.end()
 
     def _wait_until_allowed(self, process: Background) -> bool:
@@ -198,10 +209,16 @@ class RegisteredTasks:
 
         return check
 
-    def _given_up(self) -> tuple[tuple[str, str], ...]:
-        cached = self._cached
-        ids = (one for one in cached.ids if cached.tries.get(one, 0) >= MOST_TRIES)
-        return tuple((one, cached.why.get(one, "")) for one in ids)
+    def _may_try(self, env_id: str) -> bool:
+        before = self._cached.not_drawn.get(env_id)
+        return before is None or before.tries < MOST_TRIES or abs(time.time() - before.last) > AGAIN_AFTER
+
+    def _note_failure(self, env_id: str, why: str, needs_download: bool = False) -> None:
+        before = self._cached.not_drawn.get(env_id)
+        tries = 1 if before is None else before.tries + 1
+        self._cached.not_drawn[env_id] = NotDrawn(why[:LONGEST_WHY], needs_download, tries, time.time())
+        self._keep()
+        self._say(why_not=dict(self._cached.not_drawn))
 
     def _keep(self) -> None:
         try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workbench.session.protocol.messages import CannotAnswer
-from workbench.session.protocol.questions import MakeScene, SceneMade
+from workbench.session.protocol.questions import MakeScene, SceneMade, TaskPicture
 from workbench.session.worker.pacing import throttled
 
 if TYPE_CHECKING:
@@ -129,15 +129,13 @@ def registered_ids() -> tuple[str, ...]:
     return tuple(environment_ids())
 
 
-def draw_task(env_id: str) -> np.ndarray:
-    """(H, W, 3) of a registered task after a reset.
-
-    Raises:
-        CannotAnswer: it cannot be made or drawn here.
-    """
+def draw_task(env_id: str) -> TaskPicture:
+    """The picture of a registered task after a reset."""
     from workbench.authoring.loading.load import load_task
     from workbench.authoring.loading.reference import RecordedTask
+    from workbench.authoring.problem import is_ctrl_c
     from workbench.core.cameras.render import list_cameras, take_pictures
+    from workbench.core.env.assets import MissingAssets
     from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 
     env: TaskEnv | None = None
@@ -150,16 +148,15 @@ def draw_task(env_id: str) -> np.ndarray:
         cameras = sorted(list_cameras(env.env), key=lambda camera: camera.kind != "human")
         seen = [camera for camera in cameras if "rgb" in camera.modalities]
         if not seen:
-            raise CannotAnswer("it has no camera, or nothing here can render")
+            return TaskPicture(why_not="It has no camera, or nothing here can render.")
         (picture,) = take_pictures(env.env, 0, [(seen[0].name, seen[0].kind, ("rgb",))])
-        if picture.rgb is None:
-            raise CannotAnswer("its camera gives no picture")
-        return picture.rgb
-    except (CannotAnswer, KeyboardInterrupt):
-        raise
+        return TaskPicture(picture.rgb, "" if picture.rgb is not None else "Its camera gives no colours.")
+    except MissingAssets as error:
+        return TaskPicture(why_not=" ".join(str(error).split()), needs_download=True)
     except BaseException as error:  # a constructor may end the program (SystemExit)
-        traceback.print_exc()
-        raise CannotAnswer(f"{type(error).__name__}: {_line(error)}") from error
+        if is_ctrl_c(error):
+            raise
+        return TaskPicture(why_not=f"{type(error).__name__}: {_line(error)}")
     finally:
         if env is not None:
             env.close()
