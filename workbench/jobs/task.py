@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, CameraKey, Picture
 from workbench.core.cameras.report import ObjectToSee
+from workbench.core.env.keywords import HowMade
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Degree
 from workbench.core.scene.shapes import SceneGeometry
@@ -129,6 +130,8 @@ class TaskDescription:
     """Notices about a task that works, as sentences."""
     parse_cameras: str = "parse_camera_configs"
     """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
+    made: HowMade = HowMade()
+    """How the envs are made: robot, modes and the task's own keyword arguments."""
 
     def camera(self, key: CameraKey) -> CameraInfo | None:
         return next((camera for camera in self.cameras if camera.key == key), None)

@@ -174,7 +174,8 @@ class Catalogue:
             else "No episode was recorded yet; look for other folders with workbench review FOLDER",
         )
         why_not = registered.why_not
-        for env_id in registered.ids:
+        # Those that cannot be opened before something is downloaded come last.
+        for env_id in sorted(registered.ids, key=why_not.__contains__):
             why = why_not.get(env_id)
             entry = self._entry(
                 Section.REGISTERED, env_id, env_id, "" if why is None else why.text, env_id=env_id

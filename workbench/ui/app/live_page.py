@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable
 
@@ -27,6 +28,7 @@ from workbench.ui.live.timeline import TimelinePanel
 from workbench.ui.live.version_panel import VersionPanel
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
+from workbench.ui.tasks.env_options import EnvOptionsPanel
 from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
 from workbench.ui.widgets.hotkeys import Command, register
 from workbench.ui.widgets.parts import Clock, PagePart, Parts
@@ -89,6 +91,9 @@ class Page:
         self._opening = None if chooser is None else OpenDialog(server, chooser, clock=clock)
         if self._opening is not None:
             self._opening.add_button()
+        # For `tab_stays.js`: not the path itself, which may be long.
+        which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
+        server.gui.add_html(render("which", which=which))
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
@@ -116,6 +121,7 @@ class Page:
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server, dark)
             version = VersionPanel(server, session)
+            options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(
                 server,
@@ -140,7 +146,7 @@ class Page:
             review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
-        on_run = self._run, self._view_panel, version
+        on_run = self._run, self._view_panel, version, options
         return run_tab, [*on_run, self._studio, *reward, self._rescored, self._inspect, self._record, log]
 
     def _add_table_of_envs(self) -> None:

@@ -152,9 +152,9 @@ class OpenTask:
             reference, entry.options or self.catalogue.options, kept
         )
         place.pages.show("live", anew=True)
+        # Until then the old page draws the old session.
+        place.pages.wait_until_shown(_SHOWN_WITHIN)
         if old is not None:
-            # Not before: until then the old page draws it.
-            place.pages.wait_until_shown(_SHOWN_WITHIN)
             self._doing = "Closing the task before: its recordings are written …"
             old.close()
 

@@ -43,6 +43,7 @@ SCRIPTS = (
     "steady_resolution.js",
     "tab_title.js",
     "task_list.js",
+    "tab_stays.js",
 )
 """Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"
