@@ -125,21 +125,28 @@ def _own_parameters(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parame
         if init is None:
             continue
         try:
-            # With the types of a module that has `from __future__ import annotations`.
-            signature = inspect.signature(init, eval_str=True)
-        except Exception:  # a name in an annotation may be missing, and evaluating it may do anything
-            try:
-                signature = inspect.signature(init)
-            except (TypeError, ValueError):
-                return
+            signature = inspect.signature(init)
+        except (TypeError, ValueError):
+            return
         parameters = list(signature.parameters.values())[1:]
         for parameter in parameters:
             if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
                 if parameter.name not in seen:
                     seen.add(parameter.name)
-                    yield parameter.name, parameter
+                    yield parameter.name, parameter.replace(annotation=_annotation(parameter, init))
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return
+
+
+def _annotation(parameter: inspect.Parameter, init: Any) -> Any:
+    """The type; one of a module with ``from __future__ import annotations`` is a text, which may name what is not there."""
+    if not isinstance(parameter.annotation, str):
+        return parameter.annotation
+    names = getattr(inspect.unwrap(init), "__globals__", {})
+    try:
+        return eval(parameter.annotation, names)
+    except Exception:  # any: evaluating it runs the author's code
+        return parameter.empty
 
 
 def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: Any) -> Keyword:

@@ -106,6 +106,8 @@ def _kept(view: SessionView) -> str:
     """Which version still runs, in a sentence."""
     if view.state == "stopped":
         return "The worker process is gone, so nothing moves until there is a new one."
+    if view.task is None and not (view.problem is not None and view.problem.file):
+        return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
     if view.task is None:
         return "There is no version to show yet. Fix the file and save it; the page follows."
     if view.problem is not None and view.problem.stage == "worker":
