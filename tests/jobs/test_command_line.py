@@ -46,9 +46,15 @@ def test_what_is_shown_gives_the_same_options(
     ("options", "line"),
     [
         (TaskOptions(), "workbench open push.py"),
-        (TaskOptions(4, env_kwargs={"robot_uids": "fetch"}), "workbench open push.py --num-envs 4 --env robot_uids=fetch"),
+        (
+            TaskOptions(4, env_kwargs={"robot_uids": "fetch"}),
+            "workbench open push.py --num-envs 4 --env robot_uids=fetch",
+        ),
         (TaskOptions(env_kwargs={"a": "1", "b": 1}), "workbench open push.py --env 'a=\"1\"' --env b=1"),
-        (TaskOptions(env_kwargs={"a": "$(rm -rf ~); `x`"}), "workbench open push.py --env 'a=$(rm -rf ~); `x`'"),
+        (
+            TaskOptions(env_kwargs={"a": "$(rm -rf ~); `x`"}),
+            "workbench open push.py --env 'a=$(rm -rf ~); `x`'",
+        ),
     ],
 )
 def test_it_is_short_and_quoted_for_a_shell(options: TaskOptions, line: str) -> None:

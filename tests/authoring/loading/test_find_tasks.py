@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from workbench.authoring.loading import find_tasks
 from workbench.authoring.loading.find_tasks import find_task_files, is_below, read_task_file
 
-REGISTERED = 'open({mark!r}, "w")\n@register_env("Push-v1", max_episode_steps=50)\nclass PushEnv(BaseEnv):\n    pass\n'
+REGISTERED = (
+    'open({mark!r}, "w")\n@register_env("Push-v1", max_episode_steps=50)\nclass PushEnv(BaseEnv):\n    pass\n'
+)
 
 
 def task(path: Path, text: str = "class Task(BaseEnv): pass\n") -> Path:
@@ -73,7 +75,9 @@ def test_a_search_is_bounded_and_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_task_files(tmp_path).left_out
 
 
-def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_writing(tmp_path: Path) -> None:
+def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_writing(
+    tmp_path: Path,
+) -> None:
     task(tmp_path / "broken.py", "class Push(BaseEnv):\n    def evaluate(self:\n")
     task(tmp_path / "noise.py", "BaseEnv ((((")
     assert names(tmp_path) == ["broken.py"]

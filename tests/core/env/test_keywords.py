@@ -32,7 +32,9 @@ class Base:
     control_mode = "pd_joint_pos"
     agent: Any = SimpleNamespace(uid="panda", supported_control_modes=["pd_joint_pos", "pd_ee_pose"])
 
-    def __init__(self, num_envs: int = 1, obs_mode: str | None = None, sim_config: dict | None = None) -> None: ...
+    def __init__(
+        self, num_envs: int = 1, obs_mode: str | None = None, sim_config: dict | None = None
+    ) -> None: ...
 
 
 class Colour(enum.Enum):
@@ -56,7 +58,7 @@ class Task(Middle):
         colour: Colour = Colour.RED,
         where: tuple[float, ...] = (0.0, 1.0),
         needed: int,
-        made: object = object(),  # noqa: B008
+        made: object = object(),
         gone: Missing = 1,  # noqa: F821  # pyright: ignore
         **kwargs: Any,
     ) -> None: ...
@@ -194,7 +196,9 @@ def test_a_value_in_json_is_read_back(value: Any) -> None:
     assert isinstance(shown(text), str)
 
 
-@given(st.text(max_size=50), st.sampled_from(["bool", "int", "float", "str", "choice", "json"]), st.booleans())
+@given(
+    st.text(max_size=50), st.sampled_from(["bool", "int", "float", "str", "choice", "json"]), st.booleans()
+)
 def test_no_text_is_more_than_refused(text: str, kind: Any, optional: bool) -> None:
     try:
         value = read_value(Keyword("a", kind, "1", choices=("1",), optional=optional), text)

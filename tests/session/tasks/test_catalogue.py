@@ -25,7 +25,9 @@ TASK = "class Task(BaseEnv): pass\n"
 def cached(folder: Path, ids: list[str], **more: object) -> Path:
     """A cache in which nothing is left to draw."""
     folder.mkdir(parents=True, exist_ok=True)
-    gone = {one: {"text": "needs ycb", "needs_download": True, "tries": 9, "last": time.time()} for one in ids}
+    gone = {
+        one: {"text": "needs ycb", "needs_download": True, "tries": 9, "last": time.time()} for one in ids
+    }
     (folder / LIST_FILE).write_bytes(msgspec.json.encode({"ids": ids, "not_drawn": gone, **more}))
     return folder
 
@@ -56,7 +58,9 @@ def listed(catalogue: Catalogue) -> dict[Section, list[Entry]]:
     return {section: [one for one in rows if one.section is section] for section in Section}
 
 
-def test_all_sections_are_there_and_say_what_is_opened(made: Callable[..., Catalogue], tmp_path: Path) -> None:
+def test_all_sections_are_there_and_say_what_is_opened(
+    made: Callable[..., Catalogue], tmp_path: Path
+) -> None:
     catalogue = made()
     (tmp_path / "work/sub").mkdir()
     (tmp_path / "work/sub/push.py").write_text(f"@register_env('Push-v1')\n{TASK}")
