@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import viser
@@ -27,6 +28,7 @@ from workbench.ui.live.timeline import TimelinePanel
 from workbench.ui.live.version_panel import VersionPanel
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
+from workbench.ui.widgets.editor import editor_link
 from workbench.ui.widgets.hotkeys import Command, register
 from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
@@ -51,6 +53,7 @@ class Page:
         stage: The 3-D view; None makes one.
         commands: Further ones for the palette.
         clock: Of all parts of the page.
+        editor: Address of a line in the author's editor, as `parse_editor` gives it.
     """
 
     def __init__(
@@ -62,10 +65,12 @@ class Page:
         stage: Stage | None = None,
         commands: tuple[Command, ...] = (),
         clock: Clock = time.monotonic,
+        editor: str = "",
     ) -> None:
         self._server = server
         self._session = session
         self._clock = clock
+        self._link = partial(editor_link, editor, known=session.versions.knows_file)
         self._on_review = on_review
         self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
         self._layout: EnvLayout | None = None
@@ -82,12 +87,12 @@ class Page:
         status = StatusLine(
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
         )
-        self._rules = RulesMark(server)
+        self._rules = RulesMark(server, self._link)
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
-        banner = Banner(server, session.versions.reload, session.versions.restart_worker)
-        busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker)
+        banner = Banner(server, session.versions.reload, session.versions.restart_worker, self._link)
+        busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
         self._parts = Parts((status, self._rules, *in_tabs, *floating), clock)
 
@@ -108,7 +113,7 @@ class Page:
         with run_tab:
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server, dark)
-            version = VersionPanel(server, session)
+            version = VersionPanel(server, session, self._link)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(
                 server,

@@ -57,6 +57,7 @@ class Workplace:
         tasks: Task files that may define the envs of foreign recordings.
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
+        editor: Address of a line in the author's editor, as `parse_editor` gives it.
     """
 
     def __init__(
@@ -69,9 +70,10 @@ class Workplace:
         tasks: tuple[Path, ...] = (),
         trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
+        editor: str = "",
     ) -> None:
         self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
-        self._imports, self._on_notice = base.imports, on_notice
+        self._imports, self._on_notice, self._editor = base.imports, on_notice, editor
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._recovering: threading.Thread | None = None
@@ -147,7 +149,13 @@ class Workplace:
 
         assert self.session is not None, "the live page is shown with its session"
         return Page(
-            self.server, self.session, dark, lambda: self.pages.show("review"), self.stage, self.commands
+            self.server,
+            self.session,
+            dark,
+            lambda: self.pages.show("review"),
+            self.stage,
+            self.commands,
+            editor=self._editor,
         )
 
 

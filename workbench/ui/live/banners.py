@@ -8,6 +8,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP
+from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
@@ -56,9 +57,11 @@ class Banner(PagePart[SessionView]):
         server: The page.
         reload: Asks the session to load the file again.
         restart: Asks the session for a new worker process.
+        link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, reload, restart) -> None:
+    def __init__(self, server: viser.ViserServer, reload, restart, link: LinkTo = no_links) -> None:
+        self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
@@ -85,12 +88,12 @@ class Banner(PagePart[SessionView]):
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:
             self._drawn = drawn
-            self._html.content = banner_html(problem, view)
+            self._html.content = banner_html(problem, view, self._link)
             self._panel.visible = True
             self._panel.expand()
 
 
-def banner_html(problem: Problem, view: SessionView) -> str:
+def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:
     """The banner's content."""
     if problem.stage == "syntax" or (view.task is None and problem.file is not None):
         subject = "The file"
@@ -99,7 +102,7 @@ def banner_html(problem: Problem, view: SessionView) -> str:
     doing = DOING.get(problem.stage, f"failed in {problem.stage}")
     if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
-    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view))
+    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
 
 
 def _kept(view: SessionView) -> str:
@@ -128,9 +131,11 @@ class BusyBanner(PagePart[SessionView]):
         server: The page.
         interrupt: Asks the session to interrupt the author's code.
         restart: Asks the session for another worker process.
+        link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, interrupt, restart) -> None:
+    def __init__(self, server: viser.ViserServer, interrupt, restart, link: LinkTo = no_links) -> None:
+        self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-11.0)
         with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
             self._html = server.gui.add_html("")
@@ -146,7 +151,7 @@ class BusyBanner(PagePart[SessionView]):
         if busy is None or not is_busy_for_long(view):
             self._panel.visible = False
             return
-        self._html.content = busy_html(busy, view)
+        self._html.content = busy_html(busy, view, self._link)
         # An element of its own: the changing seconds would close an open traceback.
         trace = (
             render("traceback", traceback=busy.traceback) if busy.ignores_interrupt and busy.traceback else ""
@@ -160,7 +165,7 @@ class BusyBanner(PagePart[SessionView]):
             self._panel.expand()
 
 
-def busy_html(busy: Busy, view: SessionView) -> str:
+def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
     """The banner's content."""
     if busy.ignores_interrupt:
         advice = (
@@ -175,4 +180,4 @@ def busy_html(busy: Busy, view: SessionView) -> str:
             "the last good version comes back where it was. Saving a fixed file does the same."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
-    return render("busy", subject=subject, busy=busy, advice=advice)
+    return render("busy", subject=subject, busy=busy, advice=advice, link=link)
