@@ -148,7 +148,7 @@ class LiveState:
         if self.timeline is None or not its_past_stays:
             last = -1 if self.timeline is None else self.timeline.history.last
             table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode)
-            self.timeline = Timeline(table, self.history_bytes, last + 1)
+            self.timeline = Timeline(table, self.history_bytes, last + 1, task.joints)
 
     def stepped(self, event: Stepped) -> None:
         if self.timeline is None:
@@ -395,8 +395,8 @@ class LiveState:
         if timeline is None:
             return replace(now, refused=refused, **known)
         env, moment = now.settings.selected_env, timeline.shown
-        past = timeline.view(env, now.settings.cameras)
-        view = replace(now, refused=refused, curves=timeline.history.steps.curves(), timeline=past, **known)
+        past, curves = timeline.view(env, now.settings.cameras), timeline.history.steps.curves(env)
+        view = replace(now, refused=refused, curves=curves, timeline=past, **known)
         if moment is None:
             return view
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))

@@ -127,7 +127,7 @@ class Page:
             reward = [
                 NumbersPanel(server),
                 RescoredAbove(server),
-                CurvesPanel(server),
+                CurvesPanel(server, session.past.seek_tick),
             ]
             self._rescored = PastRescorePanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):

@@ -118,7 +118,7 @@ class ReviewPage:
                 server, self._want, "This recording has no pictures.", clock=self._clock
             )
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
-            numbers, curves = ReviewNumbers(server), ReviewCurves(server)
+            numbers, curves = ReviewNumbers(server), ReviewCurves(server, review.seek)
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
             compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)

@@ -33,6 +33,7 @@ SCRIPTS = (
     "let_in.js",
     "typed_first.js",
     "pressed.js",
+    "curve_clicks.js",
     "keys.js",
     "pressed_by_key.js",
     "view_stays.js",
