@@ -20,7 +20,11 @@
   }
 
   function markOf(element) {
-    return element.closest("[role=tabpanel]")?.querySelector("[data-seek]");
+    for (let around = element; around; around = around.parentElement) {
+      const mark = around.querySelector("[data-seek]");
+      if (mark) return mark;
+    }
+    return null;
   }
 
   window.addEventListener(
