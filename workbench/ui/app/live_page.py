@@ -129,7 +129,7 @@ class Page:
             self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session)
-            review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
+            review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS, color="gray")
             review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)

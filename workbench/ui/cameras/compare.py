@@ -41,7 +41,9 @@ class CameraCompare:
                 color="gray",
                 hint="To compare it later, or return to it.",
             )
-            self._compare = server.gui.add_button("Show side by side", icon=viser.Icon.COLUMNS_2)
+            self._compare = server.gui.add_button(
+                "Show side by side", icon=viser.Icon.COLUMNS_2, color="gray"
+            )
             self._pair = JobResult(server, session)
             self._take = server.gui.add_button(
                 "Place it as A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False

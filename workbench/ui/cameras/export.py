@@ -70,7 +70,7 @@ class CameraExport:
             self._html = server.gui.add_html("")
             self._form = server.gui.add_dropdown("File", tuple(FORMS))
             self._which = server.gui.add_dropdown("Of", (THIS, ALL))
-            self._download = server.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
+            self._download = server.gui.add_button("Download", icon=viser.Icon.DOWNLOAD, color="gray")
             self._text = server.gui.add_text(
                 "Calibration",
                 "",

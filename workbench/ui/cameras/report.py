@@ -58,7 +58,9 @@ class CameraReportPanel:
                 visible=False,
                 hint="How many, each with a seed of its own.",
             )
-            self._measure = server.gui.add_button("Measure this camera", icon=viser.Icon.CHECKLIST)
+            self._measure = server.gui.add_button(
+                "Measure this camera", icon=viser.Icon.CHECKLIST, color="gray"
+            )
             self._report = JobResult(server, session)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"

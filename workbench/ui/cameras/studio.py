@@ -68,8 +68,8 @@ class Toggle:
 class StudioPanel(PagePart[SessionView]):
     """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by a press on its frustum.
 
-    From the top: the picture, by which every movement is checked; what is used all the time (look through it, undo);
-    the pose; the lens, folded.
+    From the top: the button that shows the change of the file; the picture, by which every movement is checked; what is
+    used all the time (look through it, undo); the pose; the lens, folded.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
@@ -83,6 +83,7 @@ class StudioPanel(PagePart[SessionView]):
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NO_CAMERA,)
+        above = gui.add_folder(None)
         self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NO_CAMERA, visible=False),
             read=lambda name: self._names.get(name),
@@ -94,7 +95,6 @@ class StudioPanel(PagePart[SessionView]):
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)
-        above = gui.add_folder(None)
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
         self._writing = WriteToFile(server, session, self._placing, self._new_from_viewer, above)
@@ -288,6 +288,7 @@ class StudioPanel(PagePart[SessionView]):
                         lambda _, one=one, value=value: one.choose(value),
                         one.now == value,
                         one.label == "Along" and self._look_at,
+                        style="pill",
                     )
                     for name, value in one.choices.items()
                 ),
@@ -313,9 +314,10 @@ class StudioPanel(PagePart[SessionView]):
         pressed: Callable[[viser.ClientHandle | None], None],
         on: bool = False,
         off: bool = False,
+        style: str = "button",
     ) -> dict[str, object]:
         press = self._presses.id_of(key, pressed)
-        return {"name": name, "hint": hint, "on": on, "press": "" if off else press}
+        return {"name": name, "hint": hint, "on": on, "press": "" if off else press, "style": style}
 
     # --- presses -----------------------------------------------------------------------------------------
 

@@ -91,7 +91,7 @@ class CameraSuggest:
                 step=1,
                 hint="Freshly reset envs in which a placement is measured; as many as there are envs at most.",
             )
-            self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
+            self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH, color="gray")
             self._offers = JobResult(server, session)
             self._presses = Presses(server)
         self._search.on_click(self._ask)

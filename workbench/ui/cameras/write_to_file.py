@@ -41,7 +41,7 @@ class CameraChange:
         gui = server.gui
         self.arrival = NewResult()
         self._text = gui.add_html("", visible=False)
-        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
+        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, visible=False)
         self._undo = gui.add_button(
             "Undo it in the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
         )

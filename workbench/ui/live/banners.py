@@ -135,7 +135,7 @@ class BusyBanner(PagePart[SessionView]):
         with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
-            self._interrupt = server.gui.add_button("Interrupt", icon=viser.Icon.HAND_STOP, color="orange")
+            self._interrupt = server.gui.add_button("Interrupt", icon=viser.Icon.HAND_STOP)
             self._restart = server.gui.add_button("Restart", icon=viser.Icon.POWER, color="gray")
         self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
         self._interrupt.on_click(lambda _: interrupt())

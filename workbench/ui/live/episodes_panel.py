@@ -30,21 +30,22 @@ class RecordPanel(PagePart[SessionView]):
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._button = server.gui.add_button(
             RECORD,
             icon=viser.Icon.PLAYER_RECORD,
-            color="red",
             hint="Reset and record every episode until it is stopped (C)",
         )
+        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._next = server.gui.add_button(
             NEXT,
             icon=viser.Icon.PLAYER_TRACK_NEXT,
+            color="gray",
             hint="Wait for the next reset and record that one episode",
         )
         self._save = server.gui.add_button(
             SAVE,
             icon=viser.Icon.HISTORY,
+            color="gray",
             hint="Record after the fact: the episode at the moment that is shown (shift+C)",
         )
         self._before = server.gui.add_button(

@@ -87,7 +87,7 @@ class SharePanel:
         )
         self._will = server.gui.add_html("")
         self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
-        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         self._made = server.gui.add_html("")
         self._make.on_click(lambda event: self._start(event.client))
         self._stop.on_click(lambda _: self._making.stop())
