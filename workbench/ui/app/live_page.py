@@ -220,6 +220,7 @@ class Page:
             pictures = without_the_viewpoint(pictures, view.pictures)
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         placed = self._studio.draw_in_view(view, offset)
+        self._timeline.fold(self._studio.looks_through)
         self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
         self._forces.draw(self._inspect.forces(view), offset)
         # A scene of another size is framed again; a reload that keeps the size never moves the view.

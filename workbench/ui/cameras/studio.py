@@ -117,6 +117,11 @@ class StudioPanel(PagePart[SessionView]):
         """The modality to render of the chosen camera."""
         return self._picture.shows
 
+    @property
+    def looks_through(self) -> bool:
+        """Whether a page looks through the chosen camera."""
+        return self._look.any
+
     def _name_of(self, key: CameraKey | None) -> str | None:
         return next((name for name, known in self._names.items() if known == key), NO_CAMERA)
 
