@@ -25,6 +25,7 @@ from workbench.ui.live.status_line import RulesMark, StatusLine
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.live.timeline import TimelinePanel
 from workbench.ui.live.version_panel import VersionPanel
+from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
 from workbench.ui.widgets.hotkeys import Command, register
@@ -70,7 +71,7 @@ class Page:
         self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
-        self._built: tuple[bool, int] | None = None
+        self._built: tuple[bool, Looks] | None = None
         self._waits_for_human = False
         stage = stage or Stage(server)
         self._scene, self._framing = stage.scene, stage.framing
@@ -206,12 +207,11 @@ class Page:
             self._layout = lay_out(task.geometry, step.poses)
             self._server.gui.set_panel_label(task.env_id)
             self._built = None
-        built = (one, self._view_panel.triangles)
+        looks = self._view_panel.looks
+        built = (one, looks)
         if built != self._built:
             self._built = built
-            self._scene.build(
-                task.geometry, self._layout, step.poses, env if one else None, self._view_panel.triangles
-            )
+            self._scene.build(task.geometry, self._layout, step.poses, env if one else None, looks)
         self._scene.move(step.poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
         pictures = self._cameras.shown_pictures(seen) if self._cameras.show_frustums else {}

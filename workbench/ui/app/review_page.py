@@ -215,7 +215,7 @@ class ReviewPage:
         chosen = view.chosen
         cameras = () if chosen is None else self._reader.cameras(chosen.episode)
         pictures = self._pictures if self._cameras.show_frustums else {}
-        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.triangles, cameras, pictures)
+        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""

@@ -39,6 +39,7 @@ SCRIPTS = (
     "view_stays.js",
     "library_keys.js",
     "view_width.js",
+    "envs_width.js",
     "unfolded.js",
     "typed_numbers.js",
     "steady_resolution.js",
