@@ -24,17 +24,17 @@ FILTERS: dict[Filter, tuple[str, str, str]] = {
     "all": ("all", "Every env", "There is no env."),
     "failed": (
         "last failed",
-        "The last episode that came to an end ended without success: by fail, or at the time limit",
-        "In no env did the last episode fail.",
+        "The last finished episode ended without success: by fail, or at the time limit",
+        "No env's last episode failed.",
     ),
     "running": (
         "running",
-        "The episode under way has not come to its first end",
+        "The current episode has not ended yet",
         "No env is running.",
     ),
     "flagged": (
         "flagged",
-        "Something odd in the episode under way, or in the one before",
+        "Something odd in the current or the previous episode",
         "No env is flagged.",
     ),
 }
@@ -127,7 +127,7 @@ def make_rows(
         state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
         had_one = rows.last.steps[env] >= 0
         before = [
-            f"{outlier.reason} (episode before, step {outlier.step})"
+            f"{outlier.reason} (previous episode, step {outlier.step})"
             for outlier in rows.last.outliers.get(env, ())
         ]
         now = [f"{outlier.reason} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
@@ -203,11 +203,11 @@ def _step(step: int) -> str:
 MOST_ROWS = 64
 """Rows of one page of the table."""
 HINTS = {
-    "env": "Press a column to sort by it, again to turn it round",
-    "state": "Of the episode under way: running until its first end",
+    "env": "Click a column to sort by it, again to reverse the order",
+    "state": "Of the current episode: running until it first ends",
     "steps": "Control steps of the episode",
     "return": "Sum of the rewards of the episode so far",
-    "last": "How the episode before ended, and at which step",
+    "last": "How the previous episode ended, and at which step",
     "flags": "What is odd: NaN or infinite, too fast, fallen, reward out of range",
 }
 

@@ -101,10 +101,10 @@ class TimeBar(PagePart[View]):
     def commands(self) -> list[Command]:
         """Commands of the arrow keys."""
         return [
-            Command("A step back in time", lambda: self._step_by(-1), "arrowleft"),
-            Command("A step on in time", lambda: self._step_by(1), "arrowright"),
-            Command("To the event before", lambda: self._to_event(-1), "arrowleft", "shift"),
-            Command("To the next event", lambda: self._to_event(1), "arrowright", "shift"),
+            Command("One step back", lambda: self._step_by(-1), "arrowleft"),
+            Command("One step forward", lambda: self._step_by(1), "arrowright"),
+            Command("Previous event", lambda: self._to_event(-1), "arrowleft", "shift"),
+            Command("Next event", lambda: self._to_event(1), "arrowright", "shift"),
         ]
 
     def _step_by(self, steps: int) -> None:
