@@ -1,4 +1,4 @@
-"""The gizmos of the chosen camera in the 3-D view, and the page's view through that camera."""
+"""The gizmos of the chosen camera in the 3D view, and the page's view through that camera."""
 
 from __future__ import annotations
 
