@@ -33,15 +33,23 @@ DEFECTS = {
 VIEW = "canvas[data-engine]"
 
 
-@pytest.fixture
-def desk(example: At, browser: Browser) -> Iterator[Desk]:
+@pytest.fixture(scope="module")
+def opened(example: At, browser: Browser) -> Iterator[Desk]:
     with example(browser) as desk:
         close_notice(desk.page)
-        desk.press("s", "s")
+        desk.press("r")
         desk.tab("Reward")
+        desk.comes_to(0)
+        desk.press("s", "s")
         desk.comes_to(2)
         yield desk
         assert not desk.errors
+
+
+@pytest.fixture
+def desk(opened: Desk) -> Desk:
+    opened.page.set_viewport_size({"width": 1280, "height": 720})
+    return opened
 
 
 def faults(page: Page) -> list[str]:
