@@ -26,7 +26,7 @@ NO_CURVES = Curves(0, np.zeros(0, np.int64), np.zeros((0, 1), np.float32), np.ze
 NEWEST = slice(-LONGEST, None)
 HOW_TO = (
     'For a curve of each part of the reward, put info["reward_terms"] = {"reach": reach, ...} (tensors of shape '
-    "(num_envs,)) into the info that compute_dense_reward is given."
+    "(num_envs,)) into the info that compute_dense_reward receives."
 )
 
 
@@ -40,7 +40,7 @@ class CurvesPanel(PagePart[SessionView]):
         folder = gui.add_folder(None)
         self._reward, self._success = (LineChart(server, folder, HEIGHT) for _ in range(2))
         self._lost = gui.add_html("", visible=False)
-        self._empty = gui.add_html(render("note", text="Curves appear with the second step."))
+        self._empty = gui.add_html(render("note", text="Curves appear after the second step."))
         self._terms = LineChart(server, gui.add_folder(None), TERMS_HEIGHT)
         self._about_terms = gui.add_html("", visible=False)
 
