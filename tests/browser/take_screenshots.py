@@ -74,7 +74,7 @@ def shoot_busy(page: Page, file: Path) -> None:
 def shoot_reloads(page: Page, file: Path) -> None:
     """The Run tab's account of a patched and of a rebuilt version, side by side."""
     tab(page, "Run")
-    folder = page.get_by_text("Version of the file", exact=True)
+    folder = page.get_by_text("Code version", exact=True)
     good, taken = TASK.read_text(), []
     edits = [
         ("patched in", "return reward\n", "return reward + 1\n"),

@@ -69,8 +69,8 @@ def back_to_the_file(page: Page) -> None:
 
     def back() -> bool:
         # What has just come is brought into sight: a press that is under way then falls beside its pill.
-        if "wb-off" not in tool(page, "Back to the file")["classes"]:
-            press_tool(page, "Back to the file")
+        if "wb-off" not in tool(page, "Reset to file")["classes"]:
+            press_tool(page, "Reset to file")
         return said.is_visible()
 
     until(back, "the camera as the file has it")
@@ -140,7 +140,7 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     press(page, "Show side by side")
     expect(page.locator(".wb-pair img")).to_have_count(2)
     expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
-    press(page, "Place it as A")
+    press(page, "Return to A")
     expect(page.get_by_text("measure it again")).to_have_count(0)
 
 
@@ -169,15 +169,15 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
     moved[2, 3] += 0.1  # world to camera, OpenCV: what is seen goes a decimetre away
     field = page.locator("textarea:visible")
     field.fill("\n".join(" ".join(map(str, row)) for row in moved))
-    press(page, "Place the camera by it")
+    press(page, "Apply to the camera")
     until(lambda: bool(np.allclose(shown_matrix(page), moved, atol=1e-6)), "the pasted pose")
     mirrored = moved.copy()
     mirrored[0] *= -1
     field.fill(json.dumps(mirrored.tolist()))
-    press(page, "Place the camera by it")
+    press(page, "Apply to the camera")
     expect(page.get_by_text("mirror image")).to_be_visible()
     field.fill(text)
-    press(page, "Place the camera by it")
+    press(page, "Apply to the camera")
     until(lambda: bool(np.allclose(shown_matrix(page), before, atol=1e-5)), "our own file's pose")
 
 

@@ -58,7 +58,7 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
     clock = Clock()
     panel = CurvesPanel(server)
     with page_at(browser, f"http://127.0.0.1:{server.get_port()}") as (page, errors):
-        expect(page.get_by_text("Curves appear with the second step.")).to_be_visible()
+        expect(page.get_by_text("Curves appear after the second step.")).to_be_visible()
 
         def draw(curves: Curves, env: int = 0) -> None:
             clock.passes()

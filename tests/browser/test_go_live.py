@@ -67,7 +67,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
 
         page.get_by_role("tab", name="Rescore").click()
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
-        page.get_by_role("button", name="Rescore what is open").click()
+        page.get_by_role("button", name="Rescore the open recordings").click()
         expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)
         page.get_by_text("reward by up to").click()
         expect(page.get_by_text("step 1 / 15").first).to_be_visible()

@@ -44,7 +44,7 @@ class _RecordBar:
             raise KeyboardInterrupt
         self.stop_requested = True
         # A step may never end.
-        self.describe("ending after this step; Ctrl-C again ends at once")
+        self.describe("stopping after this step; Ctrl-C again stops at once")
 
     def describe(self, text: str, kept: int | None = None) -> None:
         self._bar.update(self._row, description=text, completed=kept)
@@ -99,7 +99,7 @@ def record_in_terminal(what: RecordOptions) -> int:
         _print_kept(what, before)
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted; episodes that had ended are kept")
+        return refuse("interrupted; finished episodes were kept")
     return _print_result(requested, recorded)
 
 
@@ -108,7 +108,7 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
     if kept:
         folder = shlex.quote(str(requested.out))
         print_text(
-            f"{_episodes(kept)} that had ended before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
+            f"{_episodes(kept)} that had finished before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
         )
 
 
@@ -124,13 +124,13 @@ def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
     if recorded.start_corrected:
         count = _episodes(recorded.start_corrected)
         print_text(
-            f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
+            f"{count} did not start as recorded with the recorded seed, and were set to the recorded first state."
         )
     if recorded.written:
         folder = shlex.quote(str(recorded.written[0].path.parent))
         print_text(f"Look at them with: workbench review {folder}")
     if recorded.stopped:
-        return refuse("interrupted; episodes that had ended are kept")
+        return refuse("interrupted; finished episodes were kept")
     if requested.successes is not None and kept < requested.successes:
         wanted = "1 success was" if requested.successes == 1 else f"{requested.successes} successes were"
         return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")

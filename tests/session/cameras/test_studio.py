@@ -230,10 +230,10 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     # Taken back is the placement too, and one step of undo brings it again.
     assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
     assert view.studio.edit_state.message.endswith(
-        "base_camera is where the file places it; Undo puts it where you placed it."
+        "base_camera is where the file places it; Undo restores your placement."
     )
     wait_until(session, seen_from(BASE, start), "the camera where the file has it")
-    assert view.studio.undo == "took back the change of base_camera"
+    assert view.studio.undo == "reverted the change of base_camera"
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.studio.camera(BASE).now, now.now)

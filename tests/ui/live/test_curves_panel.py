@@ -174,7 +174,7 @@ def test_task_without_success_has_no_curve_of_it(panels: Panels, panel: CurvesPa
 def test_without_a_past_nothing_is_drawn(panels: Panels, panel: CurvesPanel) -> None:
     panel.draw(running(4, curves=None))
     panel.draw(seen(1, 4))
-    assert panels.charts() == [] and "Curves appear with the second step." in panels.html()
+    assert panels.charts() == [] and "Curves appear after the second step." in panels.html()
     panel.draw(seen(2, 4))
     assert len(panels.charts()) == 2 and "Curves appear" not in panels.html()
     panel.draw(seen(1, 4))

@@ -128,7 +128,7 @@ def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
     not_carried = "; ".join(view.timeline.not_carried)
     for arrived in ("", "<i>Push</i>, step 3: its actions were made again."):
         html = render("timeline_hint", live=True, not_carried=not_carried, arrived=arrived)
-        assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
+        assert "not restored: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
         assert ("&lt;i&gt;Push&lt;/i&gt;, step 3" in html) == bool(arrived) and "<i>" not in html
 
 

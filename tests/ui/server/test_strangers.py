@@ -87,7 +87,7 @@ def test_too_many_that_say_nothing_lock_nobody_out(gated_server, monkeypatch, ca
         idle[-1].settimeout(0.2)
         with pytest.raises(TimeoutError):
             idle[-1].recv(1)
-    assert "10 connections at a time do not show the token (from 127.0.0.1)" in caplog.text
+    assert "10 connections are open without the token (from 127.0.0.1)" in caplog.text
 
 
 @pytest.mark.parametrize(

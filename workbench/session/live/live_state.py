@@ -243,7 +243,7 @@ class LiveState:
             steps_per_second=0.0,
             real_time_factor=0.0,
             state="stopped" if death.gives_up else "starting",
-            activity="" if death.gives_up else "starting another worker",
+            activity="" if death.gives_up else "starting a new worker",
         )
         return problem
 

@@ -305,7 +305,7 @@ class PastRescorer:
                 done=done,
                 steps=done,
                 seconds=self.rescoring.view.seconds + seconds,
-                warnings=tuple(f"not put back: {what}: {why}" for what, why in missed.items()),
+                warnings=tuple(f"not restored: {what}: {why}" for what, why in missed.items()),
             )
             if answer.problem is not None:
                 raise JobFailed("the new code raised", answer.problem)

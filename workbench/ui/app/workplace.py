@@ -115,10 +115,8 @@ class Workplace:
             self._on_notice(str(error))
             return
         if recovered:
-            what = "An episode that was" if len(recovered) == 1 else f"{len(recovered)} episodes that were"
-            shelf.review.add_problem(
-                f"{what} left half written by a program that was killed can be seen again."
-            )
+            what = "An episode" if len(recovered) == 1 else f"{len(recovered)} episodes"
+            shelf.review.add_problem(f"{what} left half written by a killed program is back in the library.")
             self._on_notice(recovered_text(recovered))
             shelf.library.request_scan()
 

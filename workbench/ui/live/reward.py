@@ -32,7 +32,7 @@ MOST_NAMED = 12
 CHOICE = "Choose curves"
 HOW_TO = (
     'For a curve of each part of the reward, put info["reward_terms"] = {"reach": reach, ...} (tensors of shape '
-    "(num_envs,)) into the info that compute_dense_reward is given."
+    "(num_envs,)) into the info that compute_dense_reward receives."
 )
 AT_FIRST = (Group.REWARD, Group.TERM)
 """Drawn unless a person turns them off, as success is."""
@@ -68,7 +68,7 @@ class CurvesPanel(PagePart[SessionView]):
         self._presses = Presses(server)
         self._hint = gui.add_html("", visible=False)
         self._lost = gui.add_html("", visible=False)
-        self._empty = gui.add_html(render("note", text="Curves appear with the second step."))
+        self._empty = gui.add_html(render("note", text="Curves appear after the second step."))
         self._about_terms = gui.add_html("", visible=False)
 
     def key(self, view: SessionView) -> object:

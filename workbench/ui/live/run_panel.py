@@ -99,11 +99,11 @@ SPEEDS: dict[str, float] = {
     "2 ×": 2.0,
     "4 ×": 4.0,
     "8 ×": 8.0,
-    "as fast as it can": math.inf,
+    "unlimited": math.inf,
 }
 EPISODE_ENDS: dict[str, EpisodeEnd] = {
-    "reset that env": "reset",
-    "let it run on": "continue",
+    "reset the env": "reset",
+    "keep running": "continue",
     "pause": "pause",
 }
 SOURCES: dict[str, ActionSource] = {
@@ -198,13 +198,13 @@ class RunPanel(PagePart[SessionView]):
             )
             self._seed = Control(
                 gui.add_number(
-                    "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
+                    "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env."
                 ),
                 send=session.set_seed,
                 settle=0.6,
             )
             self._end = Control(
-                gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
+                gui.add_dropdown("At the end", tuple(EPISODE_ENDS), initial_value="reset the env"),
                 read=lambda value: EPISODE_ENDS[value],
                 send=lambda rule: session.change(episode_end=rule),
                 shown=lambda rule: _name_of(EPISODE_ENDS, rule),

@@ -99,9 +99,9 @@ def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
     if env is None:
         return None
     outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
-    when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the episode before")
+    when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the previous episode")
     envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
-    press = "Press to see it" if env in rows.outliers else "Press to choose it"
+    press = "Click to see it" if env in rows.outliers else "Click to select it"
     hint = f"In env {env}, {when}: {outlier.reason}. {press}; the table of envs (B) has them all."
     return f"⚑ {envs}flagged: {outlier.reason}", hint
 
@@ -147,7 +147,7 @@ def _doing(busy: Busy) -> str:
         at = f" at {place(busy)}" if busy.file else ""
         return f"by a debugger{at} for {busy.seconds:.0f} s; continue from there, not from this page"
     if busy.getting_ready:
-        return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
+        return f"a new worker is getting ready (shaders are compiled once per process), {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
 
 

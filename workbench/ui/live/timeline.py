@@ -91,6 +91,7 @@ class TimeBar(PagePart[View]):
         # Across the bottom of the view: viser docks panels at the sides only.
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
         self._shown: int | None = None
+        self._folded = False
         self._before_slider: int | None = None
         """The place that was shown before the slider was last moved."""
 
@@ -100,10 +101,10 @@ class TimeBar(PagePart[View]):
     def commands(self) -> list[Command]:
         """Commands of the arrow keys."""
         return [
-            Command("A step back in time", lambda: self._step_by(-1), "arrowleft"),
-            Command("A step on in time", lambda: self._step_by(1), "arrowright"),
-            Command("To the event before", lambda: self._to_event(-1), "arrowleft", "shift"),
-            Command("To the next event", lambda: self._to_event(1), "arrowright", "shift"),
+            Command("One step back", lambda: self._step_by(-1), "arrowleft"),
+            Command("One step forward", lambda: self._step_by(1), "arrowright"),
+            Command("Previous event", lambda: self._to_event(-1), "arrowleft", "shift"),
+            Command("Next event", lambda: self._to_event(1), "arrowright", "shift"),
         ]
 
     def _step_by(self, steps: int) -> None:
@@ -126,6 +127,12 @@ class TimeBar(PagePart[View]):
 
     def _on_walk(self, name: str) -> None:
         next(does for label, does in self._does.items() if name.startswith(label))()
+
+    def fold(self, wanted: bool) -> None:
+        """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
+        if wanted != self._folded:
+            self._folded = wanted
+            (self._panel.minimize if wanted else self._panel.expand)()
 
     def _draw_panel(self, there: bool, shown: int | None) -> bool:
         self._panel.visible = there

@@ -16,7 +16,7 @@ from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
-AS_NEEDED, PATCHED, CAMERAS, REBUILT = "Load again", "Patch", "Cameras", "Rebuild"
+AS_NEEDED, PATCHED, CAMERAS, REBUILT = "Reload", "Patch", "Cameras", "Rebuild"
 LEVELS: dict[str, LoadLevel] = {
     AS_NEEDED: "auto",
     PATCHED: "patched",
@@ -40,7 +40,7 @@ class VersionPanel(PagePart[SessionView]):
         self._names: tuple[str, ...] = ("",)
         # viser's annotations infer the option type from the first options.
         add_dropdown: Any = server.gui.add_dropdown
-        with server.gui.add_folder("Version of the file"):
+        with server.gui.add_folder("Code version"):
             self._task = Control(
                 add_dropdown("Task", self._names, visible=False, hint="The file has several tasks."),
                 send=session.versions.choose_class,
@@ -49,8 +49,8 @@ class VersionPanel(PagePart[SessionView]):
             self._again = server.gui.add_button_group(
                 "",
                 tuple(LEVELS),
-                hint="Load again: by the least that is safe. Patch: only the code. Cameras: code and cameras. "
-                "Rebuild: the scene too, with the moment put back. A patch that was not found safe can leave old "
+                hint="Reload: as little as is safe. Patch: only the code. Cameras: code and cameras. "
+                "Rebuild: the scene too, with the moment restored. A patch that was not found safe can leave old "
                 "and new code mixed.",
             )
             self._again.on_click(lambda event: self._load(event.target.value))
