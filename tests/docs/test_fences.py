@@ -128,7 +128,7 @@ def test_what_a_page_says_to_type_works(page: Path, desk: Path, renderer: None, 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1500)
 @pytest.mark.parametrize(
     "page",
     [page for page in TYPED if any(f.mark == "slow" for f in fences(page))],
@@ -189,7 +189,7 @@ def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) 
         opens(words, desk)
         return
     ended = subprocess.run(
-        words, cwd=desk, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=300
+        words, cwd=desk, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=800
     )
     said = " ".join((ended.stdout + ended.stderr).split())
     assert (ended.returncode == 0) == (wanted is None), f"{fence.place}: {shlex.join(words)} says {said}"
