@@ -149,7 +149,7 @@ def html_of(topic: Topic) -> str:
 
 _PICTURE = (
     r'<picture><source media="(prefers-color-scheme: light)" srcset="\1light/\2">'
-    r'<img src="\1dark/\2" alt="\3" loading="lazy"></picture>'
+    r'<img src="\1dark/\2" alt="\3"></picture>'
 )
 
 
