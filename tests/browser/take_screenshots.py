@@ -102,6 +102,7 @@ def live_page(browser: Browser, *arguments: str, task: str = "") -> Iterator[Des
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / TASK.name
         file.write_text(task or TASK.read_text())
+        shutil.copy(POLICY, file.parent)
         with open_workbench(str(file), *arguments, cwd=file.parent) as opened:
             page, _ = new_page(browser)
             page.goto(opened.url)
@@ -115,7 +116,7 @@ def take_policy(desk: Desk) -> None:
     """The policy acts, which is careless in every fifth env."""
     desk.choose("Source", "policy")
     label = desk.page.locator("div", has=desk.page.get_by_text("Policy", exact=True)).last
-    label.locator("xpath=../../..").locator("input").last.fill(f"{POLICY}:act")
+    label.locator("xpath=../../..").locator("input").last.fill(f"{POLICY.name}:act")
     time.sleep(3)
 
 
