@@ -68,10 +68,13 @@ class Desk:
         assert old in text
         self.file.write_text(text.replace(old, new, 1))
 
-    def play(self, seconds: float) -> None:
-        self.press("Space")
-        time.sleep(seconds)
-        self.press("Space")
+    def step(self, steps: int) -> None:
+        """As many steps as this also on a busy machine; returns when the page shows the last."""
+        self.press(*steps * ["s"])
+        timeline = self.page.locator(".wb-timeline")
+        shown = ""
+        while shown != (shown := timeline.inner_text()):
+            time.sleep(3.0)
 
     def wear(self, theme: Literal["dark", "light"]) -> None:
         if theme != self.theme:
@@ -200,7 +203,7 @@ def shoot_envs(browser: Browser) -> None:
     with live_page(browser, "--num-envs", "16", *CONTROL, task=text) as desk:
         take_policy(desk)
         desk.tab("Reward")
-        desk.play(10)
+        desk.step(62)
         desk.press("b", "Shift+E", "f")
         desk.shoot("envs")
 
@@ -222,7 +225,7 @@ def shoot_studio(browser: Browser) -> None:
 def shoot_measured_camera(browser: Browser) -> None:
     """What a camera sees of all envs: the table, the depths, and the pictures."""
     with live_page(browser, "--num-envs", "16") as desk:
-        desk.play(4)
+        desk.step(20)
         desk.tab("Studio")
         desk.choose("Camera", "base_camera · sensor")
         desk.page.get_by_text("Measure", exact=True).click()
@@ -241,10 +244,10 @@ def shoot_branch(browser: Browser) -> None:
     """The selected env goes back some steps and on from there; then a moment of that branch is looked at."""
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         take_policy(desk)
-        desk.play(3)
+        desk.step(40)
         desk.press(*18 * ["ArrowLeft"], "g")
         time.sleep(2)
-        desk.play(1.5)
+        desk.step(25)
         desk.tab("Reward")
         desk.press(*5 * ["ArrowLeft"])
         desk.shoot("branch")
@@ -254,7 +257,7 @@ def shoot_rescored(browser: Browser) -> None:
     """A reward that asks for less is saved: what it says of the episodes so far, and one moment of them."""
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         take_policy(desk)
-        desk.play(8)
+        desk.step(70)
         desk.tab("Reward")
         desk.edit("reach = 1 - torch.tanh(5 * distance)", "reach = 1 - torch.tanh(3 * distance)")
         rows = desk.page.locator(".wb-again-table tbody tr")
@@ -274,7 +277,7 @@ def shoot_busy(browser: Browser) -> None:
         place += 1
     lines[place + 1 : place + 1] = ["        while self.elapsed_steps.max() >= 0:", "            continue"]
     with live_page(browser, "--num-envs", "16") as desk:
-        desk.play(3)
+        desk.step(25)
         desk.file.write_text("\n".join(lines) + "\n")
         expect(desk.page.get_by_role("button", name="Interrupt", exact=True)).to_be_visible(timeout=60_000)
         desk.tab("Log")
