@@ -150,7 +150,7 @@ def shoot_studio(chromium: str) -> None:
                 page.keyboard.press(key)
                 time.sleep(0.1)
             page.get_by_role("button", name="Show the change").click()
-            page.get_by_role("button", name="Write it to push_cube.py").scroll_into_view_if_needed()
+            page.get_by_role("button", name="Save to push_cube.py").scroll_into_view_if_needed()
             shoot(page, "studio")
 
 
@@ -204,7 +204,7 @@ def shoot_review(chromium: str) -> None:
             page.keyboard.up("Control")
             page.keyboard.press("Enter")
             tab(page, "Compare")
-            expect(page.get_by_text(re.compile("They part at"))).to_be_visible(timeout=60_000)
+            expect(page.get_by_text(re.compile("They diverge at"))).to_be_visible(timeout=60_000)
             page.keyboard.press("End")
             shoot(page, "compare")
 
