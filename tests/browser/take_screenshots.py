@@ -55,7 +55,7 @@ def shoot_branch(page: Page) -> None:
     for _ in range(5):
         page.get_by_role("button", name="‹ step", exact=True).click()
     shoot(page, "branch")
-    page.get_by_role("button", name="now", exact=True).click()
+    page.get_by_role("button", name="live", exact=True).click()
 
 
 def shoot_busy(page: Page, file: Path) -> None:
@@ -241,7 +241,7 @@ def shoot_rescored(page: Page, file: Path) -> None:
     time.sleep(2.0)
     page.locator(".wb-again-more").scroll_into_view_if_needed()
     shoot(page, "rescored")
-    page.get_by_role("button", name="now", exact=True).click()
+    page.get_by_role("button", name="live", exact=True).click()
     file.write_text(good)
     expect(page.get_by_text("Nothing differs").first).to_be_visible(timeout=120_000)
 

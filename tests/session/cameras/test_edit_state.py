@@ -109,7 +109,7 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
     for name in ("front", "other"):
         studio.file.plan(EditRequest("remove", ("human", name)))
-        assert f"{name} is no longer in" in written(session).message
+        assert f"{name}: removed from" in written(session).message
     assert names(session) == ["render_camera"] and task_file.read_text().count(
         "CameraConfig("
     ) == before.count("CameraConfig(")

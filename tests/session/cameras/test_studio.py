@@ -449,7 +449,7 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
         session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
     )
     assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
-    assert view.studio.undo == "took base_camera from the file"
+    assert view.studio.undo == "reloaded base_camera from the file"
     session.studio.undo()
     wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
     serial = view.task_serial
