@@ -55,7 +55,7 @@ def shoot_branch(page: Page) -> None:
     for _ in range(5):
         page.get_by_role("button", name="‹ step", exact=True).click()
     shoot(page, "branch")
-    page.get_by_role("button", name="now", exact=True).click()
+    page.get_by_role("button", name="live", exact=True).click()
 
 
 def shoot_busy(page: Page, file: Path) -> None:
@@ -150,7 +150,7 @@ def shoot_studio(chromium: str) -> None:
                 page.keyboard.press(key)
                 time.sleep(0.1)
             page.get_by_role("button", name="Show the change").click()
-            page.get_by_role("button", name="Write it to push_cube.py").scroll_into_view_if_needed()
+            page.get_by_role("button", name="Save to push_cube.py").scroll_into_view_if_needed()
             shoot(page, "studio")
 
 
@@ -204,7 +204,7 @@ def shoot_review(chromium: str) -> None:
             page.keyboard.up("Control")
             page.keyboard.press("Enter")
             tab(page, "Compare")
-            expect(page.get_by_text(re.compile("They part at"))).to_be_visible(timeout=60_000)
+            expect(page.get_by_text(re.compile("They diverge at"))).to_be_visible(timeout=60_000)
             page.keyboard.press("End")
             shoot(page, "compare")
 
@@ -241,7 +241,7 @@ def shoot_rescored(page: Page, file: Path) -> None:
     time.sleep(2.0)
     page.locator(".wb-again-more").scroll_into_view_if_needed()
     shoot(page, "rescored")
-    page.get_by_role("button", name="now", exact=True).click()
+    page.get_by_role("button", name="live", exact=True).click()
     file.write_text(good)
     expect(page.get_by_text("Nothing differs").first).to_be_visible(timeout=120_000)
 
