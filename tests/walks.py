@@ -290,7 +290,7 @@ def walk_all(browser: Browser, folder: Path) -> list[Walked]:
             until(lambda: numbers(page, "Position")[1] == numbers(page, "Looks at")[1], "both numbers")
             page.get_by_role("button", name="Show the change").click()
             expect(page.locator(".wb-diff-add")).to_contain_text("look_at(")
-            page.get_by_role("button", name="Write it to push_cube.py").click()
+            page.get_by_role("button", name="Save to push_cube.py").click()
 
         saving, stepping, placing = WALKS
         page.get_by_role("tab", name="Reward").click()

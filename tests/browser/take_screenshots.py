@@ -161,7 +161,7 @@ def shoot_reload(browser: Browser) -> None:
         for level, edit in edits.items():
             desk.edit(*edit)
             expect(desk.page.get_by_text(level).first).to_be_visible(timeout=60_000)
-            desk.page.get_by_text("Version of the file", exact=True).scroll_into_view_if_needed()
+            desk.page.get_by_text("Code version", exact=True).scroll_into_view_if_needed()
             desk.page.get_by_role("button", name="Rebuild", exact=True).scroll_into_view_if_needed()
             for theme in THEMES:
                 desk.wear(theme)
@@ -217,7 +217,7 @@ def shoot_studio(browser: Browser) -> None:
         expect(show).to_be_visible()
         desk.press(*12 * ["Alt+ArrowLeft"], *12 * ["Alt+Shift+ArrowRight"])
         show.click()
-        write = desk.page.get_by_role("button", name=re.compile("^Write it to"))
+        write = desk.page.get_by_role("button", name=re.compile("^Save to"))
         write.evaluate("e => e.scrollIntoView({block: 'end'})")
         desk.shoot("studio")
 
@@ -327,7 +327,7 @@ def shoot_review(browser: Browser) -> None:
             page.keyboard.up("Control")
             desk.press("Enter")
             desk.tab("Compare")
-            expect(page.get_by_text(re.compile("They part at|They diverge"))).to_be_visible(timeout=60_000)
+            expect(page.get_by_text(re.compile("They diverge at"))).to_be_visible(timeout=60_000)
             desk.press("End")
             desk.shoot("compare")
             page.close()

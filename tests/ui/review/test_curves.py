@@ -85,9 +85,9 @@ def test_of_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
     steps, anchor = 1000, 400
     for position in (-400, -399, 0, 1, 599, 600):
         positions, line, dot = drawn(server, aligned((steps, anchor), position=position))
-        assert positions[:3] == [-400, -398, -396] and len(positions) == 501
+        assert (positions[0], positions[-1]) == (-400 + 1, 600) and 400 < len(positions) <= 600
         (at,) = [i for i, value in enumerate(dot) if value is not None] or [0]
-        assert abs(positions[at] - position) <= 1
+        assert abs(positions[at] - position) <= 3
         value = position + anchor  # its own, and not that of the point
         assert dot[at] == (None if value == 0 else value)
         assert line[at] in (None, positions[at] + anchor)

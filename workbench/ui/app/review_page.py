@@ -118,7 +118,7 @@ class ReviewPage:
                 server, self._want, "This recording has no pictures.", clock=self._clock
             )
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
-            numbers, curves = ReviewNumbers(server), ReviewCurves(server)
+            numbers, curves = ReviewNumbers(server), ReviewCurves(server, review.seek)
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
             compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
@@ -144,7 +144,7 @@ class ReviewPage:
         self._library.add_action(
             Action(
                 "Side by side",
-                "Watch them all at once, each at its own place (Shift Enter)",
+                "Show them side by side (Shift Enter)",
                 self._open_side_by_side,
                 MOST_OPEN,
                 "Open the selected recordings side by side",
@@ -155,7 +155,7 @@ class ReviewPage:
         self._library.add_action(
             Action(
                 "Rescore",
-                "Run today's reward and evaluate over them (J)",
+                "Run the current reward and evaluate over them (J)",
                 self._rescore.rescore_and_notify,
             )
         )
@@ -215,7 +215,7 @@ class ReviewPage:
         chosen = view.chosen
         cameras = () if chosen is None else self._reader.cameras(chosen.episode)
         pictures = self._pictures if self._cameras.show_frustums else {}
-        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.triangles, cameras, pictures)
+        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
@@ -318,15 +318,15 @@ class ReviewPage:
         commands = [
             Command("Play or pause", review.toggle_play, "space"),
             *timeline.commands(),
-            Command("The first moment", review.to_first, "home"),
-            Command("The last moment", review.to_last, "end"),
+            Command("Go to the first moment", review.to_first, "home"),
+            Command("Go to the last moment", review.to_last, "end"),
             Command("Next recording", lambda: self._panel.select_neighbour(1), "N"),
             Command("Previous recording", lambda: self._panel.select_neighbour(-1), "P"),
-            Command("Over each other or side by side", self._panel.toggle_arrangement, "O"),
-            Command("Frame what is shown", self._in_3d.frame, "F"),
+            Command("Overlaid or side by side", self._panel.toggle_arrangement, "O"),
+            Command("Frame the scene", self._in_3d.frame, "F"),
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
-            Command("Dark or light", self._view_panel.toggle_dark, "D"),
-            Command("Rescore the selected recordings, or else the open ones", self._rescore_chosen, "J"),
+            Command("Switch between dark and light", self._view_panel.toggle_dark, "D"),
+            Command("Rescore the selected recordings, or the open ones", self._rescore_chosen, "J"),
             Command("Continue live from here", self._panel.enter_recording, "G"),
         ]
         if self._place.session is not None:

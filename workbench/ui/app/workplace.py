@@ -60,6 +60,7 @@ class Workplace:
         tasks: Task files that may define the envs of foreign recordings.
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
+        editor: Address of a line in the author's editor, as `parse_editor` gives it.
     """
 
     def __init__(
@@ -72,9 +73,10 @@ class Workplace:
         tasks: tuple[Path, ...] = (),
         trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
+        editor: str = "",
     ) -> None:
         self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
-        self._imports, self._on_notice = base.imports, on_notice
+        self._imports, self._on_notice, self._editor = base.imports, on_notice, editor
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._recovering: threading.Thread | None = None
@@ -117,10 +119,8 @@ class Workplace:
             self._on_notice(str(error))
             return
         if recovered:
-            what = "An episode that was" if len(recovered) == 1 else f"{len(recovered)} episodes that were"
-            shelf.review.add_problem(
-                f"{what} left half written by a program that was killed can be seen again."
-            )
+            what = "An episode" if len(recovered) == 1 else f"{len(recovered)} episodes"
+            shelf.review.add_problem(f"{what} left half written by a killed program is back in the library.")
             self._on_notice(recovered_text(recovered))
             shelf.library.request_scan()
 
@@ -151,7 +151,13 @@ class Workplace:
 
         assert self.session is not None, "the live page is shown with its session"
         return Page(
-            self.server, self.session, dark, lambda: self.pages.show("review"), self.stage, self.commands
+            self.server,
+            self.session,
+            dark,
+            lambda: self.pages.show("review"),
+            self.stage,
+            self.commands,
+            editor=self._editor,
         )
 
 

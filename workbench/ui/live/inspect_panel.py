@@ -155,12 +155,12 @@ class InspectPanel(PagePart[SessionView]):
             "Show",
             tuple(CHOICES),
             initial_value=NOTHING,
-            hint="Read of the selected env, five times a second.",
+            hint="Read from the selected env, five times a second.",
         )
         self._forces = server.gui.add_checkbox(
             "Force arrows",
             False,
-            hint="Draw the contact forces of the selected env as arrows in the 3-D view.",
+            hint="Draw the contact forces of the selected env as arrows in the 3D view.",
         )
         self._handle = server.gui.add_html("")
         self._asked: tuple[object, ...] | None = None
@@ -236,7 +236,7 @@ def inspect_html(
     note = ""
     env, section = view.selected_env, CHOICES[choice]
     if view.task is None or view.step is None:
-        note = "There is something to inspect when the task is loaded."
+        note = "There is something to inspect when the task has loaded."
     elif choice == NOTHING:
         note = (
             "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "
@@ -258,7 +258,7 @@ def inspect_html(
         elif section == "contacts":
             contacts = () if no_step_yet else now.contacts or ()
             if no_step_yet:
-                note += ": what touches what is not known before the next step"
+                note += ": contacts are known after the next step"
             elif not contacts:
                 note += ": nothing touches anything"
         elif section == "observation":
@@ -266,9 +266,9 @@ def inspect_html(
         elif section == "state":
             leaves = leaf_rows(now.state or (), before.state if before else None)
         if view.timeline.shown is not None:
-            note += "; this is live, since of the past only the poses are kept"
+            note += "; this is live: of past moments only the poses are kept"
         if section in ("observation", "state"):
-            note += "; numbers that changed since the reading before are blue"
+            note += "; numbers that changed since the previous reading are blue"
     return render(
         "inspect",
         note=note,
@@ -296,7 +296,7 @@ WEAKEST = 1e-3
 
 
 class ForceArrows:
-    """Contact forces of one env as arrows in the 3-D view.
+    """Contact forces of one env as arrows in the 3D view.
 
     One arrow for each contact point, along the force on the first body of the pair. Forces span five decades (a cube's
     weight on four corners, a hand pressed into a table), so the length grows with the cube root of the force and is

@@ -30,14 +30,17 @@ and body, or a file. Runs in a thread, so it may read files."""
 
 SCRIPTS = (
     "no_eval.js",
+    "needs_webgl.js",
     "let_in.js",
     "typed_first.js",
     "pressed.js",
+    "curve_clicks.js",
     "keys.js",
     "pressed_by_key.js",
     "view_stays.js",
     "library_keys.js",
     "view_width.js",
+    "envs_width.js",
     "unfolded.js",
     "typed_numbers.js",
     "steady_resolution.js",
