@@ -83,7 +83,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         expect(page.get_by_role("button", name="Stay here")).to_be_visible()
         changed = "changed since: compute_normalized_dense_reward"
         told = page.get_by_text(
-            f"WorkbenchPushCube-v1, seed 5, step 2 ({changed}): its actions were made again"
+            f"WorkbenchPushCube-v1, seed 5, step 2 ({changed}): its actions were replayed"
         )
         expect(told).to_be_visible(timeout=PATIENT)
         assert page.evaluate("window.fewest") > 5, "the view was empty for a while"
@@ -97,7 +97,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         page.locator('input[value="today\'s"]:visible').click()
         page.get_by_role("option", name="as recorded", exact=True).click()
         live.click()
-        told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were made again")
+        told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were replayed")
         expect(told).to_be_visible(timeout=PATIENT)
         assert list(author.glob("workbench-recorded-*/push_cube.py"))
         assert not [error for error in errors if "non-existent component" not in error]

@@ -130,7 +130,7 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     page, errors = desk
     open_both(page)
     page.get_by_role("tab", name="Compare").click()
-    expect(page.get_by_text(re.compile("They part at step 1"))).to_be_visible()
+    expect(page.get_by_text(re.compile("They diverge at step 1"))).to_be_visible()
     page.locator("tr", has=page.get_by_text("bodies", exact=True)).click()
     says(page, "step 1 /")
     page.get_by_role("button", name="Swap A and B").click()

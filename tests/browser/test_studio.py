@@ -57,7 +57,7 @@ def page(opened: Page) -> Page:
     expect(opened.get_by_role("button", name="Show the change")).to_be_visible()
     if "wb-off" not in tool(opened, "Reset to file")["classes"]:
         press(opened, "Reset to file")
-    expect(opened.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
+    expect(opened.get_by_text(re.compile("^As in push_cube.py"))).to_be_visible()
     return opened
 
 
@@ -95,7 +95,7 @@ def arc_about_x(page: Page) -> tuple[float, float] | None:
 
 def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> None:
     choose(opened, NO_CAMERA)
-    expect(opened.get_by_text("Choose a camera here, or press its frustum")).to_be_visible()
+    expect(opened.get_by_text("Choose a camera here, or click its frustum")).to_be_visible()
 
     def orange() -> tuple[NDArray[np.intp], ...]:
         r, g, b = np.moveaxis(view(opened), -1, 0)
@@ -105,7 +105,7 @@ def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> No
     ys, xs = orange()
     x, y = (xs.min() + xs.max()) / 2 + VIEW["x"], (ys.min() + ys.max()) / 2
     opened.mouse.click(x, y)
-    expect(opened.get_by_text(re.compile("^As push_cube.py has it, line"))).to_be_visible()
+    expect(opened.get_by_text(re.compile("^As in push_cube.py, line"))).to_be_visible()
     assert numbers(opened, "Position") == [0.45, 0, 0.6] and numbers(opened, "Looks at") == [0.08, 0, 0]
 
 
@@ -136,12 +136,12 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     assert task_file.read_text() == text
     until(lambda: numbers(page, "Position")[1] == numbers(page, "Looks at")[1], "both numbers")
     moved = numbers(page, "Position")[1]
-    page.get_by_role("button", name="Write it to push_cube.py").click()
-    expect(page.get_by_text("the new env has it")).to_be_visible()
+    page.get_by_role("button", name="Save to push_cube.py").click()
+    expect(page.get_by_text("saved to push_cube.py and verified")).to_be_visible()
     assert base_camera(task_file) == ([0.45, moved, 0.6], [0.08, moved, 0])
-    expect(page.get_by_text(re.compile("^As push_cube.py has it, line"))).to_be_visible()
+    expect(page.get_by_text(re.compile("^As in push_cube.py, line"))).to_be_visible()
     page.get_by_role("button", name="Revert in the file").click()
-    expect(page.get_by_text("push_cube.py is as it was before.")).to_be_visible()
+    expect(page.get_by_text("Edit reverted in push_cube.py.")).to_be_visible()
     assert task_file.read_text() == text
     page.get_by_role("button", name="Close", exact=True).click()
 
@@ -291,11 +291,11 @@ def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path)
     until(lambda: picture(page) not in ("", before), "the picture with another centre")
     button(page, "Show the change")
     expect(page.locator(".wb-diff-add").filter(has_text="intrinsic=")).to_contain_text("[150")
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text("the new env has it")).to_be_visible()
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text("saved to push_cube.py and verified")).to_be_visible()
     assert "fov=1.0, near=0.01, far=10)" not in task_file.read_text() and "70" in task_file.read_text()
     button(page, "Revert in the file")
-    expect(page.get_by_text(f"{FILE} is as it was before.")).to_be_visible()
+    expect(page.get_by_text(f"Edit reverted in {FILE}.")).to_be_visible()
     assert task_file.read_text() == text
     button(page, "Close")
     press(page, "Reset to file")
@@ -307,7 +307,7 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
     page.locator(field(page, "New name")).fill("third")
     button(page, "Add sensor")
-    expect(page.get_by_text(re.compile("It looks from your side at cube, goal from 0"))).to_be_visible()
+    expect(page.get_by_text(re.compile("It looks at cube, goal from your side, 0"))).to_be_visible()
     sight = page.get_by_alt_text("what it would see")
     until(lambda: sight.evaluate("e => e.naturalWidth") == 128, "its picture, before it is written")
     assert task_file.read_text() == before
@@ -317,17 +317,17 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     expect(page.locator(".wb-diff:visible")).to_have_count(0)
     button(page, "Add human view")
     expect(page.locator(".wb-diff-add").filter(has_text='"third"').first).to_be_visible()
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text(f"third is in {FILE}, and the env has it.")).to_be_visible()
-    expect(page.locator("input[aria-haspopup=listbox]:visible").first).to_have_value("third · for people")
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text(f"third: added to {FILE} and verified.")).to_be_visible()
+    expect(page.locator("input[aria-haspopup=listbox]:visible").first).to_have_value("third · human view")
     page.locator(field(page, "New name")).fill("fourth")
     button(page, "Rename")
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text(f"third is fourth in {FILE} now.")).to_be_visible()
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text(f"third: renamed to fourth in {FILE} and verified.")).to_be_visible()
     assert '"fourth"' in task_file.read_text() and '"third"' not in task_file.read_text()
     button(page, "Remove")
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text(f"fourth is no longer in {FILE}.")).to_be_visible()
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text(f"fourth: removed from {FILE} and verified.")).to_be_visible()
     assert '"fourth"' not in task_file.read_text()
     assert task_file.read_text().count("CameraConfig(") == before.count("CameraConfig(")
     page.get_by_text("Add, copy, rename, remove", exact=True).click()

@@ -315,7 +315,7 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
     assert record_in_terminal(what) == 1
     said = capsys.readouterr()
     assert "policy failed" in said.err and "tired" in said.err
-    assert "1 episode that had ended before is kept: workbench review" in said.out
+    assert "1 episode that had finished before is kept: workbench review" in said.out
 
 
 def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go(

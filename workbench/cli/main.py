@@ -343,6 +343,18 @@ def doctor() -> int:
     return main()
 
 
+@app.command(name="help")
+def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
+    """Show a page of the documents, or list the topics.
+
+    Args:
+        topic: name of the page, such as cameras; without one, all are listed.
+    """
+    from workbench.cli import help
+
+    return help.show_help(topic)
+
+
 def _lacks_maniskill(command: str) -> bool:
     """Say what to type where the command cannot do its work for want of ManiSkill, and warn of two that are mixed."""
     lines = lines_if_lacking(f"workbench {command}", sys.argv[1:])

@@ -141,7 +141,7 @@ def _serve(
     close_session: Callable[[], None],
 ) -> NoReturn:
     if gated_server.options.token:
-        place.commands = (Command("Renew the token and close every page", requests.renew),)
+        place.commands += (Command("Renew the token and close every page", requests.renew),)
     requests.handle_signals()
     try:
         place.pages.start(first)

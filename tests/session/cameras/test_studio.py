@@ -308,9 +308,7 @@ def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Pa
     assert target(view) == (0.08, 0, 0.2)
     task_file.write_text(good)
     wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
-    wait_until(
-        session, said(lambda s: "is where the file says" in s.problem), "that the placement is dropped"
-    )
+    wait_until(session, said(lambda s: "follows it" in s.problem), "that the placement is dropped")
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert view.studio.problem == "", "what was said before a person did something about it"
@@ -451,7 +449,7 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
         session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
     )
     assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
-    assert view.studio.undo == "took base_camera from the file"
+    assert view.studio.undo == "reloaded base_camera from the file"
     session.studio.undo()
     wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
     serial = view.task_serial

@@ -83,7 +83,7 @@ def test_an_answer_of_another_kind_is_none() -> None:
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(asker.ask, go_on, question(0))
         asker.take(Answer(line.calls.get(timeout=10).number, pack(("no", "report"))))
-        with pytest.raises(JobFailed, match="answered with what cannot be read"):
+        with pytest.raises(JobFailed, match="answered with unreadable data"):
             asked.result(timeout=10)
 
 

@@ -117,7 +117,7 @@ def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pyte
     shown.draw()
     ghost = shown.panels.bodies("cube")
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
-    assert "They part at step 1" in shown.panels.part("Compare").html()
+    assert "They diverge at step 1" in shown.panels.part("Compare").html()
     assert "reward = 2" in shown.panels.part("Compare").html()
     assert len(shown.chart("reward").series) == 4, "step, two lines and the dot"
     shown.panels.command("Overlaid or side by side")

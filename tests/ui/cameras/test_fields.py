@@ -192,7 +192,7 @@ def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_s
 @pytest.mark.parametrize(
     ("label", "value", "why"),
     [
-        ("Near, far", (3.0, 2.0), "nearer than what is far"),
+        ("Near, far", (3.0, 2.0), "less than far"),
         ("Width, height", (64.4, 48.0), "whole number"),
         ("Width, height", (128.4, 96.0), "whole number"),
         ("w x y z", "1 0 0", "four numbers"),

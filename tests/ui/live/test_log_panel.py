@@ -69,5 +69,5 @@ def test_held_still_it_waits_and_cleared_it_does_not(panels: Panels, clock: Cloc
 
 def test_memory_is_said_of_both_processes() -> None:
     html = vitals_html(Vitals(700 * 2**20, 8 * 2**30, 800 * 2**20, False))
-    assert all(part in html for part in ("700 MB of 8.0 GB", "spare worker 800 MB", "being warmed up"))
+    assert all(part in html for part in ("700 MB of 8.0 GB", "spare worker 800 MB", "warming up"))
     assert "spare" not in vitals_html(Vitals(700 * 2**20, None, None, False))

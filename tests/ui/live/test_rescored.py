@@ -93,7 +93,7 @@ def rescoring(panels: Panels, clock: Clock) -> Rescoring:
         (RescoreView("loading"), "loading the new code"),
         (RescoreView("rescoring", done=26, total=50), "50 %"),
         (done(episode(), same(1)), "1 of 2 episodes differs."),
-        (done(same(1), differing_names={"new"}), "as they were. Other entries differ: new."),
+        (done(same(1), differing_names={"new"}), "are unchanged. Other entries differ: new."),
         (RescoreView("stopped", why="the file was saved again"), "the file was saved again"),
     ],
 )

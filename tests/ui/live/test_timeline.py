@@ -196,7 +196,7 @@ def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
     lived.draw()
     assert not lived.panels.shows(SLIDER)
     assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
-    assert "1 step<" in lived.strip()
+    assert "history: 1 step," in lived.strip()
     lived.step(1)
     assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)
 

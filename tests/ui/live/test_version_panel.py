@@ -32,7 +32,7 @@ def test_what_a_build_could_not_carry_is_named_up_to_a_number() -> None:
     html = version_html(
         ReloadReport("rebuilt", "_load_scene changed", ("actor goal",), missing), 1500.0, True
     )
-    assert "1.5 s" in html and "put back" in html
+    assert "1.5 s" in html and "was restored" in html
     assert "actor cube_0" in html and f"actor cube_{MOST_SHOWN}" not in html and "and 3 more" in html
 
 
@@ -61,7 +61,7 @@ def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: P
     told = panels.html()
     assert (
         told.index("not loaded")
-        < told.index("The version before it still runs")
+        < told.index("The previous version is still running")
         < told.index("only evaluate")
     )
     assert "push.py:88" in told and "KeyError" in told

@@ -20,6 +20,7 @@ from workbench.session.live.session import Session
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.recorded_scene import SceneProcess
 from workbench.session.review.review import Review
+from workbench.ui.app import help_pages
 from workbench.ui.app.go_live import GoLive, MakeSession
 from workbench.ui.app.review_page import ReviewPage
 from workbench.ui.app.trust_dialog import TrustDialog
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Which = Literal["live", "review"]
+HELP = Command("Help", lambda: None)
+"""The browser itself opens the page (``web_assets/help.js``)."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class Workplace:
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._recovering: threading.Thread | None = None
-        self.commands: tuple[Command, ...] = ()
+        self.commands: tuple[Command, ...] = (HELP,)
         """In the palette of both pages; set before the first page is shown."""
         self.session = session
         """Shown by the live page when it is next built."""
@@ -88,6 +91,7 @@ class Workplace:
         self.go_live = GoLive(self, make_session, clearances, base)
         self.rescorer, self.rescore_choices = Rescorer(clearances, base), RescoreChoices()
         self.sharing = Sharing(gated_server)
+        gated_server.add_route(help_pages.ADDRESS, help_pages.reply, help_pages.HEADERS)
         self.stage = Stage(self.server)
         self.pages = Pages(self.server, self.stage, self._page)
 

@@ -33,13 +33,13 @@ RANGE_EVERY = 0.5
 """Seconds. A slider whose ends move at every step cannot be held."""
 STANDS_STILL = 0.35
 """Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
-LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "step ›", "event ›", "now"
+LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
 EPISODE, EVERYTHING = "zoom to episode", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Continue from here"
 UNDO = "undo"
 """Start of the undo button's label; what is undone follows."""
-WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
+WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE, EPISODE)
 View = TypeVar("View", contravariant=True)
 
 
@@ -153,7 +153,7 @@ class TimelinePanel(TimeBar[SessionView]):
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         zooms = {EPISODE: partial(self._zoom, True), EVERYTHING: partial(self._zoom, False)}
-        does = {NOW: self.go_live, **zooms, UNDO: session.past.undo}
+        does = {LIVE: self.go_live, **zooms, UNDO: session.past.undo}
         super().__init__(server, session.past, "step of the past", does, clock)
         self._session, self._clock = session, clock
         self._travel.on_click(lambda event: self._on_travel(event.target.value))

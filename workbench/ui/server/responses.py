@@ -46,6 +46,7 @@ SCRIPTS = (
     "key_help.js",
     "steady_resolution.js",
     "tab_title.js",
+    "help.js",
 )
 """Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"
@@ -219,6 +220,7 @@ def content_type(name: str) -> str:
         ".json": "application/json",
         ".svg": "image/svg+xml",
         ".wasm": "application/wasm",
+        ".webp": "image/webp",
     }
     return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 

@@ -241,4 +241,4 @@ class RareLog:
 
 def _line(sentence: str, times: int) -> str:
     more = "once more" if times == 1 else f"{times} more times"
-    return short_line(sentence, LONGEST_LINE) + (f" ({more} since this was last said.)" if times else "")
+    return short_line(sentence, LONGEST_LINE) + (f" ({more} since the last message.)" if times else "")

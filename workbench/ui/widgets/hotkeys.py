@@ -26,6 +26,9 @@ _NAMES = {
     "pagedown": "Page down",
     "home": "Home",
     "end": "End",
+    "enter": "Enter",
+    "escape": "Escape",
+    "delete": "Delete",
 }
 
 
