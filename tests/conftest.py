@@ -46,6 +46,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 ONE_AFTER_THE_OTHER = {
     "tests/browser/test_page.py": "tests/browser/test_camera_reports.py",
+    "tests/browser/test_layout.py": "tests/browser/test_camera_reports.py",
     "tests/browser/test_timeline.py": "tests/browser/test_rescored_past.py",
 }
 """Files that share a page's server with another (tests/browser/conftest.py), so that one process has to run both."""

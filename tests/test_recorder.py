@@ -74,7 +74,7 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
     assert sorted(e.length for e in read) == sorted(e.length for e in theirs) == [2, 3, 5]
     for one in read:
         (other,) = [e for e in theirs if e.length == one.length]
-        # The partial reset had no seed; RecordEpisode goes on saying the one of the episode before.
+        # The partial reset had no seed; RecordEpisode goes on saying the one of the previous episode.
         assert one.info.seed == (NO_SEED if one.length == 2 else other.info.seed)
         for name in ("action", "reward", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)

@@ -151,7 +151,7 @@ def one_way(desk: Desk, way: str) -> str:
             said += f"deaf after {deaf:.1f} s; "
             calm(desk.file)
             desk.click("Restart")
-            back = desk.poke_until(lambda: desk.says("is back where it was"), trips)
+            back = desk.poke_until(lambda: desk.says("is restored where it was"), trips)
         else:
             back = desk.poke_until(lambda: desk.says("was interrupted in evaluate"), trips)
         said += f"{HANGS[way]}"
@@ -159,7 +159,7 @@ def one_way(desk: Desk, way: str) -> str:
         dying = desk.poke_until(lambda: not worker.is_running() or worker.status() == "zombie", trips)
         said = f"dead after {dying:.1f} s"
         calm(desk.file)
-        back = desk.poke_until(lambda: desk.says("is back where it was"), trips)
+        back = desk.poke_until(lambda: desk.says("is restored where it was"), trips)
     else:
         word = "EOFError" if way == "read" else "came too fast to be kept"
         back = desk.poke_until(lambda: desk.says(word) and "busy" not in page_text(desk.page), trips)

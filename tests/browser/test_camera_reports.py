@@ -65,12 +65,12 @@ def page(opened: Page) -> Page:
 
 
 def back_to_the_file(page: Page) -> None:
-    said = page.get_by_text(re.compile("^As push_cube.py has it"))
+    said = page.get_by_text(re.compile("^As in push_cube.py"))
 
     def back() -> bool:
         # What has just come is brought into sight: a press that is under way then falls beside its pill.
-        if "wb-off" not in tool(page, "Back to the file")["classes"]:
-            press_tool(page, "Back to the file")
+        if "wb-off" not in tool(page, "Reset to file")["classes"]:
+            press_tool(page, "Reset to file")
         return said.is_visible()
 
     until(back, "the camera as the file has it")
@@ -129,19 +129,19 @@ def test_a_press_on_the_picture_tells_body_depth_and_point(page: Page) -> None:
 
 def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of_another(page: Page) -> None:
     press(page, "Measure this camera")
-    expect(page.get_by_text(f"{ENVS} envs as they are")).to_be_visible()
+    expect(page.get_by_text(f"{ENVS} envs now")).to_be_visible()
     row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
     expect(row.locator("td").nth(1)).to_have_text("100 %")
     assert float(row.locator("td").nth(2).inner_text().removesuffix(" px")) > 10
-    expect(page.get_by_text("measure it again")).to_have_count(0)
+    expect(page.get_by_text("measure again")).to_have_count(0)
     press(page, "Keep this placement as A")
     page.locator(".wb-planes [data-press]").last.click()
-    expect(page.get_by_text("measure it again")).to_be_visible()
+    expect(page.get_by_text("measure again")).to_be_visible()
     press(page, "Show side by side")
     expect(page.locator(".wb-pair img")).to_have_count(2)
     expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
-    press(page, "Place it as A")
-    expect(page.get_by_text("measure it again")).to_have_count(0)
+    press(page, "Return to A")
+    expect(page.get_by_text("measure again")).to_have_count(0)
 
 
 def test_the_sheet_has_all_envs_and_a_press_selects_one(page: Page) -> None:
@@ -169,15 +169,15 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
     moved[2, 3] += 0.1  # world to camera, OpenCV: what is seen goes a decimetre away
     field = page.locator("textarea:visible")
     field.fill("\n".join(" ".join(map(str, row)) for row in moved))
-    press(page, "Place the camera by it")
+    press(page, "Apply to the camera")
     until(lambda: bool(np.allclose(shown_matrix(page), moved, atol=1e-6)), "the pasted pose")
     mirrored = moved.copy()
     mirrored[0] *= -1
     field.fill(json.dumps(mirrored.tolist()))
-    press(page, "Place the camera by it")
+    press(page, "Apply to the camera")
     expect(page.get_by_text("mirror image")).to_be_visible()
     field.fill(text)
-    press(page, "Place the camera by it")
+    press(page, "Apply to the camera")
     until(lambda: bool(np.allclose(shown_matrix(page), before, atol=1e-5)), "our own file's pose")
 
 
@@ -195,5 +195,5 @@ def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
     assert page.locator(".wb-offer img").count() == page.locator(".wb-offer").count() <= 5
     expect(page.locator(".wb-offer").first).to_contain_text(re.compile(r"cube: in (\d) of \1 envs"))
     take.first.click()
-    expect(page.locator(".wb-offer").first).to_contain_text("taken")
+    expect(page.locator(".wb-offer").first).to_contain_text("in use")
     until(lambda: not np.allclose(shown_matrix(page), before, atol=1e-3), "the camera where it was suggested")

@@ -67,7 +67,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
 
         page.get_by_role("tab", name="Rescore").click()
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
-        page.get_by_role("button", name="Rescore what is open").click()
+        page.get_by_role("button", name="Rescore the open recordings").click()
         expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)
         page.get_by_text("reward by up to").click()
         expect(page.get_by_text("step 1 / 15").first).to_be_visible()
@@ -83,7 +83,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         expect(page.get_by_role("button", name="Stay here")).to_be_visible()
         changed = "changed since: compute_normalized_dense_reward"
         told = page.get_by_text(
-            f"WorkbenchPushCube-v1, seed 5, step 2 ({changed}): its actions were made again"
+            f"WorkbenchPushCube-v1, seed 5, step 2 ({changed}): its actions were replayed"
         )
         expect(told).to_be_visible(timeout=PATIENT)
         assert page.evaluate("window.fewest") > 5, "the view was empty for a while"
@@ -97,7 +97,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         page.locator('input[value="today\'s"]:visible').click()
         page.get_by_role("option", name="as recorded", exact=True).click()
         live.click()
-        told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were made again")
+        told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were replayed")
         expect(told).to_be_visible(timeout=PATIENT)
         assert list(author.glob("workbench-recorded-*/push_cube.py"))
         assert not [error for error in errors if "non-existent component" not in error]

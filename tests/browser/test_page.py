@@ -163,7 +163,7 @@ def test_a_patch_keeps_the_step_and_says_so_and_a_rebuild_can_be_asked_for(calm:
     calm.tab("Run")
     expect(calm.page.get_by_text("only compute_dense_reward changed").last).to_be_visible()
     calm.button("Rebuild").click()
-    expect(calm.page.get_by_text("rebuilt was asked for").last).to_be_visible()
+    expect(calm.page.get_by_text("rebuilt was requested").last).to_be_visible()
     calm.tab("Reward")
     assert calm.elapsed() == 1
     calm.file.write_text(good)

@@ -82,7 +82,7 @@ def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk
 
 def test_an_edit_that_changes_no_number_is_one_line(desk: Desk) -> None:
     desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
-    says(desk, r"Nothing differs in \d+ episodes: reward, success and fail are as they were\.")
+    says(desk, r"Nothing differs in \d+ episodes: reward, success and fail are unchanged\.")
     expect(rows(desk)).to_have_count(0)
     expect(desk.page.get_by_text("before and now")).to_have_count(0)
 

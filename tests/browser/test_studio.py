@@ -55,9 +55,9 @@ def page(opened: Page) -> Page:
     """base_camera is chosen, and placed as the file says."""
     choose(opened, "base_camera · sensor")
     expect(opened.get_by_role("button", name="Show the change")).to_be_visible()
-    if "wb-off" not in tool(opened, "Back to the file")["classes"]:
-        press(opened, "Back to the file")
-    expect(opened.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
+    if "wb-off" not in tool(opened, "Reset to file")["classes"]:
+        press(opened, "Reset to file")
+    expect(opened.get_by_text(re.compile("^As in push_cube.py"))).to_be_visible()
     return opened
 
 
@@ -95,7 +95,7 @@ def arc_about_x(page: Page) -> tuple[float, float] | None:
 
 def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> None:
     choose(opened, NO_CAMERA)
-    expect(opened.get_by_text("Choose a camera here, or press its frustum")).to_be_visible()
+    expect(opened.get_by_text("Choose a camera here, or click its frustum")).to_be_visible()
 
     def orange() -> tuple[NDArray[np.intp], ...]:
         r, g, b = np.moveaxis(view(opened), -1, 0)
@@ -105,7 +105,7 @@ def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> No
     ys, xs = orange()
     x, y = (xs.min() + xs.max()) / 2 + VIEW["x"], (ys.min() + ys.max()) / 2
     opened.mouse.click(x, y)
-    expect(opened.get_by_text(re.compile("^As push_cube.py has it, line"))).to_be_visible()
+    expect(opened.get_by_text(re.compile("^As in push_cube.py, line"))).to_be_visible()
     assert numbers(opened, "Position") == [0.45, 0, 0.6] and numbers(opened, "Looks at") == [0.08, 0, 0]
 
 
@@ -136,19 +136,19 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     assert task_file.read_text() == text
     until(lambda: numbers(page, "Position")[1] == numbers(page, "Looks at")[1], "both numbers")
     moved = numbers(page, "Position")[1]
-    page.get_by_role("button", name="Write it to push_cube.py").click()
-    expect(page.get_by_text("the new env has it")).to_be_visible()
+    page.get_by_role("button", name="Save to push_cube.py").click()
+    expect(page.get_by_text("saved to push_cube.py and verified")).to_be_visible()
     assert base_camera(task_file) == ([0.45, moved, 0.6], [0.08, moved, 0])
-    expect(page.get_by_text(re.compile("^As push_cube.py has it, line"))).to_be_visible()
-    page.get_by_role("button", name="Undo it in the file").click()
-    expect(page.get_by_text("push_cube.py is as it was before.")).to_be_visible()
+    expect(page.get_by_text(re.compile("^As in push_cube.py, line"))).to_be_visible()
+    page.get_by_role("button", name="Revert in the file").click()
+    expect(page.get_by_text("Edit reverted in push_cube.py.")).to_be_visible()
     assert task_file.read_text() == text
     page.get_by_role("button", name="Close", exact=True).click()
 
 
 def test_typed_and_nudged_and_undone(page: Page) -> None:
-    unfold(page, "Lens and picture", page.get_by_label("Degrees high"))
-    page.get_by_label("Degrees high").fill("90")
+    unfold(page, "Lens and image", page.get_by_label("Vertical fov"))
+    page.get_by_label("Vertical fov").fill("90")
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "Radians") == [1.5708], "radians")
     page.evaluate("document.activeElement.blur()")
@@ -164,16 +164,16 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
     until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "where it was")
     page.keyboard.press("Control+Shift+z")
     until(lambda: numbers(page, "Radians") == [1.5708], "the lens again")
-    page.get_by_text("Lens and picture", exact=True).click()
+    page.get_by_text("Lens and image", exact=True).click()
 
 
 def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) -> None:
     at = "[document.activeElement.textContent, document.activeElement.ariaPressed]"
-    tool(page, "move, turn")
+    tool(page, "pose")
     # The click before this gives the focus back once more a moment later.
     page.evaluate("new Promise(done => setTimeout(done, 60))")
     page.evaluate(
-        "[...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn').focus()"
+        "[...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'pose').focus()"
     )
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
@@ -184,26 +184,26 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "Eye") == [0.6, 0, 0.6], "the eye")
     until(lambda: numbers(page, "Degrees")[1] == 49.09, "the angle")
-    assert numbers(page, "Target") == [0.08, 0, 0]
+    assert numbers(page, "Looks at") == [0.08, 0, 0]
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Alt+ArrowLeft")
     until(lambda: numbers(page, "Eye") == [0.6, -0.01, 0.6], "the nudge")
-    assert numbers(page, "Target") == [0.08, 0, 0]
+    assert numbers(page, "Looks at") == [0.08, 0, 0]
     for _ in range(2):
         page.keyboard.press("Control+z")
     until(lambda: numbers(page, "Eye") == [0.45, 0, 0.6], "both undone")
-    press(page, "move, turn")
-    until(lambda: "wb-on" in tool(page, "move, turn")["classes"], "the pose again")
+    press(page, "pose")
+    until(lambda: "wb-on" in tool(page, "pose")["classes"], "the pose again")
     page.locator("//label[text()='Position']/ancestor::*[.//input][1]//input").first.fill("0.6")
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
 
 
 def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -> None:
-    tool(page, "move, turn")
+    tool(page, "pose")
     page.evaluate(
         """() => {
-            [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn').focus();
+            [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'pose').focus();
             addEventListener("focusout", () => document.body.append(document.createElement("i")), { once: true });
         }"""
     )
@@ -213,10 +213,10 @@ def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -
 
 
 def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -> None:
-    tool(page, "move, turn")
+    tool(page, "pose")
     kept = page.evaluate(
         """async () => {
-            const pill = [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn');
+            const pill = [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'pose');
             pill.dispatchEvent(new PointerEvent("pointerup", { bubbles: true }));
             pill.dispatchEvent(new KeyboardEvent("keydown", { bubbles: true, key: "Tab" }));
             pill.focus();
@@ -224,16 +224,16 @@ def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -
             return document.activeElement.textContent;
         }"""
     )
-    assert kept == "move, turn"
+    assert kept == "pose"
     page.evaluate("document.activeElement.blur()")
 
 
 def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
-    press(page, "Look through it")
+    press(page, "Look through")
     tool(page, "Back to my view")
     # Red only in the middle of this camera's picture: the target on the table fills the view.
     until(lambda: bool((view(page)[..., 0] - view(page)[..., 2] > 90).mean() > 0.02), "its view")
-    press(page, "Put it where I look")
+    press(page, "Move to my view")
     assert np.allclose(numbers(page, "Position"), [0.45, 0, 0.6], atol=2e-4)
     assert np.allclose(numbers(page, "Looks at"), [0.08, 0, 0], atol=2e-4)
     press(page, "Back to my view")
@@ -253,7 +253,7 @@ def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
     page.locator("//label[text()='New name']/ancestor::*[.//input][1]//input").fill("second_camera")
     page.get_by_role("button", name="Duplicate", exact=True).click()
     expect(page.locator(".wb-diff-add").filter(has_text='"second_camera"')).to_be_visible()
-    page.get_by_role("button", name="Leave the file as it is").click()
+    page.get_by_role("button", name="Discard the change").click()
     expect(page.locator(".wb-diff:visible")).to_have_count(0)
     assert task_file.read_text() == text
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
@@ -277,7 +277,7 @@ def test_turned_with_the_mouse(page: Page) -> None:
 
 def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path) -> None:
     text, before = task_file.read_text(), picture(page)
-    unfold(page, "Lens and picture", page.locator(field(page, "Lens as")))
+    unfold(page, "Lens and image", page.locator(field(page, "Lens as")))
     option(page, "Lens as", "intrinsic matrix")
     expect(page.locator(field(page, "fx, fy"))).to_be_visible()
     page.locator(field(page, "fx, fy")).fill("150")
@@ -291,43 +291,43 @@ def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path)
     until(lambda: picture(page) not in ("", before), "the picture with another centre")
     button(page, "Show the change")
     expect(page.locator(".wb-diff-add").filter(has_text="intrinsic=")).to_contain_text("[150")
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text("the new env has it")).to_be_visible()
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text("saved to push_cube.py and verified")).to_be_visible()
     assert "fov=1.0, near=0.01, far=10)" not in task_file.read_text() and "70" in task_file.read_text()
-    button(page, "Undo it in the file")
-    expect(page.get_by_text(f"{FILE} is as it was before.")).to_be_visible()
+    button(page, "Revert in the file")
+    expect(page.get_by_text(f"Edit reverted in {FILE}.")).to_be_visible()
     assert task_file.read_text() == text
     button(page, "Close")
-    press(page, "Back to the file")
-    page.get_by_text("Lens and picture", exact=True).click()
+    press(page, "Reset to file")
+    page.get_by_text("Lens and image", exact=True).click()
 
 
 def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_file: Path) -> None:
     before = task_file.read_text()
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
     page.locator(field(page, "New name")).fill("third")
-    button(page, "Add a sensor")
-    expect(page.get_by_text(re.compile("It looks from your side at cube, goal from 0"))).to_be_visible()
+    button(page, "Add sensor")
+    expect(page.get_by_text(re.compile("It looks at cube, goal from your side, 0"))).to_be_visible()
     sight = page.get_by_alt_text("what it would see")
     until(lambda: sight.evaluate("e => e.naturalWidth") == 128, "its picture, before it is written")
     assert task_file.read_text() == before
-    leave = page.get_by_role("button", name="Leave the file as it is")
+    leave = page.get_by_role("button", name="Discard the change")
     until(lambda: bottom_of(leave) < HEIGHT, "the last of it in sight")
     leave.click()
     expect(page.locator(".wb-diff:visible")).to_have_count(0)
-    button(page, "Add one for people")
+    button(page, "Add human view")
     expect(page.locator(".wb-diff-add").filter(has_text='"third"').first).to_be_visible()
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text(f"third is in {FILE}, and the env has it.")).to_be_visible()
-    expect(page.locator("input[aria-haspopup=listbox]:visible").first).to_have_value("third · for people")
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text(f"third: added to {FILE} and verified.")).to_be_visible()
+    expect(page.locator("input[aria-haspopup=listbox]:visible").first).to_have_value("third · human view")
     page.locator(field(page, "New name")).fill("fourth")
     button(page, "Rename")
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text(f"third is fourth in {FILE} now.")).to_be_visible()
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text(f"third: renamed to fourth in {FILE} and verified.")).to_be_visible()
     assert '"fourth"' in task_file.read_text() and '"third"' not in task_file.read_text()
     button(page, "Remove")
-    button(page, f"Write it to {FILE}")
-    expect(page.get_by_text(f"fourth is no longer in {FILE}.")).to_be_visible()
+    button(page, f"Save to {FILE}")
+    expect(page.get_by_text(f"fourth: removed from {FILE} and verified.")).to_be_visible()
     assert '"fourth"' not in task_file.read_text()
     assert task_file.read_text().count("CameraConfig(") == before.count("CameraConfig(")
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
@@ -340,7 +340,7 @@ def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page)
     expect(page.get_by_text("The preview is 32 × 32")).to_be_visible()
     image = page.locator("img[src^='blob:']:visible").first
     until(lambda: image.evaluate("e => e.naturalWidth") == 32, "the small picture")
-    by_matrix = page.get_by_role("button", name="Place the camera by it")
+    by_matrix = page.get_by_role("button", name="Apply to the camera")
     unfold(page, "Matrices and files", by_matrix)
     by_matrix.scroll_into_view_if_needed()
     box = image.bounding_box()
@@ -348,7 +348,7 @@ def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page)
     # And nothing lies over it.
     on_top = "([x, y]) => document.elementFromPoint(x, y).closest('.wb-pane') !== null"
     assert page.evaluate(on_top, [box["x"] + box["width"] / 2, box["y"] + 60])
-    press(page, "own size")
+    press(page, "full")
     until(lambda: image.evaluate("e => e.naturalWidth") == 128, "its own size")
     page.get_by_text("Matrices and files", exact=True).click()
     expect(by_matrix).to_be_hidden()
@@ -373,6 +373,7 @@ def test_files_for_opencv_and_ros_say_what_the_page_says(page: Page) -> None:
     page.get_by_text("Matrices and files", exact=True).click()
 
 
+@pytest.mark.slow
 def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_be_stopped(page: Page) -> None:
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("r")
@@ -381,7 +382,7 @@ def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_b
         page.keyboard.press("s")
         expect(page.get_by_text(f"env 0: step {step}").first).to_be_visible()
     unfold(page, "Measure", page.get_by_role("button", name="Measure this camera", exact=True))
-    option(page, "Over", "this env's steps so far")
+    option(page, "Over", "this env's episode so far")
     button(page, "Measure this camera")
     expect(page.get_by_text("4 moments of env 0's episode, step 0 to step 3")).to_be_visible()
     strip = page.locator(".wb-steps").first.locator("i")

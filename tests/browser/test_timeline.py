@@ -106,7 +106,7 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
     page.get_by_role("option", name="contacts", exact=True).click()
     page.get_by_role("checkbox").locator("visible=true").first.click()
     page.keyboard.press("r")
-    expect(page.get_by_text("not known before the next step")).to_be_visible()
+    expect(page.get_by_text("known after the next step")).to_be_visible()
     field = page.locator("input[inputmode]:visible").last
     field.click()
     page.keyboard.press("s")

@@ -38,7 +38,7 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         live = page.get_by_role("button", name="Continue live from here")
         expect(live).to_be_visible(timeout=PATIENT)
         page.get_by_role("tab", name="Rescore").click()
-        rescore = page.get_by_role("button", name="Rescore what is open")
+        rescore = page.get_by_role("button", name="Rescore the open recordings")
         rescore.click()
         window = page.get_by_role("dialog")
         expect(window).to_contain_text(str(file), timeout=PATIENT)

@@ -51,11 +51,11 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     provoke(desk.file, "evaluate", "native")
     desk.button("Step").click()
     desk.button("Interrupt").click()
-    expect(desk.page.get_by_text(re.compile("was interrupted and continues"))).to_be_visible()
+    expect(desk.page.get_by_text(re.compile("did not stop when it was interrupted"))).to_be_visible()
     expect(desk.button("Interrupt")).to_be_hidden()
     calm(desk.file)
     desk.button("Restart").click()
-    expect(desk.page.get_by_text(re.compile("is back where it was"))).to_be_visible()
+    expect(desk.page.get_by_text(re.compile("is restored where it was"))).to_be_visible()
     assert desk.opened.wait_for_line("worker failed.*ended by hand in evaluate")
 
 
@@ -64,7 +64,7 @@ def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:
     provoke(desk.file, "reset", "flood")
     desk.button("Reset all").click()
     desk.tab("Log")
-    expect(desk.page.get_by_text(re.compile("more came too fast to be kept"))).to_be_visible()
+    expect(desk.page.get_by_text(re.compile("more were dropped: they came too fast"))).to_be_visible()
     expect(desk.page.get_by_text(re.compile("all work and no play")).first).to_be_visible()
     expect(desk.page.get_by_text(re.compile(r"Memory: .* GB allowed"))).to_be_visible()
     until(lambda: not (desk.file.parent / "hazard").exists(), "the end of the flood")

@@ -64,7 +64,7 @@ class Desk:
 
     def moments_kept(self) -> int:
         """Steps and resets that the timeline says it has."""
-        found = re.search(r"MB, (\d+) steps", self.page.locator(".wb-timeline").inner_text())
+        found = re.search(r"history: (\d+) steps?,", self.page.locator(".wb-timeline").inner_text())
         return 0 if found is None else int(found[1])
 
     def box(self, what: str) -> FloatRect:

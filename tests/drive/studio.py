@@ -38,7 +38,7 @@ def tool(page: Page, name: str) -> dict:
 
     def find() -> bool:
         found[:] = page.evaluate(
-            """n => [...document.querySelectorAll('.wb-tools .wb-pill')].filter(e => e.textContent === n).map(e => {
+            """n => [...document.querySelectorAll('.wb-tools [role=button], .wb-tools [aria-disabled]')].filter(e => e.textContent === n).map(e => {
                 e.scrollIntoView({block: 'nearest'});
                 const r = e.getBoundingClientRect();
                 return {classes: e.className, at: [r.x + r.width / 2, r.y + r.height / 2]};

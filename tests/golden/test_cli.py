@@ -25,7 +25,7 @@ from workbench.cli import main
 from workbench.cli.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
-COMMANDS = ("start", "open", "record", "review", "rescore", "share", "export", "view", "doctor")
+COMMANDS = ("start", "open", "record", "review", "rescore", "share", "export", "view", "doctor", "help")
 CALLS = {
     "workbench": ["nonsense", "--nonsense", "open --nonsense", "record"],
     "start": [
@@ -84,6 +84,7 @@ CALLS = {
         "export made --lerobot set --cameras gone",
     ],
     "view": ["view gone.rrd", "view push.py", "view empty"],
+    "help": ["help", "help camera", "help sliders", "help nonsense"],
 }
 
 

@@ -211,7 +211,7 @@ def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
     view = wait_until(session, lambda v: v.timeline.entered == entered, "the state")
     assert view.timeline.not_carried == () and view.step.elapsed_steps[1] == state
     # By its seed and its actions: where these lead elsewhere the recorded state is put in, which is no proof of them.
-    assert "its actions were made again" in view.timeline.arrived or state == 0
+    assert "its actions were replayed" in view.timeline.arrived or state == 0
     assert "put" not in view.timeline.arrived
     assert_close(view.step.poses[1], episode.poses[state])
     for t in range(state, episode.length):

@@ -1,4 +1,4 @@
-"""What a person is told to do about a task that cannot be opened as it was asked for."""
+"""What a person is told to do about a task that cannot be opened as it was requested."""
 
 from __future__ import annotations
 

@@ -129,9 +129,7 @@ def test_what_changed_since_it_was_recorded_is_told_on_arrival(live: Session, ru
     assert then != text
     number = live.enter_recording(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
     view = wait_until(live, lambda v: v.timeline.entered == number, "the state")
-    told = (
-        "an episode, step 3 (changed since: GOAL_RADIUS, compute_dense_reward): its actions were made again"
-    )
+    told = "an episode, step 3 (changed since: GOAL_RADIUS, compute_dense_reward): its actions were replayed"
     assert view.timeline.arrived.startswith(told)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -97,7 +98,8 @@ def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recor
 
 
 @pytest.mark.parametrize(
-    ("num_envs", "workers", "executor"), [(1, 1, None), (1, 1, Processes()), (3, 3, None)]
+    ("num_envs", "workers", "executor"),
+    [(1, 1, None), pytest.param(1, 1, Processes(), marks=pytest.mark.slow), (3, 3, None)],
 )
 def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
     recorded: Recorded, num_envs: int, workers: int, executor: Executor | None, tmp_path: Path
@@ -313,7 +315,7 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
     assert record_in_terminal(what) == 1
     said = capsys.readouterr()
     assert "policy failed" in said.err and "tired" in said.err
-    assert "1 episode that had ended before is kept: workbench review" in said.out
+    assert "1 episode that had finished before is kept: workbench review" in said.out
 
 
 def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go(
@@ -367,6 +369,7 @@ def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
         record(RecordOptions("PickCube-v1", tmp_path / "out", options=options))
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
     (tmp_path / "hangs.py").write_text(
         "from pathlib import Path\n\nasked = 0\n\n\n"
@@ -417,6 +420,10 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     assert "Traceback" not in errors
     written = sorted(tmp_path.glob("*.json"))
     assert len(said.splitlines()) == len(written) + 1
+    told = re.findall(
+        r"^episode (\d+): 3 steps, return -?[\d.]+, no success, (\d+) of 100000 kept$", errors, re.M
+    )
+    assert [int(kept) for _, kept in told] == list(range(1, len(written) + 1)), "a line for each, in a pipe"
     assert not (tmp_path / ".writing").exists()
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
 

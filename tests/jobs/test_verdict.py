@@ -36,7 +36,7 @@ def test_what_is_the_same_differs_nowhere() -> None:
     assert found.success == found.fail == (None, None) and found.look_at is None
     assert (found.metres, found.radians, found.drift_at) == (None, 0, None) and not found.drifted
     assert (found.task, found.seed, found.start_differs, found.missed) == ("", -1, False, {})
-    assert verdict_text.change_text(found) == "as it was"
+    assert verdict_text.change_text(found) == "unchanged"
 
 
 @pytest.mark.parametrize(("share", "differs"), [(0.9e-5, False), (1.1e-5, True)])
@@ -89,7 +89,7 @@ def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
     old = said(height=[0.1] * 5, speed=[1.0] * 5, gone=[1] * 5)
     found = compare(0, old, said(height=[0.1, 0.1, 0.2, 0.1, 0.1], speed=[1.0] * 5, new=[2] * 5))
     assert not found.differs and found.differing == found.others == ("height",)
-    assert verdict_text.change_text(found) == "as it was, but for height"
+    assert verdict_text.change_text(found) == "unchanged, except height"
 
 
 def test_what_is_known_of_the_run_is_in_its_verdict() -> None:

@@ -39,11 +39,13 @@ def open_in_terminal(
     recordings: Path,
     history_bytes: int,
     trust: bool = False,
+    editor: str = "",
 ) -> int:
     """Serve the page of a task; returns (the exit code) only if the server cannot start.
 
     Args:
         trust: run code that recordings name without asking.
+        editor: address of a line in the author's editor.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
@@ -70,7 +72,7 @@ def open_in_terminal(
     if waits_for_a_file:
         how.recents.add(task, options)
     session = how.open(task, options, on_event=on_event)
-    place = _workplace(gated_server, how, _for_others(options), session, trust)
+    place = _workplace(gated_server, how, _for_others(options), session, trust, editor=editor)
     _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", requests)
 
 
@@ -81,18 +83,20 @@ def start_in_terminal(
     recordings: Path,
     history_bytes: int,
     trust: bool = False,
+    editor: str = "",
 ) -> int:
     """Serve the page to choose a task from; returns (the exit code) only if the server cannot start.
 
     Args:
         options: of the tasks that are opened from there.
         trust: run code without asking, as `open_in_terminal`.
+        editor: as there.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
         return gated_server
     how = _HowToOpen(recordings, worker, history_bytes, RecentTasks())
-    place = _workplace(gated_server, how, options, None, trust)
+    place = _workplace(gated_server, how, options, None, trust, editor=editor)
     requests = _PageRequests()
     requests.show_address()
     _serve(gated_server, place, "start", f"tasks in {Path.cwd()}", requests)
@@ -105,18 +109,20 @@ def review_in_terminal(
     worker: WorkerOptions,
     base: TaskOptions,
     trust: bool = False,
+    editor: str = "",
 ) -> int:
     """Serve the page of a folder of recordings; returns (the exit code) only if the server cannot start.
 
     Args:
         worker, base: options of tasks that are opened from there.
         trust: run code that recordings name without asking.
+        editor: address of a line in the author's editor.
     """
     gated_server = _start_server(at, "Recordings")
     if isinstance(gated_server, int):
         return gated_server
     how = _HowToOpen(folder, worker, HISTORY_BYTES, RecentTasks())
-    place = _workplace(gated_server, how, base, None, trust, tasks)
+    place = _workplace(gated_server, how, base, None, trust, tasks, editor)
     requests = _PageRequests()
     requests.show_address()
     _serve(gated_server, place, "review", f"recordings in {folder}", requests)
@@ -196,9 +202,10 @@ def _workplace(
     session: Session | None,
     trust: bool,
     tasks: tuple[Path, ...] = (),
+    editor: str = "",
 ) -> Workplace:
     base = TaskOptions(rules=options.rules, imports=options.imports)
-    place = Workplace(
+    return Workplace(
         gated_server,
         how.recordings,
         how.open_for_recording,
@@ -207,9 +214,9 @@ def _workplace(
         tasks,
         trust,
         warn,
+        editor,
         Choices(how.recents, how.open, options),
     )
-    return place
 
 
 def _serve(
@@ -220,7 +227,7 @@ def _serve(
     requests: _PageRequests,
 ) -> NoReturn:
     if gated_server.options.token:
-        place.commands = (Command("Renew the token and close every page", requests.renew),)
+        place.commands += (Command("Renew the token and close every page", requests.renew),)
     requests.handle_signals()
     try:
         place.pages.start(first)

@@ -1,4 +1,4 @@
-"""Runs ``workbench record``: a progress bar, then a list of the episodes. Ctrl-C keeps finished episodes."""
+"""Runs ``workbench record``: a progress bar, or a line for each episode, then a list of them. Ctrl-C keeps finished episodes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from types import FrameType
 
+from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
@@ -15,7 +16,7 @@ from workbench.authoring.problem import TaskError
 from workbench.cli.terminal import err, print_finding, print_problem, print_text, progress_bar, refuse, warn
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.pool import PoolError
-from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, record, with_given_actions
+from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record, with_given_actions
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 from workbench.session.rescore.recordings import hidden_modules_text
@@ -26,6 +27,7 @@ class _RecordBar:
 
     def __init__(self, bar: Bar, total: int | None) -> None:
         self._bar, self._row = bar, bar.add_task("opening", total=total)
+        self._total = total
         self.stop_requested = False
         self._began: float | None = None
         """When the first episode began."""
@@ -42,7 +44,7 @@ class _RecordBar:
             raise KeyboardInterrupt
         self.stop_requested = True
         # A step may never end.
-        self.describe("ending after this step; Ctrl-C again ends at once")
+        self.describe("stopping after this step; Ctrl-C again stops at once")
 
     def describe(self, text: str, kept: int | None = None) -> None:
         self._bar.update(self._row, description=text, completed=kept)
@@ -53,6 +55,17 @@ class _RecordBar:
         self._bar.update(self._row, completed=now.kept)
         if not self.stop_requested:
             self.describe(f"recording, {now.steps / seconds:.0f} steps a second")
+        if now.over is not None and not err.is_terminal:
+            # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
+            err.print(escape(_episode_line(*now.over, now.kept, self._total)), soft_wrap=True)
+
+
+def _episode_line(number: int, kept: Written | None, count: int, total: int | None) -> str:
+    so_far = f"{count} of {total} kept"
+    if kept is None:
+        return f"episode {number}: not kept, {so_far}"
+    ended = {None: "", True: ", success", False: ", no success"}[kept.success]
+    return f"episode {number}: {kept.steps} steps, return {kept.total_reward:.3f}{ended}, {so_far}"
 
 
 def record_in_terminal(what: RecordOptions) -> int:
@@ -86,7 +99,7 @@ def record_in_terminal(what: RecordOptions) -> int:
         _print_kept(what, before)
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted; episodes that had ended are kept")
+        return refuse("interrupted; finished episodes were kept")
     return _print_result(requested, recorded)
 
 
@@ -95,7 +108,7 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
     if kept:
         folder = shlex.quote(str(requested.out))
         print_text(
-            f"{_episodes(kept)} that had ended before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
+            f"{_episodes(kept)} that had finished before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
         )
 
 
@@ -111,13 +124,13 @@ def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
     if recorded.start_corrected:
         count = _episodes(recorded.start_corrected)
         print_text(
-            f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
+            f"{count} did not start as recorded with the recorded seed, and were set to the recorded first state."
         )
     if recorded.written:
         folder = shlex.quote(str(recorded.written[0].path.parent))
         print_text(f"Look at them with: workbench review {folder}")
     if recorded.stopped:
-        return refuse("interrupted; episodes that had ended are kept")
+        return refuse("interrupted; finished episodes were kept")
     if requested.successes is not None and kept < requested.successes:
         wanted = "1 success was" if requested.successes == 1 else f"{requested.successes} successes were"
         return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")

@@ -193,7 +193,7 @@ class TerminalPrompt:
         with self._quiet():
             print_question(question, self._out)
             choices = (
-                "show: print the text first; y: run it, and ask again next time; a: run it, and trust this text from now on; "
+                "show: print the text first; y: run it and ask again next time; a: run it and trust this text from now on; "
                 "n: do not run it"
             )
             choices += f"; q: nor the {question.more} more" if question.more else ""
@@ -230,12 +230,12 @@ def print_question(question: TrustQuestion, out: Console) -> None:
     elif question.trusted_before:
         gone = f"; gone since: {', '.join(question.gone)}" if question.gone else ""
         print_escaped(
-            f"You trusted another version of this before. What has changed since is marked{gone}.", "yellow"
+            f"You trusted another version of this before. Changes since then are marked{gone}.", "yellow"
         )
     for what in question.unseen:
         print_escaped(what, "yellow")
     print_escaped(
-        "It can read and change all that you can. The digits are the first that sha256sum says of each file."
+        "It can read and change everything that you can. The digits are the first of each file's sha256sum."
     )
 
 
@@ -278,7 +278,7 @@ def _modules_text(question: TrustQuestion) -> str:
     if question.recorded_text:
         return "Beside it they hold what it may import:"
     if question.computed:
-        return "What it imports cannot be told by reading it, so it may import all that lies beside it:"
+        return "What it imports cannot be determined by reading it, so it may import everything beside it:"
     return "It imports from beside it:"
 
 

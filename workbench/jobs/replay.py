@@ -183,10 +183,10 @@ def why_not_replayable(opened: OpenedTask, run: RecordedRun) -> str:
     width = actions.width(opened.env.parts)
     recorded = run.action.shape[1] if run.action.ndim == 2 else 0
     if not np.isfinite(run.action).all():
-        return "the recorded actions hold NaN or infinity: they were not made again"
+        return "actions not replayed: they hold NaN or infinity"
     if width == recorded:
         return ""
-    return f"the recorded actions have {recorded} numbers each, and this robot takes {width}: they were not made again"
+    return f"actions not replayed: recorded with {recorded} dimensions, this env takes {width}"
 
 
 def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
@@ -198,7 +198,7 @@ def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None
     except Exception as error:  # a task may keep anything on itself
         return (
             None,
-            f"the other envs cannot be put back after steps, since this task's state cannot be kept ({error})",
+            f"the other envs cannot be restored after steps, because this task's state cannot be kept ({error})",
         )
 
 
@@ -225,16 +225,16 @@ def _distance(
 def replay_text(replay_result: ReplayResult) -> str:
     """One sentence: how the state was reached, and how close it is."""
     if replay_result.way == "put there":
-        text = "the recorded state was restored; contacts, and what the task counts on itself, start again"
+        text = "the recorded state was restored; contacts and the task's own counters start over"
     elif replay_result.way == "corrected":
         text = (
-            f"its actions were made again, and its state put back at {replay_result.corrected} of {replay_result.steps} steps, "
+            f"its actions were replayed, and its state restored at {replay_result.corrected} of {replay_result.steps} steps, "
             "where they differed"
         )
     elif replay_result.steps == 0:
         text = "reset with its seed" + (", then its first state restored" * replay_result.start_differs)
     else:
-        text = "its actions were made again"
+        text = "its actions were replayed"
         text += " from its first state" if replay_result.start_differs else " from its seed"
     if replay_result.metres is None:
         text += "; it holds no states to compare with"

@@ -92,7 +92,7 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     studio, before = session.studio, task_file.read_text()
     new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
     studio.file.plan(EditRequest("add", ("human", "side"), new))
-    assert written(session).message == f"side is in {task_file.name}, and the env has it."
+    assert written(session).message == f"side: added to {task_file.name} and verified."
     assert not differences(there(session, ("human", "side")), new, close=3e-4), "but for what is rounded"
     assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
     # What is not written yet is in the copy, and stays with the original.
@@ -109,7 +109,7 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
     for name in ("front", "other"):
         studio.file.plan(EditRequest("remove", ("human", name)))
-        assert f"{name} is no longer in" in written(session).message
+        assert f"{name}: removed from" in written(session).message
     assert names(session) == ["render_camera"] and task_file.read_text().count(
         "CameraConfig("
     ) == before.count("CameraConfig(")
@@ -224,7 +224,7 @@ class Inherits(PushCubeEnv):
         session.studio.file.plan(EditRequest("edit", BASE))
         notes = planned(session).edit.notes
         assert "base_camera is made by PushCubeEnv, from which Inherits inherits" in notes[0]
-        assert written(session).message == "base_camera is written to task.py, and the new env has it."
+        assert written(session).message == "base_camera: saved to task.py and verified."
         assert not differences(there(session, BASE), wanted, close=3e-4)
         task = session.view().task
         assert {c.key: c.settings for c in before.cameras if c.key != BASE} == {

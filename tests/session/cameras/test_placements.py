@@ -166,7 +166,7 @@ def test_a_placement_that_is_out_of_the_file_again_is_a_step_of_undo_and_one_mad
     written, since = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
     placements = opened(FILE, written, FILE).placements
     assert placements.edit_undone(KEY, written, FILE) and placements.now(KEY) == FILE
-    assert placements.undo_label == "took back the change of base_camera"
+    assert placements.undo_label == "reverted the change of base_camera"
     placements.undo()
     assert placements.now(KEY) == written
     placements.place(KEY, since)

@@ -230,10 +230,10 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     # Taken back is the placement too, and one step of undo brings it again.
     assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
     assert view.studio.edit_state.message.endswith(
-        "base_camera is where the file places it; Undo puts it where you placed it."
+        "base_camera is where the file places it; Undo restores your placement."
     )
     wait_until(session, seen_from(BASE, start), "the camera where the file has it")
-    assert view.studio.undo == "took back the change of base_camera"
+    assert view.studio.undo == "reverted the change of base_camera"
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.studio.camera(BASE).now, now.now)
@@ -308,9 +308,7 @@ def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Pa
     assert target(view) == (0.08, 0, 0.2)
     task_file.write_text(good)
     wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
-    wait_until(
-        session, said(lambda s: "is where the file says" in s.problem), "that the placement is dropped"
-    )
+    wait_until(session, said(lambda s: "follows it" in s.problem), "that the placement is dropped")
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert view.studio.problem == "", "what was said before a person did something about it"
@@ -451,7 +449,7 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
         session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
     )
     assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
-    assert view.studio.undo == "took base_camera from the file"
+    assert view.studio.undo == "reloaded base_camera from the file"
     session.studio.undo()
     wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
     serial = view.task_serial

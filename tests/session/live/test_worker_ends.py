@@ -45,9 +45,9 @@ def session(risky_session: Session, risky_file: Path) -> Iterator[Session]:
 
 
 DEATHS = [
-    ("garbage", "sent what cannot be read (it says that it is 1886546286 bytes long) and was ended"),
-    ("wrong", "sent what cannot be read (it was a dict, which is no message) and was ended"),
-    ("misfit", "sent what cannot be used ("),
+    ("garbage", "sent unreadable data (it says that it is 1886546286 bytes long) and was ended"),
+    ("wrong", "sent unreadable data (it was a dict, which is no message) and was ended"),
+    ("misfit", "sent unusable data ("),
     ("headless", "its main thread had ended and left another thread running"),
     ("thread", "ended with exit code 1"),
     ("detach", "was killed by SIGKILL"),

@@ -83,7 +83,7 @@ def test_an_answer_of_another_kind_is_none() -> None:
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(asker.ask, go_on, question(0))
         asker.take(Answer(line.calls.get(timeout=10).number, pack(("no", "report"))))
-        with pytest.raises(JobFailed, match="answered with what cannot be read"):
+        with pytest.raises(JobFailed, match="answered with unreadable data"):
             asked.result(timeout=10)
 
 
@@ -187,7 +187,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
         assert background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
 
 
-@pytest.mark.parametrize("aside", [True, False])
+@pytest.mark.parametrize("aside", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_afterwards(
     background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,7 +229,7 @@ def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_a
     assert told[-1] == "waiting for other work in the background"
 
 
-@pytest.mark.parametrize("aside", [True, False])
+@pytest.mark.parametrize("aside", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_what_was_begun_last_is_left_alone_by_what_waits_behind_it(
     background: Background, tmp_path: Path, aside: bool
 ) -> None:

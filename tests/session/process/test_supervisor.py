@@ -127,7 +127,7 @@ def test_each_worker_is_greeted_and_what_it_says_arrives_in_order() -> None:
         one.worker.replace()
         death = one.until_dead()
         assert (death.why, death.asked, death.file_waits, death.gives_up) == (
-            "was ended by hand",
+            "was stopped by hand",
             True,
             False,
             False,
@@ -173,6 +173,7 @@ def test_the_third_death_in_a_row_is_the_last_until_somebody_asks() -> None:
         assert (fourth.asked, fourth.gives_up) == (False, False), "it waited to be asked, and begins anew"
 
 
+@pytest.mark.slow
 def test_a_task_that_was_loaded_forgives_earlier_deaths() -> None:
     with minded() as one:
         for times in (1, 2, 3, 4):
@@ -241,6 +242,7 @@ def test_a_load_waits_for_short_work_only() -> None:
         one.until(lambda: not one.worker.load_pending, "that it was taken up")
 
 
+@pytest.mark.slow
 def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
     with minded() as one:
         for times in (1, 2, 3):
@@ -271,7 +273,7 @@ def test_what_is_no_event_ends_the_worker_with_a_reason() -> None:
     with minded() as one:
         one.worker.send(do("nonsense x"))
         death = one.until_dead()
-        assert death.why == "sent what cannot be read (it was a str, which is no message) and was ended"
+        assert death.why == "sent unreadable data (it was a str, which is no message) and was ended"
 
 
 def test_an_event_that_cannot_be_taken_ends_the_worker_and_not_the_thread(
@@ -281,7 +283,7 @@ def test_an_event_that_cannot_be_taken_ends_the_worker_and_not_the_thread(
         one.fails = 1
         one.worker.send(do("say this"))
         death = one.until_dead()
-        assert death.why == "sent what cannot be used (ValueError: no such step) and was ended"
+        assert death.why == "sent unusable data (ValueError: no such step) and was ended"
         one.until_greeted(2)
     assert "no such step" in caplog.text
 
@@ -302,7 +304,7 @@ def test_of_the_last_that_a_worker_sent_what_cannot_be_taken_is_told_and_a_new_o
 
         one.taking = taking
         one.worker.send(do("last_steps 5"))
-        assert one.until_dead().why == "was ended by hand"
+        assert one.until_dead().why == "was stopped by hand"
         assert one.said == ["hello 1", "step 0", "step 1"]
         one.until_greeted(2)
     assert "The last that a worker sent could not be taken" in caplog.text and "no such step" in caplog.text

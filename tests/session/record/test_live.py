@@ -136,7 +136,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
 
     def drawing(view: SessionView) -> bool:
         progress = view.recording.saving.progress
-        return progress is not None and progress.what == "drawing it again" and progress.done > 0
+        return progress is not None and progress.what == "rendering it again" and progress.done > 0
 
     def measure() -> None:
         reports.measure(60)

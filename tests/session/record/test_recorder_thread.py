@@ -86,12 +86,12 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
 
 
 def test_how_far_keeping_is_and_what_came_of_it_stand_on_the_page() -> None:
-    under_way = SaveStatus(progress=JobProgress("drawing it again", 3, 12))
+    under_way = SaveStatus(progress=JobProgress("rendering it again", 3, 12))
     html = recording_html(RecordingStatus(saving=under_way))
-    assert "saving what was seen: drawing it again, 3 of 12 moments" in html and "width: 25%" in html
+    assert "saving: rendering it again, 3 of 12 moments" in html and "width: 25%" in html
     assert "Each episode becomes" not in html
-    failed = recording_html(RecordingStatus(saving=SaveStatus("nothing was seen yet", failed=True)))
-    assert "nothing was seen yet" in failed and "wb-bad-text" in failed and "wb-again-bar" not in failed
+    failed = recording_html(RecordingStatus(saving=SaveStatus("there is no step yet", failed=True)))
+    assert "there is no step yet" in failed and "wb-bad-text" in failed and "wb-again-bar" not in failed
     kept = recording_html(RecordingStatus(saving=SaveStatus("kept 1 episode")))
     assert "kept 1 episode" in kept and "wb-bad-text" not in kept
 

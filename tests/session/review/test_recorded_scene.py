@@ -89,4 +89,4 @@ def test_what_the_process_sends_and_cannot_be_read_is_told(recorded: Any, tmp_pa
     file.write_text("import os, sys, time\nos.write(int(sys.argv[1]), b'print(1)\\n')\ntime.sleep(3600)\n")
     ended = make({0: read_maniskill(recorded[0], "traj_0")}, (file,))
     assert isinstance(ended[0], SceneError)
-    assert "sent what cannot be read (it says that it is 1886546286 bytes long)" in str(ended[0])
+    assert "sent unreadable data (it says that it is 1886546286 bytes long)" in str(ended[0])

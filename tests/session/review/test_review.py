@@ -189,7 +189,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
         and "ZeroDivisionError: oh" in said
         and "file d: gone" in said
     )
-    assert "not in the folder any more" in said
+    assert "no longer in the folder" in said
     review.open(["b"])
     view = reach(review, lambda view: not view.loading and len(view.problems) == 1, "its problem")
     assert [o.id for o in view.opened] == ["a"], "what was open stays"

@@ -82,7 +82,7 @@ def lived() -> Iterator[EnvMoment]:
 def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None:
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == tuple(range(N)) and not did.not_carried
-    assert did.how == f"{T} steps were made again, and every body is where it was, to the last bit."
+    assert did.how == f"{T} steps were replayed, and every body is where it was, to the last bit."
     assert lived.told == [(done, T) for done in range(1, T + 1)]
     assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N
     for after in range(T, 2 * T):

@@ -109,7 +109,7 @@ def test_a_registration_that_comes_and_goes_is_said(desk: Desk) -> None:
     assert report.level == "rebuilt" and report.carried
     assert (
         report.reason
-        == "PushCubeEnv is not registered as WorkbenchPushCube-v1 any more, and so has no time limit"
+        == "PushCubeEnv is no longer registered as WorkbenchPushCube-v1, and so has no time limit"
     )
     report = desk.edit('@register_env("WorkbenchPushCube-v1"', '@register_env("Another-v1"')
     assert report.reason == "PushCubeEnv is registered as Another-v1 now"

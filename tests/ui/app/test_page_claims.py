@@ -195,11 +195,11 @@ def test_what_a_control_can_hold_is_taken(controls, attacker, name, claimed, hel
         ("int", 0, "The int goes from 1 to 9."),
         ("float", 0.5, "The float is at least 1."),
         ("two", [1.0], "The two has 2 numbers."),
-        ("several", [3, 4], "The several takes nothing from a page."),
-        ("colour", [0, 255, 7], "The colour takes nothing from a page."),
-        ("dropdown", "c", "That pick is not one of those on offer."),
+        ("several", [3, 4], "The several cannot be set from a page."),
+        ("colour", [0, 255, 7], "The colour cannot be set from a page."),
+        ("dropdown", "c", "That is not one of the choices for pick."),
         ("text", "a\nb", "The text takes one line of text."),
-        ("text", "x" * (LONGEST_LINE + 1), "The text takes 10000 characters; those are 10001."),
+        ("text", "x" * (LONGEST_LINE + 1), "The text takes at most 10000 characters, not 10001."),
     ],
 )
 def test_the_page_that_sent_it_is_told_and_shown_the_true_value(

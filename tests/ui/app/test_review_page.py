@@ -106,21 +106,21 @@ def test_an_opened_recording_fills_every_part(shown: Shown) -> None:
     assert shown.chart("reward")
     image = shown.panels.part("Cameras").images()[0]
     assert abs(int(np.asarray(image.image).mean()) - 140) <= 3
-    assert shown.panels.shows(GO_LIVE) and not shown.panels.shows("Draw them")
+    assert shown.panels.shows(GO_LIVE) and not shown.panels.shows("Layout")
     assert "open two" in shown.panels.part("Compare").html().lower()
 
 
 def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pytest.MonkeyPatch) -> None:
     shown.open(1, 2)
-    assert shown.panels.control("Draw them").value == GHOSTS and shown.panels.shows("Draw them")
+    assert shown.panels.control("Layout").value == GHOSTS and shown.panels.shows("Layout")
     shown.review.seek(5)
     shown.draw()
     ghost = shown.panels.bodies("cube")
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
-    assert "They part at step 1" in shown.panels.part("Compare").html()
+    assert "They diverge at step 1" in shown.panels.part("Compare").html()
     assert "reward = 2" in shown.panels.part("Compare").html()
     assert len(shown.chart("reward").series) == 4, "step, two lines and the dot"
-    shown.panels.command("Over each other or side by side")
+    shown.panels.command("Overlaid or side by side")
     shown.draw()
     (cubes,) = shown.panels.bodies("cube")
     assert len(cubes.batched_positions) == 2 and sorted(shown.panels.labels()) == ["A, seed 1", "B"]
@@ -180,7 +180,7 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Shown) -> None:
     shown.review.seek(-3)
     shown.draw()
     html = shown.panels.html("wb-timeline")
-    assert ">B: step 0 / 6, 0.00 s<" in html and "(it has no state there)" in html
+    assert ">B: step 0 / 6, 0.00 s<" in html and "(no state there)" in html
     assert "aligned at first success" in html and "stroke:#f08c00" in html
     rows = re.findall(
         r"<tr data-press.*?</tr>", shown.panels.part("Review").html("wb-opened-list"), re.DOTALL
@@ -240,12 +240,15 @@ def test_what_is_known_of_a_recording_is_told_and_what_is_not_is_left_out(shown:
     assert said["seed"] == ("31", "of the episode")
     assert said["reset options"] == ("at=&#39;left side&#39;",) * 2
     assert said["source"][1] == "push.py" and said["source"][0]
-    assert said["not held"] == ("mesh.obj", "What else the task reads, as it was named by its text: mesh.obj")
+    assert said["not stored"] == (
+        "mesh.obj",
+        "Other files that the task reads, as its code names them: mesh.obj",
+    )
     assert said["ran on"] == ("cpu (batched)", "sapien 3.0, numpy 2")
     assert said["actions"] == ("random; from step 2 on: sliders",) * 2
     assert said["control mode"] == ("pd_joint_delta_pos", "")
     assert said["made with"] == (f"note={long[:114]}…", f"note={long}")
-    assert said["cut short"] == ("its writer ended in the middle", "")
+    assert said["cut short"] == ("the program that recorded it ended early", "")
     shown.open(-1)
     assert list(facts()) == ["file", "recorded", "source", "ran on"]
 
@@ -254,9 +257,9 @@ def test_a_scene_is_framed_as_it_was_drawn_while_another_recording_comes(shown: 
     shown.open(1)
     shown.review.open(tuple(row.id for row in shown.library.view().rows if row.seed in (1, 2)))
     until(lambda: len(shown.review.view().opened) == 2, "the other recording")
-    shown.panels.command("Frame what is shown")
+    shown.panels.command("Frame the scene")
     shown.draw()
-    shown.panels.command("Frame what is shown")
+    shown.panels.command("Frame the scene")
 
 
 def test_pressing_a_row_of_the_comparison_goes_there(shown: Shown) -> None:
@@ -301,7 +304,7 @@ def test_what_is_not_per_env_is_shown_marked_and_drawn(shown: Shown, folder: Pat
     shown.draw()
     np.testing.assert_array_equal(shown.chart(line).data[1], np.linspace(0, 1, 5))
     shown.open(11, 12)
-    words = "Not compared, since they are not numbers of this env alone: progress: all, goal, phase."
+    words = "Not compared, because they are not per env: progress: all, goal, phase."
     assert words in shown.panels.part("Compare").html()
 
 
@@ -310,7 +313,7 @@ def test_many_recordings_stand_side_by_side(shown: Shown, folder: Path) -> None:
         write(folder, made(3, seed=seed), pictures=False)
     shown.library.refresh()
     shown.open(*range(20, 26))
-    assert not shown.panels.shows("Draw them")
+    assert not shown.panels.shows("Layout")
     (cubes,) = shown.panels.bodies("cube")
     assert len(cubes.batched_positions) == 6
     assert sorted(shown.panels.labels()) == ["5", "6", "A, seed 20", "B", "C", "D"]

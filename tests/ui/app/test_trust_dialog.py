@@ -134,7 +134,7 @@ def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
     said = question_html(replace(PLAIN, files=files, trusted_before=True, gone=("old.py",)))
     main, helper, new = said.split("<details>")[1:]
     assert "wb-tag" not in main and ">changed<" in helper and ">new<" in new
-    assert "What has changed since is marked; gone since: old.py" in said
+    assert "Changes since then are marked; gone since: old.py" in said
     said = question_html(replace(PLAIN, trusted_before=True))
     assert "Which of them has changed since is not known" in said
 
@@ -148,7 +148,7 @@ def test_what_going_live_means_is_said_before() -> None:
 
 
 def test_where_imports_are_computed_no_module_is_said_to_be_imported() -> None:
-    assert "it may import all that lies beside it (1)" in question_html(replace(PLAIN, computed=True))
+    assert "it may import everything beside it (1)" in question_html(replace(PLAIN, computed=True))
 
 
 def test_what_of_a_text_is_not_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

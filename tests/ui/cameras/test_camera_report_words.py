@@ -86,10 +86,13 @@ def test_an_object_that_some_envs_lack_is_judged_where_it_is() -> None:
 @pytest.mark.parametrize(
     ("thing", "said"),
     [
-        (seen("cube", [0, 90]), "cube is not seen in 1 of 2 envs."),
-        (seen("cube", [50, 90], cut=(1,)), "Everything is seen; the border cuts cube in 1 of 2 envs."),
-        (seen("cube", [50, 90]), "Everything is seen, and nothing is cut."),
-        (seen("table", [50, 90], scenery=True), "There is no object to be seen in these envs."),
+        (seen("cube", [0, 90]), "cube is not visible in 1 of 2 envs."),
+        (
+            seen("cube", [50, 90], cut=(1,)),
+            "Everything is visible; cube is cut by the border in 1 of 2 envs.",
+        ),
+        (seen("cube", [50, 90]), "Everything is visible, and nothing is cut."),
+        (seen("table", [50, 90], scenery=True), "No object is visible in these envs."),
     ],
 )
 def test_the_headline_says_the_worst(thing: ObjectSeen, said: str) -> None:
@@ -108,7 +111,7 @@ def test_an_env_is_called_by_what_is_worst_in_it() -> None:
         "cube 90 px",
         "cube 20 px, small",
         "cube hidden",
-        "cube 50 % behind things",
+        "cube 50 % behind objects",
     ]
 
 
@@ -141,4 +144,4 @@ def test_over_steps_it_is_said_when_each_object_is_seen() -> None:
     report = report_of(seen("cube", [50, 0, 10, 40], [50, 20, 40, 40], cut=(3,), present=[True] * 4))
     (row,) = object_rows(report, "steps")
     assert row["moods"] == ["good", "bad", "warn", "warn"]
-    assert headline(report, "steps") == "cube is not seen in 1 of 4 steps."
+    assert headline(report, "steps") == "cube is not visible in 1 of 4 steps."

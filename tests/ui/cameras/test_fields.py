@@ -93,7 +93,7 @@ def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_sa
             "Position",
             "Looks at",
             "Degrees",
-            "Degrees high",
+            "Vertical fov",
             "Radians",
             "Width, height",
             "Near, far",
@@ -103,20 +103,20 @@ def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_sa
         "Position": (0.4512, 0.0, 0.61),
         "Looks at": (0.08, 0.0, 0.2),
         "Degrees": pytest.approx((0.0, 47.84, 180.0)),
-        "Degrees high": 58.0,
+        "Vertical fov": 58.0,
         "Radians": 1.0123,
         "Width, height": (128.0, 96.0),
         "Near, far": (0.0123, 10.0),
     }
     assert shown(desk, "Lens as") == FOV and shown(desk, "Shader") == "minimal"
     assert not any(desk.panels.shows(label) for label in ("fx, fy", "cx, cy", "w x y z", "Forward", "Up"))
-    desk.panels.set("Turned", WXYZ)
+    desk.panels.set("Rotation", WXYZ)
     desk.draw()
     assert desk.panels.shows("w x y z") and not desk.panels.shows("Degrees")
     assert [float(word) for word in shown(desk, "w x y z").split()] == pytest.approx(
         FILE.quaternion, abs=1e-6
     )
-    desk.panels.set("Turned", AXES)
+    desk.panels.set("Rotation", AXES)
     desk.draw()
     forward, left, up = axes_of(FILE.quaternion)
     assert shown(desk, "Forward") == pytest.approx(forward, abs=1e-4)
@@ -140,7 +140,7 @@ def test_what_is_typed_is_taken_and_what_is_shown_beside_it_stays_to_the_last_di
     now = desk.types("Width, height", (64.0, 48.0))
     assert (now.width, now.height, now.fov) == (64, 48, FILE.fov)
     assert desk.types("Near, far", (0.0123, 5.0)).near == FILE.near and desk.now.far == 5.0
-    assert desk.types("Degrees high", 90.0).fov == pytest.approx(math.pi / 2)
+    assert desk.types("Vertical fov", 90.0).fov == pytest.approx(math.pi / 2)
     assert desk.types("Radians", 1.1).fov == 1.1
     assert desk.types("Shader", "default").shader_pack == "default"
     assert not desk.panels.client.notices
@@ -158,9 +158,9 @@ def test_an_eye_is_typed_alone_where_there_are_two_handles(desk: Desk) -> None:
 
 @with_a_fov
 def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> None:
-    desk.panels.set("Turned", WXYZ)
+    desk.panels.set("Rotation", WXYZ)
     assert desk.types("w x y z", "[0.5, 0.5, 0.5, 0.5]").quaternion == (0.5, 0.5, 0.5, 0.5)
-    desk.panels.set("Turned", AXES)
+    desk.panels.set("Rotation", AXES)
     desk.types("Forward", (0.0, 0.6, -0.8))
     forward, _, up = axes_of(desk.now.quaternion)
     np.testing.assert_allclose(forward, (0.0, 0.6, -0.8), atol=1e-9)
@@ -168,14 +168,14 @@ def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> N
     desk.types("Up", (0.0, 0.8, 0.6))
     forward, _, up = axes_of(desk.now.quaternion)
     np.testing.assert_allclose([forward, up], [(0.0, 0.6, -0.8), (0.0, 0.8, 0.6)], atol=1e-9)
-    desk.panels.set("Turned", RPY)
+    desk.panels.set("Rotation", RPY)
     desk.draw()
     assert desk.panels.shows("Degrees")
 
 
 @with_a_matrix
 def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_same_view(desk: Desk) -> None:
-    assert shown(desk, "Lens as") == INTRINSIC and not desk.panels.shows("Degrees high")
+    assert shown(desk, "Lens as") == INTRINSIC and not desk.panels.shows("Vertical fov")
     assert shown(desk, "fx, fy") == (100.12, 90.0) and shown(desk, "cx, cy") == (64.0, 48.0)
     now = desk.types("fx, fy", (100.12, 95.0))
     assert now.intrinsic == ((100.123, 0.0, 64.0), (0.0, 95.0, 48.0), (0.0, 0.0, 1.0))
@@ -192,7 +192,7 @@ def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_s
 @pytest.mark.parametrize(
     ("label", "value", "why"),
     [
-        ("Near, far", (3.0, 2.0), "nearer than what is far"),
+        ("Near, far", (3.0, 2.0), "less than far"),
         ("Width, height", (64.4, 48.0), "whole number"),
         ("Width, height", (128.4, 96.0), "whole number"),
         ("w x y z", "1 0 0", "four numbers"),
@@ -204,7 +204,7 @@ def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_s
 )
 @with_a_fov
 def test_what_no_camera_has_is_refused_in_words(desk: Desk, label: str, value: Any, why: str) -> None:
-    desk.panels.set("Turned", {"w x y z": WXYZ, "Forward": AXES}.get(label, RPY))
+    desk.panels.set("Rotation", {"w x y z": WXYZ, "Forward": AXES}.get(label, RPY))
     now = desk.types(label, value)
     assert why in desk.panels.client.notices[0]
     assert not differences(FILE, now)

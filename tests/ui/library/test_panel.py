@@ -108,7 +108,7 @@ def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Table:
     return Table(panel, panels, clock)
 
 
-NEXT = "The next recording of the table"
+NEXT = "Next recording in the table"
 DELETE = "Delete the selected recordings"
 ESCAPE = "Cancel, or show all recordings again"
 
@@ -158,8 +158,8 @@ def test_keys_walk_over_the_pages(table: Table) -> None:
     table.draw()
     assert table.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
     assert table.shown() == newest(MOST_ROWS, COUNT) and "wb.follow" in table.panels.html("<style")
-    table.command("Select the one before it too")
-    table.command("Select the one before it too")
+    table.command("Also select the previous recording")
+    table.command("Also select the previous recording")
     assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
 
 
@@ -168,7 +168,7 @@ def test_the_cursor_is_followed_for_keys_only_and_goes_with_its_row(library: Lib
     commands = {command.label: command for command in walking(listed)}
     assert not listed.follow
     listed.press("id07")
-    commands["Select the next recording too"].run()
+    commands["Also select the next recording"].run()
     assert listed.selected_ids() == ("id07", "id06") and listed.follow
     listed.press("id03")
     assert listed.selected_ids() == ("id03",) and not listed.follow, "it was seen where it was pressed"
@@ -177,12 +177,12 @@ def test_the_cursor_is_followed_for_keys_only_and_goes_with_its_row(library: Lib
     listed.page(library.view())
     listed.choose("all")
     assert listed.cursor is None and listed.selected_ids() == (), "it was let go of"
-    commands["Select all recordings that are listed"].run()
+    commands["Select all listed recordings"].run()
     assert len(listed.selected_ids()) == COUNT
 
 
 def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
-    table.command("Select all recordings that are listed")
+    table.command("Select all listed recordings")
     assert len(table.selected()) == COUNT
     table.press("success")
     assert len(table.selected()) == (COUNT + 1) // 2
@@ -276,7 +276,7 @@ def test_states_of_the_folder_are_said(child_process: None, panels: Panels, tmp_
     library = Library(tmp_path / "none")
     panel = LibraryPanel(panels.server, library, lambda ids: None)
     panel.draw()
-    assert "Looking through the folder" in panels.html()
+    assert "Scanning the folder" in panels.html()
     library.refresh()
     panel.draw()
     assert "is not there" in panels.html()

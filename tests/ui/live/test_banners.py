@@ -8,7 +8,7 @@ from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
 from workbench.ui.live.banners import DOING, Banner, banner_html
 
-RESTART = "Start a new worker"
+RESTART = "Restart the worker"
 EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
 
 
@@ -17,7 +17,7 @@ def test_first_says_what_failed_and_where() -> None:
     title, rest = html.split("</div>", 1)
     assert "PushEnv" in title and "failed in evaluate" in title and "push.py:88" in title
     assert "KeyError" in rest and "return goal[&lt;0&gt;]" in rest
-    assert "The last good version keeps running." in rest
+    assert "The last good version is still running." in rest
 
 
 def test_everything_of_the_author_s_is_escaped() -> None:

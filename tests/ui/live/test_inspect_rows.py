@@ -153,7 +153,7 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
 def test_contacts_are_said_to_be_unknown_before_a_step_and_none_to_be_none_after_one() -> None:
     now = Inspection(0, 5, contacts=(PRESSED,))
     html = inspect_html("contacts", running(1), now, None, no_step_yet=True)
-    assert "not known before the next step" in html and "5 N" not in html
+    assert "known after the next step" in html and "5 N" not in html
     assert "nothing touches anything" in inspect_html(
         "contacts", running(1), Inspection(0, 5, contacts=()), None
     )

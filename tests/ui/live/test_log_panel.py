@@ -58,7 +58,7 @@ def test_held_still_it_waits_and_cleared_it_does_not(panels: Panels, clock: Cloc
     drawn(NOTHING_PRINTED)
     assert not panels.shows("Filter") and not panels.shows("Clear")
     assert "reward" in drawn(Printed(1, LINES[:1], 0))
-    panels.set("Hold still", True)
+    panels.set("Pause", True)
     assert "Warning" not in drawn(Printed(2, LINES[:2], 0))
     panels.set("Filter", "Warn")
     assert "Warning" in drawn(Printed(2, LINES[:2], 0)), "the filter is of what stands there"
@@ -69,5 +69,5 @@ def test_held_still_it_waits_and_cleared_it_does_not(panels: Panels, clock: Cloc
 
 def test_memory_is_said_of_both_processes() -> None:
     html = vitals_html(Vitals(700 * 2**20, 8 * 2**30, 800 * 2**20, False))
-    assert all(part in html for part in ("700 MB of 8.0 GB", "spare worker 800 MB", "being warmed up"))
+    assert all(part in html for part in ("700 MB of 8.0 GB", "spare worker 800 MB", "warming up"))
     assert "spare" not in vitals_html(Vitals(700 * 2**20, None, None, False))

@@ -40,7 +40,7 @@ def done(*verdicts: Verdict[PastRun], **changes: Any) -> RescoreView:
 
 
 class RecordedSession:
-    """Stands where the session stands for a panel: what it has of curves, and what it was asked for."""
+    """Stands where the session stands for a panel: what it has of curves, and what it was requested."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[object, ...]] = []
@@ -93,7 +93,7 @@ def rescoring(panels: Panels, clock: Clock) -> Rescoring:
         (RescoreView("loading"), "loading the new code"),
         (RescoreView("rescoring", done=26, total=50), "50 %"),
         (done(episode(), same(1)), "1 of 2 episodes differs."),
-        (done(same(1), differing_names={"new"}), "as they were. Other entries differ: new."),
+        (done(same(1), differing_names={"new"}), "are unchanged. Other entries differ: new."),
         (RescoreView("stopped", why="the file was saved again"), "the file was saved again"),
     ],
 )
@@ -111,7 +111,7 @@ def test_outcomes_are_said_before_rewards() -> None:
 
 def test_nothing_that_differs_is_one_sentence() -> None:
     both = same(0), same(1)
-    says = "Nothing differs in 2 episodes: reward, success and fail are as they were."
+    says = "Nothing differs in 2 episodes: reward, success and fail are unchanged."
     assert verdict_text.headline(both) == says and verdict_text.totals(both) == ["mean return: 1"]
     assert verdict_text.headline([same(0), same(1, differing=("height",))]).endswith(
         "Other entries differ: height."

@@ -89,7 +89,7 @@ def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Env
     travel = lived.panels.control("way to continue")
     assert travel.options == ("Continue from here: env 0", "all envs", "env 0 into all envs")
     assert lived.panels.shows("way to continue") and lived.ends() == (-4, 0, -2)
-    lived.panels.command("What is live")
+    lived.panels.command("Go to live")
     lived.draw()
     assert "live" in lived.strip() and not lived.panels.shows("way to continue")
 
@@ -119,17 +119,17 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvM
     lived.panels.choose(panel.EPISODE)
     lived.draw()
     assert lived.ends()[0] == -3
-    lived.panels.command("The first moment")
+    lived.panels.command("Go to the first moment")
     assert lived.past.shown == lived.past.last - 3, "of the episode"
-    lived.panels.command("What is live")
+    lived.panels.command("Go to live")
     lived.draw()
     assert lived.panels.control("step to take").options[-2:] == (panel.EVERYTHING, "undo reset of all")
     lived.panels.choose(panel.EVERYTHING)
     lived.draw()
     assert lived.ends()[0] == -8
-    lived.panels.command("The first moment")
+    lived.panels.command("Go to the first moment")
     assert lived.past.shown == lived.past.first
-    lived.panels.command("What is live")
+    lived.panels.command("Go to live")
     lived.draw()
     lived.panels.choose("undo reset of all")
     view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
@@ -167,14 +167,14 @@ def test_of_one_env_there_is_one_way_to_go_on() -> None:
 def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: EnvMoment) -> None:
     lived.step(3)
     until(lambda: not Control.took_the_key(), "a moment in which nobody touches anything")
-    lived.panels.command("A step back in time")
+    lived.panels.command("One step back")
     assert lived.past.shown == 2
     lived.draw()
     lived.panels.set(SLIDER, -2)
-    lived.panels.command("A step back in time")
+    lived.panels.command("One step back")
     assert lived.past.shown == 1, "only the slider went back"
     until(lambda: not Control.took_the_key(), "the key to be over")
-    lived.panels.command("A step back in time")
+    lived.panels.command("One step back")
     assert lived.past.shown == 0
 
 
@@ -196,7 +196,7 @@ def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
     lived.draw()
     assert not lived.panels.shows(SLIDER)
     assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
-    assert "1 step<" in lived.strip()
+    assert "history: 1 step," in lived.strip()
     lived.step(1)
     assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)
 
@@ -224,18 +224,18 @@ def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
 
 def test_home_is_the_left_end_of_the_slider(lived: EnvMoment) -> None:
     lived.step(3)
-    lived.panels.command("The first moment")
+    lived.panels.command("Go to the first moment")
     assert lived.past.shown == 0
     last = lived.past.last
     lived.panels.command("Reset all envs")
     wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
     lived.step(2)
     lived.panels.choose(panel.EPISODE)
-    lived.panels.command("What is live")
+    lived.panels.command("Go to live")
     lived.draw()
-    lived.panels.command("The first moment")
+    lived.panels.command("Go to the first moment")
     assert lived.past.shown == 4
-    lived.panels.command("To the event before")
+    lived.panels.command("Previous event")
     assert lived.past.shown == 0
-    lived.panels.command("To the next event")
+    lived.panels.command("Next event")
     assert lived.past.shown == 4

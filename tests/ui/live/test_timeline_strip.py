@@ -83,7 +83,7 @@ def test_a_shown_moment_is_told_in_steps_ago() -> None:
     html = strip_html(strip(), running(4, selected_env=2, timeline=past(163)))
     assert cursor(html) == 63.0 and ">live<" not in html
     assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
-    assert "history 3.0 of 256 MB, 101 steps" in html
+    assert "history: 101 steps, 3.0 of 256 MB" in html
 
 
 def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
@@ -126,9 +126,9 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_no_line() -> Non
 def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
     view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
     not_carried = "; ".join(view.timeline.not_carried)
-    for arrived in ("", "<i>Push</i>, step 3: its actions were made again."):
+    for arrived in ("", "<i>Push</i>, step 3: its actions were replayed."):
         html = render("timeline_hint", live=True, not_carried=not_carried, arrived=arrived)
-        assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
+        assert "not restored: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
         assert ("&lt;i&gt;Push&lt;/i&gt;, step 3" in html) == bool(arrived) and "<i>" not in html
 
 

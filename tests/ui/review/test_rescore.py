@@ -51,8 +51,8 @@ def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> 
     )
     reward = verdict(largest=0.25, first_difference=4, differing=("reward",))
     assert verdict_text.change_text(reward) == "reward by up to 0.25, from step 4"
-    assert verdict_text.change_text(verdict()) == "as it was"
-    assert verdict_text.change_text(verdict(differing=("height",))) == "as it was, but for height"
+    assert verdict_text.change_text(verdict()) == "unchanged"
+    assert verdict_text.change_text(verdict(differing=("height",))) == "unchanged, except height"
     assert verdict_text.change_text(verdict(why_not="it has no step")) == "not rescored: it has no step"
     assert verdict_text.returns_text(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
 
@@ -165,13 +165,13 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     ]
     rescoring.draw(RescoreView("done", 1, tuple(given), 3, 3))
     assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
-    assert not any(rescoring.panels.shows(name) for name in ("Rescore what is open", "Stop"))
+    assert not any(rescoring.panels.shows(name) for name in ("Rescore the open recordings", "Stop"))
     rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
     until(lambda: review.view().opened, "the recording", seen=lambda: review.view().problems)
     view = review.view()
     assert view.opened[0].id == rows[2].id and view.states == (3,)
     rescoring.draw(replace(rescoring.told.view, serial=2))
-    assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Rescore what is open")
+    assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Rescore the open recordings")
     assert "wb-selected" in rescoring.panels.html()
 
 

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 import viser
 
 from tests.ui.scenes import table_scene
 from workbench.core.scene.shapes import Material
-from workbench.ui.scene.bodies import SceneView
+from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.scene.glb import group_visuals
 
@@ -101,3 +103,23 @@ def test_scene_without_a_floor_gets_a_grid(server: viser.ViserServer) -> None:
     view = SceneView(server)
     view.build(geometry, lay_out(geometry, poses), poses)
     assert server.scene.get_handle_by_name("/floor") is not None
+
+
+def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(
+    server: viser.ViserServer,
+) -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    ground = next(visual for visual in geometry.visuals if "ground" in visual.name)
+    dark = replace(ground, material=Material((0.05, 0.05, 0.06, 1.0)))
+    geometry = replace(geometry, visuals=tuple(dark if v is ground else v for v in geometry.visuals))
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    before = {handle.name: handle.glb_data for handle in view.handles}
+    view.build(geometry, layout, poses, looks=Looks(dark=False))
+    new = [handle for handle in view.handles if handle.name not in before]
+    assert len(new) == 1 and "ground" in new[0].name and len(view.handles) == len(before)
+    (floor,) = trimesh.load(io.BytesIO(new[0].glb_data), file_type="glb").geometry.values()
+    assert floor.visual.material.baseColorFactor[:3].min() > 200
+    view.build(geometry, layout, poses)
+    assert {handle.glb_data for handle in view.handles} == set(before.values())

@@ -121,7 +121,7 @@ def test_a_choice_is_one_of_the_options_or_refused(value, options):
 
 
 def test_true_is_not_the_option_one():
-    with pytest.raises(ValueError, match="on offer"):
+    with pytest.raises(ValueError, match="not one of the choices"):
         checked_choice(True, (0, 1), "camera")
 
 

@@ -132,7 +132,7 @@ def test_what_is_not_ours_is_left_alone(folder):
 
 
 def test_a_socket_that_another_program_listens_at_is_left_to_it(gated_server, folder):
-    with pytest.raises(ServerError, match="Another program listens"):
+    with pytest.raises(ServerError, match="Another program is listening"):
         open_server(ServerOptions(socket=folder / "page.sock"))
     assert get(gated_server) == 403
 

@@ -87,7 +87,7 @@ def test_too_many_that_say_nothing_lock_nobody_out(gated_server, monkeypatch, ca
         idle[-1].settimeout(0.2)
         with pytest.raises(TimeoutError):
             idle[-1].recv(1)
-    assert "10 connections at a time do not show the token (from 127.0.0.1)" in caplog.text
+    assert "10 connections are open without the token (from 127.0.0.1)" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
     for _ in range(4 * 3600):
         told.happened("a", "It happened.")
         now[0] += 1.0
-    assert said[:2] == ["It happened.", "It happened. (59 more times since this was last said.)"]
+    assert said[:2] == ["It happened.", "It happened. (59 more times since the last message.)"]
     assert len(said) < 12
     lines = len(said)
     for _ in range(2):
@@ -234,8 +234,8 @@ def test_what_was_not_told_yet_is_told_at_the_end_with_the_total(caplog):
         closing.close()
         closing.close()  # what was told is not told again
     lines = [record.getMessage() for record in caplog.records]
-    assert "(29 more times since this was last said.)" in lines[1] and "token that is not valid" in lines[1]
-    assert lines[2:] == ["In all 30 requests were turned away."]
+    assert "(29 more times since the last message.)" in lines[1] and "invalid token" in lines[1]
+    assert lines[2:] == ["30 requests were refused in total."]
 
 
 def test_no_program_is_named(gated_server):

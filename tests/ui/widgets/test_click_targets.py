@@ -18,7 +18,7 @@ from workbench.ui.widgets.templates import render
 
 
 def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an_id() -> None:
-    pill = {"name": "a", "hint": "h", "on": True, "press": '"><b>'}
+    pill = {"name": "a", "hint": "h", "on": True, "style": "pill", "press": '"><b>'}
     html = render("studio_tools", rows=[[pill, {**pill, "press": ""}]])
     assert html.count('tabindex="0" role="button" aria-pressed="true"') == 1
     assert html.count('aria-disabled="true"') == 1 and "<b>" not in html

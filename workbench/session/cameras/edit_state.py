@@ -18,19 +18,23 @@ from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.view import Change, EditRequest, EditState
 
 SENTENCES: dict[Change, tuple[str, str, str]] = {
-    "edit": ("This changes {old} in {file}.", "{old} is written to {file}, and the new env has it.", ""),
-    "add": ("This adds {new} to {file}.", "{old} is in {file}, and the env has it.", "{new} was not added."),
+    "edit": ("This changes {old} in {file}.", "{old}: saved to {file} and verified.", ""),
+    "add": ("This adds {new} to {file}.", "{old}: added to {file} and verified.", "{new} was not added."),
     "duplicate": (
         "This adds {new}, a copy of {old}, to {file}.",
-        "{new} is in {file}, a copy of {old}.",
+        "{new}, a copy of {old}: added to {file} and verified.",
         "{new} was not added.",
     ),
     "rename": (
-        "This makes {old} {new} in {file}.",
-        "{old} is {new} in {file} now.",
+        "This renames {old} to {new} in {file}.",
+        "{old}: renamed to {new} in {file} and verified.",
         "{old} was not renamed.",
     ),
-    "remove": ("This takes {old} out of {file}.", "{old} is no longer in {file}.", "{old} was not removed."),
+    "remove": (
+        "This removes {old} from {file}.",
+        "{old}: removed from {file} and verified.",
+        "{old} was not removed.",
+    ),
 }
 """By change: what it would do, what it did, and the message when another plan replaces it."""
 PLANNED, DONE, LEFT = range(3)
@@ -62,7 +66,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, r
         elif not task.source_files:
             where = "" if task.file is None else f" ({task.file})"
             raise RefusedEdit(
-                f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
+                f"{task.class_name} is installed{where}, and installed files are not edited: copy the task into a "
                 "folder of your own",
                 text,
             )
@@ -146,7 +150,7 @@ def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, EditState]:
         return None, EditState("refused", message=f"Not copied: {reason}.")
     named = ", ".join(f"{new} for {old}" for old, new in made.ids)
     ids = f" It registers {named}." if named else ""
-    return made.file, EditState(message=f"The task is copied to {made.file}, which is being opened.{ids}")
+    return made.file, EditState(message=f"The task was copied to {made.file}; opening it.{ids}")
 
 
 def _own_edit(
@@ -185,10 +189,6 @@ def _texts(task: TaskDescription) -> dict[str, str]:
             reason = error.msg if isinstance(error, SyntaxError) else error.strerror
             raise RefusedEdit(f"{path} cannot be read: {reason}") from error
     return texts
-
-
-def restored_text(edit: SourceEdit) -> str:
-    return "is as it was" if len(edit.changes) == 1 else "are as they were"
 
 
 def mismatch(

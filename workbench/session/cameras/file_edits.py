@@ -15,7 +15,7 @@ from workbench.authoring.camera_source.disk import SourceEdit, apply, revert
 from workbench.authoring.source.text import RefusedEdit, plain_line_ends
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskDescription
-from workbench.session.cameras.edit_state import DONE, LEFT, change_text, copy, mismatch, plan, restored_text
+from workbench.session.cameras.edit_state import DONE, LEFT, change_text, copy, mismatch, plan
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.view import EditRequest, EditStage, EditState
 from workbench.session.history.history import ShownMoment
@@ -145,12 +145,12 @@ class FileEdits:
 
     def write(self) -> None:
         """Write the planned edit; the file is reloaded, and the new camera compared with the edit."""
-        message = "Written to {file}, being loaded now."
+        message = "Saved to {file}; loading it."
         self._run_later(self._change_file, ("planned",), apply, "written", message)
 
     def undo_write(self) -> None:
         """Take the newest edit out of the file."""
-        message = "{file} {was} before, being loaded now."
+        message = "Edit reverted in {file}; loading it."
         self._run_later(self._change_file, IN_FILE, revert, "undone", message)
 
     def _change_file(
@@ -170,9 +170,7 @@ class FileEdits:
                 kept = "refused" if stage == "written" else view.stage
                 self.view = replace(view, stage=kept, message=f"Not done: {refused.reason}.")
             else:
-                self._set_state(
-                    message.format(file=view.edit.names, was=restored_text(view.edit)), stage, loading=True
-                )
+                self._set_state(message.format(file=view.edit.names), stage, loading=True)
                 if stage == "undone":
                     del self._done[-1:]
                 else:
@@ -229,13 +227,13 @@ class FileEdits:
         went_back = self._update_placements(request, None if had is None else had.settings)
         if self.view.stage == "undone":
             back = (
-                f" {request.key[1]} is where the file places it; Undo puts it where you placed it."
+                f" {request.key[1]} is where the file places it; Undo restores your placement."
                 if went_back
                 else ""
             )
-            self._set_state(f"{edit.names} {restored_text(edit)} before.{back}", "undone")
+            self._set_state(f"Edit reverted in {edit.names}.{back}", "undone")
         elif wrong := mismatch(request, infos, edit.settings):
-            more = "Take the change back, or look at what else in the task places this camera."
+            more = "Revert the change, or look for what else in the task places this camera."
             self._set_state(f"{wrong} {more}", "mismatch")
         else:
             self._set_state(change_text(request, DONE, edit.names), "checked")
@@ -297,9 +295,9 @@ class FileEdits:
             self.view = EditState("refused", self.view.request, message=why)
         edit, undone = self.view.edit, self.view.stage == "undone"
         if self.view.loading and edit is not None:
-            hint = "the change is in it; take it back if that is the reason"
+            hint = "it has the change; revert it if that is the reason"
             if undone:
-                hint = "the camera's change is out of it"
+                hint = "the camera's change was reverted"
             does = "does" if len(edit.changes) == 1 else "do"
             self._set_state(f"{edit.names} {does} not load: {hint}.", self.view.stage, loading=not undone)
 

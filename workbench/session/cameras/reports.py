@@ -194,7 +194,7 @@ class CameraReports:
             return
         key = camera.key
         space = SearchSpace(tuple(objects), low, high, camera.now, key[0], mount=camera.info.mount)
-        what = f"searching places for {key[1]}"
+        what = f"searching placements for {key[1]}"
 
         def work(job: Job) -> None:
             def search() -> tuple[OfferedPlacement, ...]:
@@ -210,7 +210,7 @@ class CameraReports:
 
             self._update(suggestions=(), suggestions_of=key)
             found = self._background.in_turns(job, search)
-            problem = "" if found else f"no place in that box sees {' and '.join(objects)} in any env."
+            problem = "" if found else f"no placement in that box sees {' and '.join(objects)} in any env."
             self._update(suggestions=found, problem=problem)
 
         self._background_lane.start(what, work)
@@ -252,7 +252,7 @@ class CameraReports:
                 picture = self._draw(job, moment, DrawCamera(key, None, env))
                 self._update(sheet=(*self.results.sheet, picture))
 
-        self._live_lane.start(f"taking pictures by {key[1]} of all envs", work)
+        self._live_lane.start(f"taking pictures of all envs with {key[1]}", work)
 
     def pick(self, u: float, v: float) -> None:
         """Probe a pixel of the selected camera: 0, 0 is the upper left corner of the picture, 1, 1 the lower right one."""
@@ -265,7 +265,7 @@ class CameraReports:
             picture = self._draw(job, moment, question)
             self._update(picked=pick_pixel(camera.info, picture, u, v, task.segmentation))
 
-        self._live_lane.start("looking closely", work)
+        self._live_lane.start("refining", work)
 
     def stop(self) -> None:
         """Cancel all jobs; results so far stay."""

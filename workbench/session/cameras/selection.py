@@ -150,7 +150,7 @@ class Placements:
             return False
         self.placed.pop(key, None)
         if differences(written, in_file):
-            self._add_step(Step(key, written, in_file, f"took back the change of {key[1]}"))
+            self._add_step(Step(key, written, in_file, f"reverted the change of {key[1]}"))
         return True
 
     def rename(self, key: CameraKey, new: CameraKey) -> None:
@@ -187,7 +187,7 @@ class Placements:
             elif key not in own and key in before and differences(before[key], in_file[key]):
                 del self.placed[key]
                 dropped.append(key)
-                label = f"took {key[1]} from the file"
+                label = f"reloaded {key[1]} from the file"
                 self._done.append(Step(key, placed, in_file[key], label))
         for steps in (self._done, self._undone):
             steps[:] = [step for step in steps if step.key in in_file]
@@ -203,8 +203,8 @@ class Placements:
 
 _STEP_LABELS = (
     ({"position"}, "moved {}"),
-    ({"orientation"}, "turned {}"),
-    ({"position", "orientation"}, "moved and turned {}"),
+    ({"orientation"}, "rotated {}"),
+    ({"position", "orientation"}, "moved and rotated {}"),
     ({"fov", "intrinsic"}, "changed the lens of {}"),
     ({"near", "far"}, "changed near and far of {}"),
     ({"width", "height", "intrinsic"}, "changed the size of {}"),
@@ -280,7 +280,7 @@ class StudioCameras:
         if self.task is not None and self.task.backend == "gpu":
             return NOT_ON_THE_GPU
         if info.settings is None:
-            return "its pose is no pose, or its lens differs between envs, so one placement cannot be its"
+            return "its pose is invalid, or its lens differs between envs, so it cannot have one placement"
         return None
 
     def mount_pose(self, info: CameraInfo) -> NDArray[np.float32] | None:

@@ -216,11 +216,13 @@ class CameraStudio:
         chosen = [pose for pose in found if info.name in pose.label] or list(found)
         if len(chosen) > 1:
             labels = ", ".join(pose.label for pose in chosen)
-            raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
+            raise ValueError(f"it holds several poses ({labels}): paste only the one you mean")
         pose = calibration_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
         if chosen[0].stated is not None and info.mount is not None:
             if mount is None:
-                raise ValueError(f"where {info.mount} is, on which {info.name} rides, is not known yet")
+                raise ValueError(
+                    f"the pose of {info.mount}, on which {info.name} is mounted, is not known yet"
+                )
             pose = relative_to(mount, pose)  # ours is of the env's frame
         self.place(key, with_pose(now, pose))
 
@@ -281,8 +283,8 @@ class CameraStudio:
                 names = " and ".join(key[1] for key in dropped)
                 one = len(dropped) == 1
                 self._cameras.problem = (
-                    f"{names} {'was' if one else 'were'} changed in the file, so {'it is' if one else 'they are'} "
-                    "where the file says; Undo brings your placement back."
+                    f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
+                    "it; Undo restores your placement."
                 )
             self._cameras.select_again()
             self._serial += 1

@@ -325,7 +325,7 @@ class Background(Asker):
 
     def _why_gone(self, error: EOFError) -> str:
         if isinstance(error, Unreadable):
-            return f"sent what cannot be read ({error}) and was ended"
+            return f"sent unreadable data ({error}) and was ended"
         return describe_exit(None if self._process is None else self._process.exit_code())
 
 
@@ -339,4 +339,4 @@ def _unpacked(packed: bytes, kind: Any) -> Any:
     try:
         return Unpacker().unpack(packed, kind)
     except Unreadable as error:
-        raise JobFailed(f"the worker answered with what cannot be read ({error})") from error
+        raise JobFailed(f"the worker answered with unreadable data ({error})") from error

@@ -321,7 +321,7 @@ class Supervisor:
         try:
             self._serve(worker, state)
         except Unreadable as error:
-            state.why = f"sent what cannot be read ({error}) and was ended"
+            state.why = f"sent unreadable data ({error}) and was ended"
             worker.kill()
         except EOFError:
             try:
@@ -331,9 +331,7 @@ class Supervisor:
         except Exception as error:
             # An event that does not fit the state is treated as one that cannot be read.
             report_failure("What the worker sent could not be taken, so it is ended", error)
-            state.why = (
-                f"sent what cannot be used ({type(error).__name__}: {shorten(str(error))}) and was ended"
-            )
+            state.why = f"sent unusable data ({type(error).__name__}: {shorten(str(error))}) and was ended"
             worker.kill()
         self._on_busy(None)
         if self._closing:
@@ -388,7 +386,7 @@ class Supervisor:
         now = time.monotonic()
         beat = worker.beat()
         if self._replace_asked:
-            state.why = "was ended by hand"
+            state.why = "was stopped by hand"
             self._end(worker, state)
         if not worker.main_thread_ended():
             state.headless_since = None

@@ -77,7 +77,7 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
         before: the one before that.
     """
     if not len(history):
-        return "nothing was seen yet"
+        return "there is no step yet"
     found = _episode_at(history, env, history.last if serial is None else serial)
     if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
         found = _episode_before(history, env, found) or found
@@ -97,12 +97,12 @@ def _episode_before(history: History, env: int, episode: PastEpisode) -> PastEpi
 def _episode_at(history: History, env: int, serial: int) -> PastEpisode | str:
     moments = history.episode(env, serial)
     if not moments:
-        return "nothing was seen yet"
+        return "there is no step yet"
     first, of = moments[0]
     if not first.jumped[of] or first.step.elapsed_steps[of] != 0:
         return "its beginning is no longer in memory"
     if any(moment.snapshot is None for moment, _ in moments):
-        return "the state of this task cannot be kept, so what was seen cannot be put back"
+        return "the state of this task cannot be kept, so it cannot be replayed"
     for count, (moment, at) in enumerate(moments):
         step = moment.as_recorded
         if count > 0 and (step.terminated[at] or step.truncated[at]):
@@ -149,7 +149,7 @@ class PastSaver:
     def stop(self) -> None:
         """Cancel the running job; it writes no file."""
         self._job_lane.stop()
-        self._report("stopped; nothing was kept")
+        self._report("stopped; nothing was saved")
 
     def refuse(self, why: str) -> None:
         """Report why nothing can be recorded."""
@@ -177,7 +177,7 @@ class PastSaver:
                     job.report(len(seeds), len(what.episodes), "trying the seeds")
                     seeds[episode.env] = self._verified_seed(job, episode)
             while moments:
-                job.report(total - len(moments), total, "drawing it again")
+                job.report(total - len(moments), total, "rendering it again")
                 moment, rows = moments[0]
                 question = CaptureMoment(pickle.dumps(moment.snapshot), tuple(rows), what.task.can_render)
                 captured = self._process.ask(job.check, question)
@@ -198,7 +198,7 @@ class PastSaver:
             for episode in writers.values():
                 episode.writer.discard()
             if isinstance(error, RecordingError | ValueError):
-                raise JobFailed(f"it could not be kept: {error}") from error
+                raise JobFailed(f"it could not be saved: {error}") from error
             raise
         job.report(1, 1, "writing the files")
         made = [self._finisher.finish(episode) for episode in writers.values()]
@@ -208,7 +208,7 @@ class PastSaver:
         steps = sum(episode.steps for episode in what.episodes)
         unfinished = sum(not episode.ended for episode in what.episodes)
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
-        kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
+        kept = f"saved {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
         self._report(kept + _unfinished_text(unfinished, len(made)) + _lost_seed_text(lost, len(made)))
 
     def _verified_seed(self, job: Job, episode: PastEpisode) -> int:
@@ -227,7 +227,7 @@ class PastSaver:
         why, problem = str(failure), failure.problem
         if problem is not None:
             where = "" if problem.line is None else f" (line {problem.line})"
-            why = f"it could not be drawn again: {problem.message}{where}"
+            why = f"it could not be rendered again: {problem.message}{where}"
         if not job.stopped:
             self._report(why, failed=True)
 

@@ -52,7 +52,7 @@ class RescoredCurve:
     """One number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
-    """(T,) as `Curves.tick`."""
+    """(T,) as `Curves.serial`."""
     serial: NDArray[np.int64]
     """(T,) serials of the moments."""
     old: NDArray[np.float32]
@@ -305,7 +305,7 @@ class PastRescorer:
                 done=done,
                 steps=done,
                 seconds=self.rescoring.view.seconds + seconds,
-                warnings=tuple(f"not put back: {what}: {why}" for what, why in missed.items()),
+                warnings=tuple(f"not restored: {what}: {why}" for what, why in missed.items()),
             )
             if answer.problem is not None:
                 raise JobFailed("the new code raised", answer.problem)

@@ -15,7 +15,7 @@ from workbench.jobs.verdict import FLAGS, Verdict
 from workbench.machine.text import length, mean_text, number_text
 from workbench.recording.episode.row import Source
 
-PUT_IN = " With the recorded states put in at every step nothing drifts."
+PUT_IN = " With the recorded states restored at every step, nothing drifts."
 """Advice about drift from a recording."""
 _MOST_NAMED = 4
 
@@ -34,8 +34,8 @@ def change_text(verdict: Verdict[Any]) -> str:
             return _reward_change(verdict) + at
         return f"{' and '.join(name for name in FLAGS if name in verdict.differing)} at other steps{at}"
     if verdict.differing:
-        return f"as it was, but for {', '.join(verdict.differing[:3])}"
-    return "as it was"
+        return f"unchanged, except {', '.join(verdict.differing[:3])}"
+    return "unchanged"
 
 
 def _flag_text(name: str, was: int | None, now: int | None) -> str:
@@ -83,7 +83,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     differing, yet = sum(verdict.differs for verdict in rescored), " so far" * so_far
     if differing:
         return f"{differing} of {counted(len(rescored), 'episode')} {'differs' if differing == 1 else 'differ'}{yet}."
-    sentence = f"Nothing differs in {counted(len(rescored), 'episode')}{yet}: reward, success and fail are as they were."
+    sentence = f"Nothing differs in {counted(len(rescored), 'episode')}{yet}: reward, success and fail are unchanged."
     named = sorted({*others, *(name for verdict in rescored for name in verdict.differing)})[:_MOST_NAMED]
     return sentence + (f" Other entries differ: {', '.join(named)}." if named else "")
 

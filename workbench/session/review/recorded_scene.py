@@ -94,5 +94,5 @@ class SceneProcess:
         except JobFailed as failure:
             if process.pid is not None:
                 raise SceneError(str(failure)) from failure
-            why = f"The scene of {info.task} could not be made ({failure}), so there are numbers and curves only."
+            why = f"The scene of {info.task} could not be made ({failure}), so there are only numbers and curves."
             raise SceneError(why) from failure

@@ -140,12 +140,14 @@ class Review:
         problems: list[str] = []
         if missing:
             problems.append(
-                "A recording that was asked for is not in the folder any more."
+                "A requested recording is no longer in the folder."
                 if missing == 1
-                else f"{missing} recordings that were asked for are not in the folder any more."
+                else f"{missing} requested recordings are no longer in the folder."
             )
         if len(wanted) > MOST_OPEN:
-            problems.append(f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} are.")
+            problems.append(
+                f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} were opened."
+            )
             wanted = wanted[:MOST_OPEN]
         with self._changed:
             self._opening += 1
@@ -283,7 +285,7 @@ class Review:
                     continue
                 episode, message = (
                     _shared(made[0], shapes),
-                    f"Not put back: {'; '.join(made[1])}." if made[1] else "",
+                    f"Not restored: {'; '.join(made[1])}." if made[1] else "",
                 )
                 self._replace_opened(
                     number,
@@ -397,7 +399,7 @@ class Review:
         """
         with self._changed:
             if how not in self._view.alignments:
-                raise ValueError("That is not one of the moments to align at.")
+                raise ValueError("The recordings cannot be aligned at that.")
             self._advance()
             view = self._view
             kept = view.states[view.selected] if view.opened else None

@@ -131,10 +131,10 @@ def _of_simulation(report: RestoreReport) -> dict[str, str]:
 def _how(request: Restore, replayed: int, put: int, steps: int) -> str:
     if not replayed or steps == 0:
         return ""
-    again = f"{steps} steps were made again, and " if steps > 1 else "a step was made again, and "
+    again = f"{steps} steps were replayed, and " if steps > 1 else "one step was replayed, and "
     if not put:
         return f"{again}every body is where it was, to the last bit."
-    return f"{again}in {replayed} of {replayed + put} envs every body is where it was, to the last bit; the others were put there."
+    return f"{again}in {replayed} of {replayed + put} envs every body is where it was, to the last bit; the others were placed there."
 
 
 def going_back_text(done: int, total: int) -> str:

@@ -78,7 +78,7 @@ def make(request: MakeScene) -> TaskEnv:
             loaded = load_task(RecordedTask(request.task))  # an id that is registered, never a path
         except TaskError as error:
             raise CannotAnswer(
-                f"There is no env {request.task} here to make the scene with, so there are numbers and curves only. If it "
+                f"There is no env {request.task} here to make the scene with, so there are only numbers and curves. If it "
                 "is yours, say which file it is in (workbench review --task FILE), or which package registers it "
                 "(workbench review --import PACKAGE)."
             ) from error

@@ -155,11 +155,11 @@ def _what_changed(
     if running is None or before is None:
         return Change("rebuilt", "")
     if not loaded.followed:
-        return Change("rebuilt", "it was asked for")
+        return Change("rebuilt", "it was requested")
     if loaded.file is not None and before.file != loaded.file:
         return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.chosen}")
     if before.chosen != loaded.chosen:
-        return Change("rebuilt", f"{loaded.chosen} is another task than {before.chosen}")
+        return Change("rebuilt", f"{loaded.chosen} is a different task from {before.chosen}")
     if before.env_id != loaded.env_id:
         return Change("rebuilt", _registration_text(before, loaded))
     if changed := changed_options(running.request.options, request.options):
@@ -172,7 +172,7 @@ def _what_changed(
         return Change("rebuilt", f"a robot is part of the scene ({change.reason})")
     if request.level in ("auto", change.level):
         return change
-    reason = f"{request.level} was asked for"
+    reason = f"{request.level} was requested"
     if request.level != "rebuilt":
         reason += f" ({change.level} would have been chosen: {change.reason})"
     # A level that was not found safe is tried as if every hook had changed.
@@ -184,7 +184,7 @@ def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
     """How the class's registered id changed; an unregistered class has its own name as id."""
     if loaded.env_id == loaded.class_name:
         lost = "" if before.max_episode_steps is None else ", and so has no time limit"
-        return f"{loaded.chosen} is not registered as {before.env_id} any more{lost}"
+        return f"{loaded.chosen} is no longer registered as {before.env_id}{lost}"
     if before.env_id == before.class_name:
         return f"{loaded.chosen} is registered as {loaded.env_id} now"
     return f"{loaded.chosen} is registered as {loaded.env_id} now, and not as {before.env_id}"

@@ -114,7 +114,7 @@ class StepEvents:
             # A task may keep anything on itself: objects that cannot be pickled must not end a task that works.
             self._packer = self.moment = None
             print(
-                f"The past of this task can be looked at, but not gone back to: {type(error).__name__}: {error}",
+                f"The history of this task can be viewed, but not restored: {type(error).__name__}: {error}",
                 file=sys.stderr,
             )
             return nothing

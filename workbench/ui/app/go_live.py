@@ -74,12 +74,12 @@ class _Way:
         """What it waits for, for the page."""
         task = self.info.task
         if self.session is None:
-            return f"asking whether the code of {task} may run"
+            return f"waiting for permission to run the code of {task}"
         view = self.session.view()
         if view.task is None:
             doing = f"loading {task} at step {self.state}"
         else:
-            doing = f"putting {task} into step {self.state}"
+            doing = f"restoring {task} at step {self.state}"
         return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
 
 
@@ -250,7 +250,7 @@ class GoLive:
         self._own = None
 
     def _say(self, text: str) -> None:
-        tell_all(self._place.server, "This recording cannot be gone into", text, "red")
+        tell_all(self._place.server, "This recording cannot be continued", text, "red")
 
 
 class GoLivePart(PagePart[ReviewView]):
@@ -268,17 +268,17 @@ class GoLivePart(PagePart[ReviewView]):
                 "Code",
                 (TODAYS, RECORDED),
                 initial_value=RECORDED if go_live.recorded_source else TODAYS,
-                hint="Today's code of the task, or the recorded text, opened from a folder that goes when you are done",
+                hint="The current code of the task, or the recorded code, opened from a temporary folder",
             )
             self._besides = gui.add_html("")
             self._envs = gui.add_dropdown(
                 "Into",
                 (ONE, ALL),
                 initial_value=ALL if go_live.everywhere else ONE,
-                hint="Which envs are put into the recorded state",
+                hint="Which envs get the recorded state",
             )
             self._home = gui.add_button(
-                "Back to the task opened first", icon=viser.Icon.ARROW_BACK_UP, visible=False
+                "Back to the first task", icon=viser.Icon.ARROW_BACK_UP, visible=False
             )
         self._code.on_update(lambda _: self._chosen())
         self._envs.on_update(lambda _: self._chosen())

@@ -100,7 +100,7 @@ class TrustDialog:
                     # The first button has the focus: Enter must not run anything.
                     self._add_button(DO_NOT, None, viser.Icon.X, pending, Consent.NO)
                     if question.more:
-                        label = f"Nor the {question.more} more that are asked about"
+                        label = f"Don't run the other {question.more} either"
                         self._add_button(label, "gray", viser.Icon.X, pending, Consent.NONE)
                     self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Consent.ONCE)
                     self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Consent.ALWAYS)

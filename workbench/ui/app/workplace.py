@@ -24,6 +24,7 @@ from workbench.session.review.review import Review
 from workbench.session.tasks.catalogue import Catalogue
 from workbench.session.tasks.recents import RecentTasks
 from workbench.session.tasks.registered import RegisteredTasks
+from workbench.ui.app import help_pages
 from workbench.ui.app.go_live import GoLive, MakeSession
 from workbench.ui.app.open_task import Choices, OpenTask
 from workbench.ui.app.review_page import ReviewPage
@@ -45,6 +46,8 @@ ENOUGH_MEMORY = 4 << 30
 """Bytes that must be free for pictures of tasks to be drawn beside an open one."""
 
 Which = Literal["start", "live", "review"]
+HELP = Command("Help", lambda: None)
+"""The browser itself opens the page (``web_assets/help.js``)."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class Workplace:
         tasks: Task files that may define the envs of foreign recordings.
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
+        editor: Address of a line in the author's editor, as `parse_editor` gives it.
         choices: What the list of tasks offers, and how a chosen one is opened; None for no recent ones and `make_session`.
     """
 
@@ -80,26 +84,31 @@ class Workplace:
         tasks: tuple[Path, ...] = (),
         trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
+        editor: str = "",
         choices: Choices | None = None,
     ) -> None:
         self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
-        self._imports, self._on_notice = base.imports, on_notice
+        self._imports, self._on_notice, self._editor = base.imports, on_notice, editor
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._recovering: threading.Thread | None = None
-        self.commands: tuple[Command, ...] = ()
+        self.commands: tuple[Command, ...] = (HELP,)
         """In the palette of both pages; set before the first page is shown."""
         self.session = session
         """Shown by the live page when it is next built."""
         self.home = session
         """The session that a person opened, by command or from the list. `session` is another one while a recording of
         another task is continued."""
+        self.newest_opened = False
+        """The review has begun with the newest recording; it does so once."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
         self.go_live = GoLive(self, make_session, clearances, base)
         self.rescorer, self.rescore_choices = Rescorer(clearances, base), RescoreChoices()
         self.sharing = Sharing(gated_server)
+        gated_server.add_route(help_pages.ADDRESS, help_pages.reply, help_pages.HEADERS)
         self.stage = Stage(self.server)
+        self.pages = Pages(self.server, self.stage, self._page)
         if choices is None:
             open_session = lambda task, options, kept: make_session(task, options)  # noqa: E731
             choices = Choices(RecentTasks(), open_session, base)
@@ -107,7 +116,6 @@ class Workplace:
         catalogue = Catalogue(Path.cwd(), recordings, choices.recents, registered, choices.options)
         gated_server.add_route(PICTURES, picture_route(catalogue), {"Cache-Control": "private, max-age=3600"})
         self.open_task = OpenTask(self, choices.open_session, catalogue, clearances)
-        self.pages = Pages(self.server, self.stage, self._page)
 
     @property
     def shelf(self) -> Shelf:
@@ -135,10 +143,8 @@ class Workplace:
             self._on_notice(str(error))
             return
         if recovered:
-            what = "An episode that was" if len(recovered) == 1 else f"{len(recovered)} episodes that were"
-            shelf.review.add_problem(
-                f"{what} left half written by a program that was killed can be seen again."
-            )
+            what = "An episode" if len(recovered) == 1 else f"{len(recovered)} episodes"
+            shelf.review.add_problem(f"{what} left half written by a killed program is back in the library.")
             self._on_notice(recovered_text(recovered))
             shelf.library.request_scan()
 
@@ -182,9 +188,15 @@ class Workplace:
         from workbench.ui.app.live_page import Page
 
         assert self.session is not None, "the live page is shown with its session"
-        review = lambda: self.pages.show("review")  # noqa: E731
         return Page(
-            self.server, self.session, dark, review, self.stage, self.commands, chooser=self.open_task
+            self.server,
+            self.session,
+            dark,
+            lambda: self.pages.show("review"),
+            self.stage,
+            self.commands,
+            editor=self._editor,
+            chooser=self.open_task,
         )
 
 

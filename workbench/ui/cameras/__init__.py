@@ -1,1 +1,1 @@
-"""The Cameras and Studio tabs, and cameras in the 3-D view."""
+"""The Cameras and Studio tabs, and cameras in the 3D view."""

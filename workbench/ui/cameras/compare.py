@@ -17,7 +17,7 @@ from workbench.ui.widgets.inputs import refusals_told
 from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
 
-FILE, KEPT = "as in the file", "as kept (A)"
+FILE, KEPT = "as in the file", "saved as A"
 LARGEST = 256
 """Pixels along the longer side of each picture."""
 
@@ -33,7 +33,7 @@ class CameraCompare:
             self._other = server.gui.add_dropdown(
                 "Now, with",
                 (FILE, KEPT),
-                hint="The placement to compare with the camera's present one.",
+                hint="The placement to compare with the camera's current one.",
             )
             self._keep = server.gui.add_button(
                 "Keep this placement as A",
@@ -41,10 +41,12 @@ class CameraCompare:
                 color="gray",
                 hint="To compare it later, or return to it.",
             )
-            self._compare = server.gui.add_button("Show side by side", icon=viser.Icon.COLUMNS_2)
+            self._compare = server.gui.add_button(
+                "Show side by side", icon=viser.Icon.COLUMNS_2, color="gray"
+            )
             self._pair = JobResult(server, session)
             self._take = server.gui.add_button(
-                "Place it as A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+                "Return to A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
             )
         self._keep.on_click(lambda _: self._keep_now())
         self._compare.on_click(self._ask)
@@ -72,7 +74,7 @@ class CameraCompare:
         with refusals_told(event.client):
             if choice == KEPT and camera.key not in self._kept:
                 raise ValueError(
-                    "Nothing is kept of this camera yet: press Keep this placement as A, then move it."
+                    "No placement of this camera is kept yet: click Keep this placement as A, then move the camera."
                 )
             other = camera.info.settings if choice == FILE else self._kept[camera.key]
             self._asked = (camera.key, camera.now, other, choice)

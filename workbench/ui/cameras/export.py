@@ -60,17 +60,17 @@ class CameraExport:
             self._convention = server.gui.add_dropdown(
                 "Convention",
                 tuple(CONVENTIONS),
-                hint="What the camera's own axes are called: of what is shown, and of what is pasted.",
+                hint="The convention of the camera's own axes, for what is shown and what is pasted.",
             )
             self._direction = server.gui.add_dropdown(
                 "Direction",
                 tuple(DIRECTIONS),
-                hint="OpenCV's extrinsic goes from world to camera; a pose goes from camera to world.",
+                hint="OpenCV's extrinsic maps world to camera; a pose maps camera to world.",
             )
             self._html = server.gui.add_html("")
             self._form = server.gui.add_dropdown("File", tuple(FORMS))
             self._which = server.gui.add_dropdown("Of", (THIS, ALL))
-            self._download = server.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
+            self._download = server.gui.add_button("Download", icon=viser.Icon.DOWNLOAD, color="gray")
             self._text = server.gui.add_text(
                 "Calibration",
                 "",
@@ -80,12 +80,12 @@ class CameraExport:
             )
             limit_text(self._text, LONGEST)
             self._unit = server.gui.add_dropdown(
-                "Its lengths in",
+                "Units",
                 tuple(UNITS),
-                hint="Of what is pasted. What is shown and downloaded, and our own JSON, is in metres.",
+                hint="Units of what is pasted. What is shown or downloaded, and our own JSON, is in metres.",
             )
             self._import = server.gui.add_button(
-                "Place the camera by it", icon=viser.Icon.FILE_IMPORT, color="gray"
+                "Apply to the camera", icon=viser.Icon.FILE_IMPORT, color="gray"
             )
         self._download.on_click(self._on_download)
         self._import.on_click(self._on_import)
@@ -121,7 +121,7 @@ class CameraExport:
             self._session.studio.import_pose(camera.key, text, direction, convention, metres)
             event.client.add_notification(
                 "Placed",
-                "The pose was taken. A lens that the text may hold was not: its matrix goes into Lens and picture.",
+                "The pose was applied. The lens, if the text has one, was not: its matrix goes into Lens and image.",
                 color="green",
                 auto_close_seconds=8.0,
             )

@@ -39,7 +39,7 @@ RPY, WXYZ, AXES = "roll, pitch, yaw", "quaternion wxyz", "forward and up"
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
 """Digits of the shown numbers."""
 FOV, INTRINSIC = "field of view", "intrinsic matrix"
-GOES_ALONG = "What it looks at goes along with the position. To keep it: Place, eye and target."
+GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
 STAYS = "Each moves alone: the camera keeps looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 """The shader packs of ManiSkill 3."""
@@ -63,12 +63,12 @@ class CameraNumbers:
 
     def __init__(self, server: viser.ViserServer, placing: Placing, look_at: Callable[[], bool]) -> None:
         self._placing, self._look_at, self._gui = placing, look_at, server.gui
-        with self._gui.add_folder("Where it is") as where:
+        with self._gui.add_folder("Pose") as where:
             # Hides the arrows of the fields below: three numbers with four digits do not fit next to them.
             self._gui.add_html(render("tight"))
             self._build_points()
             self._build_orientation()
-        with self._gui.add_folder("Lens and picture", expand_by_default=False) as lens:
+        with self._gui.add_folder("Lens and image", expand_by_default=False) as lens:
             self._gui.add_html(render("tight"))
             self._build_lens()
             self._build_picture()
@@ -121,7 +121,7 @@ class CameraNumbers:
             "Position",
             lambda s: s.position,
             self._at,
-            hint="Of the eye, in metres. The arrow keys up and down change the number by a centimetre.",
+            hint="Position of the eye, in metres. The up and down keys change a number by a centimetre.",
         )
         self._target = self._field(
             "Looks at",
@@ -133,7 +133,7 @@ class CameraNumbers:
 
     def _build_orientation(self) -> None:
         self._orientation = self._gui.add_dropdown(
-            "Turned", (RPY, WXYZ, AXES), initial_value=RPY, hint="How its orientation is written below."
+            "Rotation", (RPY, WXYZ, AXES), initial_value=RPY, hint="How its rotation is written below."
         )
         self._rpy = self._field(
             "Degrees",
@@ -145,9 +145,7 @@ class CameraNumbers:
             "looks down, roll turns it clockwise.",
         )
         self._wxyz: Control[Any, Any] = Control(
-            self._gui.add_text(
-                "w x y z", "", hint="As sapien.Pose(q=...) has it: w first. It is brought to length 1."
-            ),
+            self._gui.add_text("w x y z", "", hint="As in sapien.Pose(q=...), w first. It is normalised."),
             read=_read_quaternion,
             send=lambda q: self._placing.change("quaternion", lambda s, _: _turned(s, q)),
             shown=lambda s: " ".join(f"{n:.{QUATERNION}f}" for n in rounded(s.quaternion, QUATERNION)),
@@ -176,9 +174,9 @@ class CameraNumbers:
             send=lambda said: self._placing.change("lens", lambda s, _: _with_lens(s, said)),
             shown=lambda s: FOV if s.intrinsic is None else INTRINSIC,
         )
-        vertical = "The vertical field of view."
+        vertical = "The vertical field of view, in degrees."
         self._degrees = self._field(
-            "Degrees high",
+            "Vertical fov",
             lambda s: [math.degrees(_fov(s))],
             lambda s, typed, _: _with_fov(s, math.radians(typed[0])),
             1,
@@ -241,7 +239,7 @@ class CameraNumbers:
                 "Shader",
                 SHADERS,
                 initial_value="minimal",
-                hint="minimal is what ManiSkill trains with; the rt ones trace rays, slowly.",
+                hint="minimal is what ManiSkill trains with; the rt shaders trace rays, slowly.",
             ),
             send=lambda name: self._placing.change("shader", lambda s, _: replace(s, shader_pack=name)),
             shown=lambda s: s.shader_pack,
@@ -324,7 +322,7 @@ def _with_size(settings: CameraSettings, typed: Numbers, frame: Frame) -> Camera
 
 def _with_range(settings: CameraSettings, typed: Numbers, frame: Frame) -> CameraSettings:
     if typed[0] >= typed[1]:
-        raise ValueError("What is near must be nearer than what is far.")
+        raise ValueError("Near must be less than far.")
     return replace(settings, near=typed[0], far=typed[1])
 
 
@@ -336,7 +334,7 @@ def _angles(settings: CameraSettings) -> list[float]:
 def _read_quaternion(text: str) -> Floats:
     words = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text)
     if len(words) != 4 or re.search(r"[^\d\s,;()\[\].eE+-]", text):
-        raise ValueError("A quaternion is four numbers, w first: 1 0 0 0 turns nothing.")
+        raise ValueError("A quaternion is four numbers, w first: 1 0 0 0 is no rotation.")
     return normalised([float(word) for word in words])
 
 

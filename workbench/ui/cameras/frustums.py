@@ -1,4 +1,4 @@
-"""The selected env's cameras in the 3-D view, each a frustum with its live picture."""
+"""The selected env's cameras in the 3D view, each a frustum with its live picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gizmos of the chosen camera in the 3-D view, and the page's view through that camera."""
+"""The gizmos of the chosen camera in the 3D view, and the page's view through that camera."""
 
 from __future__ import annotations
 
@@ -192,6 +192,8 @@ def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats)
 
 WIDEST = math.radians(150)
 """Widest field of view that the page can draw."""
+BAR = 48
+"""Pixels at the lower edge of the view that the folded timeline takes: the picture's border is above it."""
 BORDER_AT = 0.15
 """Metres in front of the eye: as near as the page draws, or bodies would hide it."""
 BORDER_COLOUR = (245, 159, 0)
@@ -289,7 +291,10 @@ class LookThrough:
         aspect = eye.image_width / eye.image_height if eye.image_height and eye.image_width else USUAL_ASPECT
         fov = vertical_fov(intrinsic_of(now), now.height)
         target = self._placing.frame(camera).point_to_view(target_of(now))
-        fov = min(fov_that_shows_all(fov, now.width / now.height, aspect), WIDEST)
+        fov = fov_that_shows_all(fov, now.width / now.height, aspect)
+        if eye.image_height > 4 * BAR:
+            fov = 2 * math.atan(math.tan(fov / 2) * eye.image_height / (eye.image_height - 2 * BAR))
+        fov = min(fov, WIDEST)
         _stand(client, pose[:3], target, UPRIGHT if level else up, fov)
 
     def _back(self, client: viser.ClientHandle) -> None:

@@ -26,7 +26,7 @@ from workbench.ui.widgets.templates import render
 PICTURE_PERIOD = 1 / 15
 """Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
 (measured: at 1,000 a second the page shows one in five seconds)."""
-KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
+KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 
 
 class CameraImage:
@@ -102,12 +102,12 @@ class CamerasPanel:
         self._cameras_serial = -1
         self._due = DrawDue(PICTURE_PERIOD, clock)
         self._asked: tuple[CameraRequest, ...] | None = None
-        self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
+        self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
         self._frustums = server.gui.add_checkbox(
-            "In the view",
+            "Show in 3D view",
             True,
             visible=False,
-            hint="Draw these cameras, with their pictures, in the 3-D view.",
+            hint="Draw these cameras, with their pictures, in the 3D view.",
         )
         self._folder = server.gui.add_folder(None)
 
@@ -323,7 +323,7 @@ MARK_SIZE = 0.05
 
 
 class CameraPick:
-    """An overlay on the picture, the result, and a mark at the point in the 3-D view.
+    """An overlay on the picture, the result, and a mark at the point in the 3D view.
 
     viser's pictures do not tell where they are pressed, so a pane of our own HTML lies over the picture (``.wb-pane`` in
     page.css). Make it in the container of the picture, directly after it.

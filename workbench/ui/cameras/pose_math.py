@@ -46,7 +46,7 @@ class Snap:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a camera's numbers (its mount's, or the env's), as seen in the 3-D view."""
+    """The frame of a camera's numbers (its mount's, or the env's), as seen in the 3D view."""
 
     mount: NDArray[np.float32] | None
     """(7,) of its link, in the env's frame; None for a camera that is not mounted."""

@@ -20,7 +20,7 @@ from workbench.ui.widgets.images import data_address
 from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import counted, render
 
-AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"
+AS_THEY_ARE, STEPS, FRESH = "all envs now", "this env's episode so far", "fresh resets"
 OVERS = (AS_THEY_ARE, STEPS, FRESH)
 MOST_PICTURES = 64
 """Pictures on the sheet, worst first."""
@@ -37,7 +37,7 @@ class CameraReportPanel:
             self._over = server.gui.add_dropdown(
                 "Over",
                 OVERS,
-                hint="The envs at the moment that is shown; the selected env's episode, step by step; or freshly reset "
+                hint="All envs at the shown moment; the selected env's episode, step by step; or freshly reset "
                 "envs with other seeds, in another process.",
             )
             self._steps = server.gui.add_number(
@@ -47,7 +47,7 @@ class CameraReportPanel:
                 max=MOST_STEPS,
                 step=1,
                 visible=False,
-                hint="How many of the episode's steps at most, evenly spread: each takes some pictures.",
+                hint="The most steps of the episode to measure, evenly spaced: each takes a few pictures.",
             )
             self._resets = server.gui.add_number(
                 "Resets",
@@ -56,9 +56,11 @@ class CameraReportPanel:
                 max=MOST_SEEDS,
                 step=1,
                 visible=False,
-                hint="How many, each with a seed of its own.",
+                hint="How many, each with its own seed.",
             )
-            self._measure = server.gui.add_button("Measure this camera", icon=viser.Icon.CHECKLIST)
+            self._measure = server.gui.add_button(
+                "Measure this camera", icon=viser.Icon.CHECKLIST, color="gray"
+            )
             self._report = JobResult(server, session)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
@@ -144,14 +146,12 @@ class CameraReportPanel:
                 }
             )
         count = len(report.envs)
-        over = (
-            counted(count, "fresh reset") if results.report_seeds else f"{counted(count, 'env')} as they are"
-        )
+        over = counted(count, "fresh reset") if results.report_seeds else f"{counted(count, 'env')} now"
         unit = "envs"
         if moments:
             span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
             over, unit = (
-                f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; press a step to go there",
+                f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; click a step to go there",
                 "steps",
             )
         width, height = report.measured_size
@@ -204,7 +204,7 @@ class CameraReportPanel:
             for picture in sheet[:MOST_PICTURES]
             if picture.rgb is not None
         ]
-        note = ("worst first, " if report is not None else "") + "press one to select its env"
+        note = ("worst first, " if report is not None else "") + "click one to select its env"
         if len(sheet) > MOST_PICTURES:
             note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
         return render("camera_sheet", cells=cells, note=note, new=new)
@@ -283,7 +283,7 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
         if found.present < len(report.envs):
             notes.append(f"in {found.present} of {len(report.envs)} {unit}")
         if found.covered > MOSTLY_HIDDEN:
-            notes.append(f"{percent(found.covered)} behind other things")
+            notes.append(f"{percent(found.covered)} behind other objects")
         rows.append(
             {
                 "name": thing.name,
@@ -304,16 +304,16 @@ def headline(report: CameraReport, unit: str = "envs") -> str:
     """The worst finding in one sentence; `unit` as in `object_rows`."""
     wanted = [thing for thing in report.wanted_objects() if thing.present.any()]
     if not wanted:
-        return f"There is no object to be seen in these {unit}."
+        return f"No object is visible in these {unit}."
     lacking = {thing.name: int((thing.present & (thing.pixels == 0)).sum()) for thing in wanted}
     worst = max(lacking, key=lambda name: lacking[name])
     if lacking[worst]:
-        return f"{worst} is not seen in {lacking[worst]} of {len(report.envs)} {unit}."
+        return f"{worst} is not visible in {lacking[worst]} of {len(report.envs)} {unit}."
     cut = {thing.name: int((thing.present & thing.cut).sum()) for thing in wanted}
     worst = max(cut, key=lambda name: cut[name])
     if cut[worst]:
-        return f"Everything is seen; the border cuts {worst} in {cut[worst]} of {len(report.envs)} {unit}."
-    return "Everything is seen, and nothing is cut."
+        return f"Everything is visible; {worst} is cut by the border in {cut[worst]} of {len(report.envs)} {unit}."
+    return "Everything is visible, and nothing is cut."
 
 
 def env_words(report: CameraReport, position: int) -> str:
@@ -333,7 +333,7 @@ def env_words(report: CameraReport, position: int) -> str:
         return f"{thing.name} {percent(hidden)} hidden"
     covered = float(thing.covered_share[position])
     if covered > MOSTLY_HIDDEN:
-        return f"{thing.name} {percent(covered)} behind things"
+        return f"{thing.name} {percent(covered)} behind objects"
     if thing.cut[position]:
         return f"{thing.name} cut"
     pixels = f"{thing.name} {thing.pixels[position]:.0f} px"

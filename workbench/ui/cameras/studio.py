@@ -37,21 +37,22 @@ from workbench.ui.widgets.templates import render, sentence
 
 NO_CAMERA = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
-KINDS = {"rgb": "colour", "segmentation": "bodies"}
-SCALES = {"own size": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
+SCALES = {"full": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
 STEP = 0.01
 """Metres by which a key moves the camera."""
 TURN = 1.0
 """Degrees by which a key turns it."""
-PLACE = (
-    "move, turn: its pose. Move it, and what it looks at goes along; or turn it.\n"
+HANDLES = (
+    "pose: move or rotate the camera; its target moves with it.\n"
     "eye and target: move the eye, and it keeps looking at its target; or move the target."
 )
-ALONG = "Along which axes it is moved and turned. The camera's own: red is forward, green left, blue up."
-STEPS = "The step size of a drag."
-SIZE = "Of the preview above. The camera keeps its own."
-VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
-IN_ITS_EYE = "You look from its position. Move the view, and its handles appear."
+AXES = "The axes along which it is moved and rotated. The camera's own: red is forward, green left, blue up."
+SNAP = "Dragging moves and rotates in steps of this size."
+SIZE = "Size of the preview above. The camera keeps its own."
+VARIES = (
+    "Its pose differs between envs, or the task moves it: the placement here applies to all envs until then."
+)
+IN_ITS_EYE = "You are at its position. Move the view to see its handles."
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,8 @@ class Toggle:
 class StudioPanel(PagePart[SessionView]):
     """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by a press on its frustum.
 
-    From the top: the picture, by which every movement is checked; what is used all the time (look through it, undo);
-    the pose; the lens, folded.
+    From the top: the button that shows the change of the file; the picture, by which every movement is checked; what is
+    used all the time (look through it, undo); the pose; the lens, folded.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
@@ -83,18 +84,18 @@ class StudioPanel(PagePart[SessionView]):
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NO_CAMERA,)
+        above = gui.add_folder(None)
         self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NO_CAMERA, visible=False),
             read=lambda name: self._names.get(name),
             send=session.studio.select,
             shown=self._name_of,
         )
-        self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
+        self._note = gui.add_html(render("note", text="Cameras appear when the task has loaded."))
         self._picture = StudioPicture(server, session, clock)
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)
-        above = gui.add_folder(None)
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
         self._writing = WriteToFile(server, session, self._placing, self._new_from_viewer, above)
@@ -102,6 +103,8 @@ class StudioPanel(PagePart[SessionView]):
         self._suggest = CameraSuggest(server, session)
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
+        self._presses.when_unfolded(self._choose_first)
+        self._was_opened = False
         with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
         self._gizmo = CameraGizmo(
@@ -112,10 +115,25 @@ class StudioPanel(PagePart[SessionView]):
             look_at=lambda: self._look_at,
         )
 
+    def _choose_first(self) -> None:
+        """The tab was opened: choose its first sensor camera, once. A person may then choose none."""
+        view = self._session.view()
+        if self._was_opened or view.task is None:
+            return
+        self._was_opened = True
+        cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
+        if cameras and view.studio.selected is None:
+            self._session.studio.select(cameras[0].key)
+
     @property
     def shows(self) -> str:
         """The modality to render of the chosen camera."""
         return self._picture.shows
+
+    @property
+    def looks_through(self) -> bool:
+        """Whether a page looks through the chosen camera."""
+        return self._look.any
 
     def _name_of(self, key: CameraKey | None) -> str | None:
         return next((name for name, known in self._names.items() if known == key), NO_CAMERA)
@@ -193,10 +211,10 @@ class StudioPanel(PagePart[SessionView]):
             text = (
                 "This task has no camera."
                 if view.task is not None
-                else "Cameras appear when the task is loaded."
+                else "Cameras appear when the task has loaded."
             )
         elif studio.selected is None:
-            text = "Choose a camera here, or press its frustum in the view, to place it."
+            text = "Choose a camera here, or click its frustum in the 3D view, to place it."
         else:
             text = ""
         self._note.visible = bool(text)
@@ -227,9 +245,9 @@ class StudioPanel(PagePart[SessionView]):
         rows = [
             [
                 self._tool(
-                    "Back to my view" if looks else "Look through it", "", "look", self._look.toggle, on=looks
+                    "Back to my view" if looks else "Look through", "", "look", self._look.toggle, on=looks
                 ),
-                self._tool("Put it where I look", "", "put", self._put),
+                self._tool("Move to my view", "", "put", self._put),
             ],
             [
                 self._tool(
@@ -241,16 +259,14 @@ class StudioPanel(PagePart[SessionView]):
                 ),
                 self._tool(
                     "Redo",
-                    f"Make again: {studio.redo} (Ctrl+Shift+Z)"
-                    if studio.redo
-                    else "There is nothing to make again.",
+                    f"Redo: {studio.redo} (Ctrl+Shift+Z)" if studio.redo else "There is nothing to redo.",
                     "redo",
                     lambda _: actions.redo(),
                     off=studio.redo is None,
                 ),
                 self._tool(
-                    "Back to the file",
-                    "Place it as the file says." if camera.moved else "It is as the file says.",
+                    "Reset to file",
+                    "Restore the placement in the file." if camera.moved else "It matches the file.",
                     "back",
                     lambda _: self._back_to_file(),
                     off=not camera.moved,
@@ -261,19 +277,19 @@ class StudioPanel(PagePart[SessionView]):
 
     def _handles_of(self, scale: float) -> str:
         """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size)."""
-        kinds = {KINDS.get(kind, kind): kind for kind in self._picture.kinds}
+        kinds = {kind: kind for kind in self._picture.kinds}
         toggles = (
             Toggle(
-                "Place",
-                PLACE,
-                {"move, turn": False, "eye and target": True},
+                "Handles",
+                HANDLES,
+                {"pose": False, "eye and target": True},
                 self._look_at,
                 self._set_look_at,
             ),
-            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, self._set_own_axes),
-            Toggle("Steps", STEPS, SNAPS, self._snap, self._set_snap),
+            Toggle("Axes", AXES, {"world": False, "camera": True}, self._own_axes, self._set_own_axes),
+            Toggle("Snap", SNAP, SNAPS, self._snap, self._set_snap),
             Toggle(
-                "Shows", "What the picture above is of.", kinds, self._picture.shows, self._picture.show_kind
+                "Shows", "What the picture above shows.", kinds, self._picture.shows, self._picture.show_kind
             ),
             Toggle("Size", SIZE, SCALES, scale, self._session.studio.set_preview_scale),
         )
@@ -287,7 +303,8 @@ class StudioPanel(PagePart[SessionView]):
                         f"{one.label} {name}",
                         lambda _, one=one, value=value: one.choose(value),
                         one.now == value,
-                        one.label == "Along" and self._look_at,
+                        one.label == "Axes" and self._look_at,
+                        style="pill",
                     )
                     for name, value in one.choices.items()
                 ),
@@ -313,9 +330,10 @@ class StudioPanel(PagePart[SessionView]):
         pressed: Callable[[viser.ClientHandle | None], None],
         on: bool = False,
         off: bool = False,
+        style: str = "button",
     ) -> dict[str, object]:
         press = self._presses.id_of(key, pressed)
-        return {"name": name, "hint": hint, "on": on, "press": "" if off else press}
+        return {"name": name, "hint": hint, "on": on, "press": "" if off else press, "style": style}
 
     # --- presses -----------------------------------------------------------------------------------------
 
@@ -336,16 +354,16 @@ class StudioPanel(PagePart[SessionView]):
     def commands(self) -> list[Command]:
         """Commands with keys. The arrow keys alone belong to the timeline."""
         return [
-            Command("Undo the last change of a camera", self._session.studio.undo, "Z", "cmd/ctrl"),
-            Command("Make it again", self._session.studio.redo, "Z", "cmd/ctrl+shift"),
-            self._moves("to its left", "arrowleft", (0, STEP, 0)),
-            self._moves("to its right", "arrowright", (0, -STEP, 0)),
+            Command("Undo the last camera change", self._session.studio.undo, "Z", "cmd/ctrl"),
+            Command("Redo the camera change", self._session.studio.redo, "Z", "cmd/ctrl+shift"),
+            self._moves("left", "arrowleft", (0, STEP, 0)),
+            self._moves("right", "arrowright", (0, -STEP, 0)),
             self._moves("up", "arrowup", (0, 0, STEP)),
             self._moves("down", "arrowdown", (0, 0, -STEP)),
             self._moves("forward", "pageup", (STEP, 0, 0)),
             self._moves("back", "pagedown", (-STEP, 0, 0)),
-            self._turns("to the left", "arrowleft", TURN, 0),
-            self._turns("to the right", "arrowright", -TURN, 0),
+            self._turns("left", "arrowleft", TURN, 0),
+            self._turns("right", "arrowright", -TURN, 0),
             self._turns("up", "arrowup", 0, TURN),
             self._turns("down", "arrowdown", 0, -TURN),
         ]
@@ -356,7 +374,7 @@ class StudioPanel(PagePart[SessionView]):
 
     def _turns(self, name: str, key: HotkeyKey, left: float, up: float) -> Command:
         turn = partial(self._by_key, partial(panned, left=left, up=up), "turning key")
-        return Command(f"Turn the chosen camera {name}", turn, key, "alt+shift")
+        return Command(f"Rotate the chosen camera {name}", turn, key, "alt+shift")
 
     def _by_key(self, move: Callable[[Floats], Floats], control: str) -> None:
         def change(now: CameraSettings, frame: Frame) -> CameraSettings:
@@ -379,5 +397,5 @@ def _preview_text(camera: StudioCamera, scale: float) -> str:
     width, height = round(camera.now.width * scale), round(camera.now.height * scale)
     return (
         f"The preview is {width} × {height}; the camera stays {camera.now.width} × "
-        f"{camera.now.height}, and only that is written."
+        f"{camera.now.height}, and only that is saved."
     )

@@ -49,7 +49,7 @@ class VisibleObject:
 
 
 class CameraSuggest:
-    """The folder in the present container, and the box of the bounds in the 3-D view.
+    """The folder in the present container, and the box of the bounds in the 3D view.
 
     The bounds are two corners of a box in the env's frame, or in that of the body that carries the camera. They are a
     box around the eye that follows the camera until a person writes into them.
@@ -76,12 +76,12 @@ class CameraSuggest:
                     hint=hint,
                 )
                 for label, hint in (
-                    ("Eye from", "Lowest corner of the box in which the eye may be, metres."),
+                    ("Eye from", "Lowest corner of the box in which the eye may be, in metres."),
                     ("Eye to", "Highest corner of that box, metres."),
                 )
             )
             self._show_box = server.gui.add_checkbox(
-                "Draw this box", False, hint="In the 3-D view, in the selected env."
+                "Draw this box", False, hint="In the 3D view, in the selected env."
             )
             self._resets = server.gui.add_number(
                 "Resets",
@@ -89,9 +89,9 @@ class CameraSuggest:
                 min=1,
                 max=MOST_RESETS,
                 step=1,
-                hint="Freshly reset envs in which a placement is measured; as many as there are envs at most.",
+                hint="Freshly reset envs in which each placement is measured; at most the number of envs.",
             )
-            self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
+            self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH, color="gray")
             self._offers = JobResult(server, session)
             self._presses = Presses(server)
         self._search.on_click(self._ask)
@@ -124,7 +124,7 @@ class CameraSuggest:
         wanted = tuple(choice.name for choice in self._choices if choice.name in chosen)
         with refusals_told(event.client):
             if not wanted:
-                raise ValueError("Choose at least one object that must be seen.")
+                raise ValueError("Choose at least one object that must be visible.")
             self._offers.asked(self._session.view().studio.results.suggestions)
             self._session.studio.reports.suggest(wanted, *self._bounds(), self._resets.value)
 
@@ -144,7 +144,7 @@ class CameraSuggest:
         mount = None if camera is None else camera.info.mount
         self._mounted.visible = mount is not None
         if mount is not None:
-            text = f"It rides on {mount}: the box is in that body's frame, which is looked from as it is after a reset."
+            text = f"Mounted on {mount}: the box is in that body's frame, as it is after a reset."
             self._mounted.content = render("note", text=text)
 
     def _draw_bounds(self, camera: StudioCamera | None) -> None:

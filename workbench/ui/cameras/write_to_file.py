@@ -26,7 +26,7 @@ from workbench.ui.widgets.images import data_address
 from workbench.ui.widgets.progress import NewResult
 from workbench.ui.widgets.templates import render
 
-LEAVE, CLOSE = "Leave the file as it is", "Close"
+LEAVE, CLOSE = "Discard the change", "Close"
 MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
 NOTHING = EditState()
 
@@ -41,15 +41,15 @@ class CameraChange:
         gui = server.gui
         self.arrival = NewResult()
         self._text = gui.add_html("", visible=False)
-        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
+        self._write = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY, visible=False)
         self._undo = gui.add_button(
-            "Undo it in the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+            "Revert in the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
         )
         self._copy = gui.add_button(
-            "Copy the task into my folder",
+            "Copy the task to my folder",
             icon=viser.Icon.COPY,
             visible=False,
-            hint=f"A file of your own in {session.studio.file.folder}, under a name that is free; the page opens it.",
+            hint=f"A file of your own in {session.studio.file.folder}, under a free name; the page opens it.",
         )
         self._drop = gui.add_button(LEAVE, color="gray", visible=False)
         self._write.on_click(lambda _: session.studio.file.write())
@@ -72,7 +72,7 @@ class CameraChange:
         self._undo.visible = stage in IN_FILE
         name = "" if edit_state.edit is None else edit_state.edit.names
         self._drop.label = LEAVE if stage == "planned" else CLOSE
-        self._write.label = f"Write it to {name}" if name else "Write it"
+        self._write.label = f"Save to {name}" if name else "Save"
         new = self.arrival.just_came(edit_state if stage != "none" else None)
         if self._drawn is None or self._drawn[0] is not edit_state or self._drawn[1:] != (stale, new):
             self._drawn = edit_state, stale, new
@@ -90,7 +90,7 @@ def edit_html(edit_state: EditState, stale: bool, scroll_to: str = "") -> str:
     files = [] if edit is None or edit_state.stage == "undone" else edit.changes
     return render(
         "camera_writing",
-        message="The camera was moved since: show the change again." if stale else edit_state.message,
+        message="The camera has moved since: show the change again." if stale else edit_state.message,
         mood="warn" if stale else MOODS.get(edit_state.stage, "plain"),
         about=edit_state.request.about if planned and edit_state.request is not None else "",
         picture="" if seen is None else data_address(seen, PREVIEW),
@@ -115,10 +115,10 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
 
 
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
-ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
+ADD_SENSOR, ADD_HUMAN = "Add sensor", "Add human view"
 WHERE = (
-    "A new sensor looks at the task's objects from the side that you look from; one for people is placed where you look "
-    "from. Its picture comes with the change, before anything is written."
+    "A new sensor looks at the task's objects from your side; a human view is placed at your viewpoint. Its picture "
+    "comes with the change, before anything is saved."
 )
 LONGEST_NAME = 64
 NEW = CameraSettings(
@@ -168,7 +168,7 @@ class WriteToFile:
             self._name = gui.add_text(
                 "New name",
                 "",
-                hint="Letters, digits, - and _. A camera that is added without one is given one.",
+                hint="Letters, digits, - and _. A new camera gets a name if this is empty.",
             )
             limit_text(self._name, LONGEST_NAME)
             self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
@@ -252,7 +252,7 @@ class WriteToFile:
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
         of_members = edit_state.what != "edit"
-        # Hidden while "Write it" is shown: a second press must not write a diff that was not read.
+        # Hidden while "Save" is shown: a second press must not write a diff that was not read.
         can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
         self._plan.visible = can_plan
@@ -318,7 +318,7 @@ def first_place(
         names: of the objects to see.
         places: (K, 3) of the objects in all envs, each in its env's frame.
     """
-    stays = "It is placed where you look from."
+    stays = "It is placed at your viewpoint."
     if not len(places):
         return seen_from, stays
     pose = pose_of(seen_from)
@@ -332,7 +332,7 @@ def first_place(
         return seen_from, stays
     x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
     told = ", ".join(names[:MOST_NAMES]) + (" and others" if len(names) > MOST_NAMES else "")
-    words = f"It looks from your side at {told} from {wanted:.2f} m; you look from {away:.1f} m away."
+    words = f"It looks at {told} from your side, {wanted:.2f} m away; you are {away:.1f} m away."
     return replace(seen_from, position=(x, y, z)), words
 
 

@@ -71,9 +71,9 @@ class LibraryEdits:
             self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
 
         known = sorted({tag for row in self._library.view().rows for tag in row.tags})
-        explained = "Words, with commas between them."
+        explained = "Words, separated by commas."
         if len(rows) > 1:
-            explained += " Tags that all of them have are shown here; their other tags stay."
+            explained += " Shown are the tags that all of them have; their other tags stay."
         if known:
             explained += f" In use: {', '.join(known[:MOST_KNOWN])}."
         self._ask("Tags", "", rows, explained, "Save", answered, ", ".join(shared))
@@ -83,7 +83,7 @@ class LibraryEdits:
         if not rows:
             return
         notes = {row.note for row in rows}
-        explained = "" if len(notes) == 1 else "They have different notes; this one takes their place."
+        explained = "" if len(notes) == 1 else "They have different notes; this one replaces them."
 
         def answered(typed: str) -> None:
             self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
@@ -98,7 +98,7 @@ class LibraryEdits:
             "Delete recordings",
             f"Delete {in_words(rows)}?",
             rows,
-            "All their files go to the folder .trash in the library, and can be taken back from there.",
+            "All their files move to the folder .trash in the library and can be restored from there.",
             "Delete",
             lambda _: self._do(lambda: self._library.delete(ids)),
         )

@@ -183,12 +183,12 @@ def walking(listed: LibraryList) -> list[Command]:
         return lambda: listed.move(by, held)
 
     return [
-        Command("The next recording of the table", move(1), "arrowdown"),
-        Command("The recording before it", move(-1), "arrowup"),
-        Command("Select the next recording too", move(1, RANGE), "arrowdown", "shift"),
-        Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
-        Command("The next page of recordings", lambda: listed.pages.turn(1), "pagedown"),
-        Command("The page of recordings before it", lambda: listed.pages.turn(-1), "pageup"),
-        Command("Select this recording, or no longer", listed.toggle_cursor, "X"),
-        Command("Select all recordings that are listed", listed.select_all, "A", "cmd/ctrl"),
+        Command("Next recording in the table", move(1), "arrowdown"),
+        Command("Previous recording in the table", move(-1), "arrowup"),
+        Command("Also select the next recording", move(1, RANGE), "arrowdown", "shift"),
+        Command("Also select the previous recording", move(-1, RANGE), "arrowup", "shift"),
+        Command("Next page of recordings", lambda: listed.pages.turn(1), "pagedown"),
+        Command("Previous page of recordings", lambda: listed.pages.turn(-1), "pageup"),
+        Command("Select or deselect this recording", listed.toggle_cursor, "X"),
+        Command("Select all listed recordings", listed.select_all, "A", "cmd/ctrl"),
     ]

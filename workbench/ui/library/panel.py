@@ -71,7 +71,7 @@ class LibraryPanel(PagePart[object]):
         self._actions = [
             Action(
                 "Open",
-                "Show it in the review (Enter, or press it twice)",
+                "Open it in the review (Enter, or double-click)",
                 on_open,
                 MOST_OPEN,
                 "Open the selected recordings",
@@ -79,16 +79,16 @@ class LibraryPanel(PagePart[object]):
             ),
             Action(
                 "Tag",
-                "Add tags or take them away (T)",
+                "Add or remove tags (T)",
                 self._edits.ask_tags,
                 named="Tag the selected recordings",
                 key="T",
             ),
             Action(
                 "Note",
-                "Write a note to it (Shift T)",
+                "Edit its note (Shift T)",
                 self._edits.ask_note,
-                named="Write a note to the selected recordings",
+                named="Edit the note of the selected recordings",
                 key="T",
                 modifier="shift",
             ),
@@ -105,7 +105,7 @@ class LibraryPanel(PagePart[object]):
             server.gui.add_text(
                 "Find",
                 "",
-                hint="Words in task, tags, note, name or version, all of which must be found; seed:3 for a seed",
+                hint="Words to find in task, tags, note, name or version; seed:3 for a seed",
             ),
             send=lambda words: self._list.look_for(words, self._list.task),
             settle=TYPING,
@@ -287,7 +287,7 @@ class LibraryPanel(PagePart[object]):
         if view.problem is not None or view.reading is not None:
             return ""
         return (
-            f"There are no recordings in {self._folder} yet. Those that are made there, on the Episodes tab of "
+            f"There are no recordings in {self._folder} yet. Recordings made there, on the Episodes tab of "
             "a task or with workbench record, appear here."
         )
 
@@ -299,7 +299,7 @@ class LibraryPanel(PagePart[object]):
             "name": column,
             "arrow": arrow,
             "press": press,
-            "hint": f"{HINTS[column]}. Press to sort by it",
+            "hint": f"{HINTS[column]}. Click to sort",
         }
 
     def _draw_tools(self, view: LibraryView) -> None:
@@ -322,7 +322,7 @@ class LibraryPanel(PagePart[object]):
                 }
                 for k, action in enumerate(self._actions)
             ],
-            summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
+            summary=f"{count} selected" if count else "Click a row to select it" if rows else "",
             count=len(rows),
             all=self._press("all", listed.select_all) if count < len(rows) else "",
             none=self._press("none", lambda: self.select(())) if count else "",
@@ -364,7 +364,7 @@ class LibraryPanel(PagePart[object]):
     def _run(self, action: Action) -> None:
         ids = self.selected()
         if not ids:
-            body = f"Press a row of the library first: {action.label} is for what is selected there."
+            body = f"Select a row of the library first: {action.label} applies to the selection."
             tell_all(self._server, "Nothing is selected", body, seconds=8.0)
         elif action.most is not None and len(ids) > action.most:
             body = f"{action.label} takes at most {action.most} at once."

@@ -8,6 +8,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP
+from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
@@ -15,6 +16,7 @@ WIDEST, BUSY_WIDEST = 520, 460
 """Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
 version is still used."""
 
+RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Start a new worker"
 SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
@@ -27,14 +29,14 @@ DOING = {
     "evaluate": "failed in evaluate",
     "reward": "failed in its reward",
     "observation": "failed in its observation",
-    "returns": "returned something of the wrong shape",
-    "policy": "was stopped by its policy",
+    "returns": "returned the wrong shape",
+    "policy": "failed",
     "worker": "lost its worker process",
 }
 INTERRUPTED = {
-    "import": "was interrupted while it was imported",
-    "build": "was interrupted while it built its scene",
-    "policy": "had its policy interrupted",
+    "import": "was interrupted during import",
+    "build": "was interrupted while building its scene",
+    "policy": "was interrupted",
 }
 
 
@@ -56,15 +58,17 @@ class Banner(PagePart[SessionView]):
         server: The page.
         reload: Asks the session to load the file again.
         restart: Asks the session for a new worker process.
+        link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, reload, restart) -> None:
+    def __init__(self, server: viser.ViserServer, reload, restart, link: LinkTo = no_links) -> None:
+        self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
-            self._reload = server.gui.add_button("Load the file again", icon=viser.Icon.REFRESH, color="gray")
+            self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
             self._restart = server.gui.add_button(
-                "Start a new worker", icon=viser.Icon.POWER, color="gray", visible=False
+                "Restart the worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
         # At the right edge of the view: on the left are viser's own notifications.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
@@ -85,38 +89,40 @@ class Banner(PagePart[SessionView]):
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:
             self._drawn = drawn
-            self._html.content = banner_html(problem, view)
+            self._html.content = banner_html(problem, view, self._link)
             self._panel.visible = True
             self._panel.expand()
 
 
-def banner_html(problem: Problem, view: SessionView) -> str:
+def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:
     """The banner's content."""
-    if problem.stage == "syntax" or (view.task is None and problem.file is not None):
+    if problem.stage == "policy":
+        subject = "The policy"
+    elif problem.stage == "syntax" or (view.task is None and problem.file is not None):
         subject = "The file"
     else:
         subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     doing = DOING.get(problem.stage, f"failed in {problem.stage}")
     if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
-    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view))
+    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
 
 
 def _kept(view: SessionView) -> str:
     """Which version still runs, in a sentence."""
     if view.state == "stopped":
-        return "The worker process is gone, so nothing moves until there is a new one."
+        return "The worker process is gone. Restart the worker to continue."
     if view.task is None and not (view.problem is not None and view.problem.file):
         return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
     if view.task is None:
-        return "There is no version to show yet. Fix the file and save it; the page follows."
+        return "No version has loaded yet. Fix the file and save it, and the page will show it."
     if view.problem is not None and view.problem.stage == "worker":
         if view.state in ("starting", "loading"):
-            return "Another worker takes over; the last good version comes back where it was."
-        return "The last good version is back where it was, and paused."
+            return "Another worker is taking over; the last good version will be restored where it was."
+        return "The last good version is restored where it was, and paused."
     if view.playing:
-        return "The last good version keeps running."
-    return "The last good version stays on the page."
+        return "The last good version is still running."
+    return "The last good version is still shown."
 
 
 class BusyBanner(PagePart[SessionView]):
@@ -130,15 +136,17 @@ class BusyBanner(PagePart[SessionView]):
         server: The page.
         interrupt: Asks the session to interrupt the author's code.
         restart: Asks the session for another worker process.
+        link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, interrupt, restart) -> None:
+    def __init__(self, server: viser.ViserServer, interrupt, restart, link: LinkTo = no_links) -> None:
+        self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-11.0)
         with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
-            self._interrupt = server.gui.add_button("Interrupt", icon=viser.Icon.HAND_STOP, color="orange")
-            self._restart = server.gui.add_button("Restart", icon=viser.Icon.POWER, color="gray")
+            self._interrupt = server.gui.add_button(INTERRUPT, icon=viser.Icon.HAND_STOP)
+            self._restart = server.gui.add_button(RESTART, icon=viser.Icon.POWER, color="gray")
         self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
         self._interrupt.on_click(lambda _: interrupt())
         self._restart.on_click(lambda _: restart())
@@ -148,7 +156,7 @@ class BusyBanner(PagePart[SessionView]):
         if busy is None or not is_busy_for_long(view):
             self._panel.visible = False
             return
-        self._html.content = busy_html(busy, view)
+        self._html.content = busy_html(busy, view, self._link)
         # An element of its own: the changing seconds would close an open traceback.
         trace = (
             render("traceback", traceback=busy.traceback) if busy.ignores_interrupt and busy.traceback else ""
@@ -162,19 +170,19 @@ class BusyBanner(PagePart[SessionView]):
             self._panel.expand()
 
 
-def busy_html(busy: Busy, view: SessionView) -> str:
+def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
     """The banner's content."""
     if busy.ignores_interrupt:
         advice = (
-            "It was interrupted and continues: it is in native code, or it catches every exception. Restart ends the "
-            "process; the last good version comes back where it was."
+            "It did not stop when it was interrupted: it is in native code, or it catches every exception. Restart "
+            "ends the process and restores the last good version where it was."
         )
     elif busy.drawing:
-        advice = "The renderer is at work. The first picture may take long; Restart ends the process."
+        advice = "The renderer is working. The first picture may take a while; Restart ends the process."
     else:
         advice = (
-            "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process, and "
-            "the last good version comes back where it was. Saving a fixed file does the same."
+            "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process and "
+            "restores the last good version where it was. Saving a fixed file does the same."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
-    return render("busy", subject=subject, busy=busy, advice=advice)
+    return render("busy", subject=subject, busy=busy, advice=advice, link=link)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from typing import Any, Literal
 
@@ -24,24 +24,24 @@ FILTERS: dict[Filter, tuple[str, str, str]] = {
     "all": ("all", "Every env", "There is no env."),
     "failed": (
         "last failed",
-        "The last episode that came to an end ended without success: by fail, or at the time limit",
-        "In no env did the last episode fail.",
+        "The last finished episode ended without success: by fail, or at the time limit",
+        "No env's last episode failed.",
     ),
     "running": (
         "running",
-        "The episode under way has not come to its first end",
+        "The current episode has not ended yet",
         "No env is running.",
     ),
     "flagged": (
         "flagged",
-        "Something odd in the episode under way, or in the one before",
+        "Something odd in the current or the previous episode",
         "No env is flagged.",
     ),
 }
 """Label of the button, hint, and text of an empty table. "last failed", not "failed": a running env may have failed
 before, and "failed 16" next to "running 16" confuses."""
 MOST_ENTRIES = 6
-"""Columns of bool entries; with more a row is wider than the view."""
+"""Columns of bool entries at first; with more a row is wider than the view. The others can be chosen."""
 POINTS = 40
 """Points of a row's small curve."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
@@ -49,13 +49,19 @@ _GRAVITY = np.array([2, 3, 0, 1])
 """Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
 
 
-def entry_names(rows: EnvRows) -> tuple[str, ...]:
-    """The bool entries that get a column, ``success`` and ``fail`` first."""
-    names = sorted(rows.first_true, key=lambda name: (name != "success", name != "fail", name))
-    return tuple(names[:MOST_ENTRIES])
+def bool_entries(rows: EnvRows) -> tuple[str, ...]:
+    """The bool entries of `evaluate`, ``success`` and ``fail`` first."""
+    return tuple(sorted(rows.first_true, key=lambda name: (name != "success", name != "fail", name)))
 
 
-def columns(rows: EnvRows) -> tuple[str, ...]:
+def entry_names(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
+    """The bool entries that get a column: those that were chosen, and of those that were not asked about the first."""
+    chosen = chosen or {}
+    every = bool_entries(rows)
+    return tuple(name for place, name in enumerate(every) if chosen.get(name, place < MOST_ENTRIES))
+
+
+def columns(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
     """Names of the sortable columns, in the order of the table."""
     return (
         "env",
@@ -64,7 +70,7 @@ def columns(rows: EnvRows) -> tuple[str, ...]:
         "return",
         "last",
         "flags",
-        *(f"first {name}" for name in entry_names(rows)),
+        *(f"first {name}" for name in entry_names(rows, chosen)),
     )
 
 
@@ -110,16 +116,18 @@ def moment_of(rows: EnvRows, env: int) -> int | None:
     return int(rows.end[env]) if rows.end[env] >= 0 else None
 
 
-def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
+def make_rows(
+    rows: EnvRows, envs: NDArray[np.int64], chosen: Mapping[str, bool] | None = None
+) -> list[dict[str, Any]]:
     """The cells of these envs. A curve is ``points`` of SVG polylines; flags are oldest first."""
-    names = entry_names(rows)
+    names = entry_names(rows, chosen)
     curves = _curves(rows.rewards, envs)
     made = []
     for env, curve in zip(envs.tolist(), curves, strict=True):
         state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
         had_one = rows.last.steps[env] >= 0
         before = [
-            f"{outlier.reason} (episode before, step {outlier.step})"
+            f"{outlier.reason} (previous episode, step {outlier.step})"
             for outlier in rows.last.outliers.get(env, ())
         ]
         now = [f"{outlier.reason} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
@@ -195,11 +203,11 @@ def _step(step: int) -> str:
 MOST_ROWS = 64
 """Rows of one page of the table."""
 HINTS = {
-    "env": "Press a column to sort by it, again to turn it round",
-    "state": "Of the episode under way: running until its first end",
+    "env": "Click a column to sort by it, again to reverse the order",
+    "state": "Of the current episode: running until it first ends",
     "steps": "Control steps of the episode",
     "return": "Sum of the rewards of the episode so far",
-    "last": "How the episode before ended, and at which step",
+    "last": "How the previous episode ended, and at which step",
     "flags": "What is odd: NaN or infinite, too fast, fallen, reward out of range",
 }
 
@@ -217,6 +225,10 @@ class EnvPanel(PagePart[SessionView]):
         self._column, self._descending = "env", False
         self._filter: Filter = "all"
         self._pages = Paged(MOST_ROWS)
+        self._chosen: dict[str, bool] = {}
+        """Bool entries that were switched on or off."""
+        self._choosing = False
+        """Whether the list of entries is open."""
         self._pressed = 0
         """Number of presses that change the table."""
 
@@ -232,7 +244,7 @@ class EnvPanel(PagePart[SessionView]):
         self._handle.content = content
 
     def _html(self, rows: EnvRows, selected: int) -> str:
-        if self._column not in columns(rows):
+        if self._column not in columns(rows, self._chosen):
             self._column, self._descending = "env", False
         envs = order(rows, self._column, self._descending, self._filter)
         places = self._pages.places(len(envs))
@@ -250,6 +262,9 @@ class EnvPanel(PagePart[SessionView]):
                 }
                 for name, (shown_as, means, _) in FILTERS.items()
             ],
+            choose=self._press(("choose",), self._toggle_choosing) if rows.first_true else "",
+            entries=self._entries(rows) if self._choosing else (),
+            choosing=self._choosing,
             pages=self._pages.shown(self._press),
             head=self._head(rows),
             rows=[
@@ -258,7 +273,7 @@ class EnvPanel(PagePart[SessionView]):
                     "selected": row["env"] == selected,
                     "press": self._press(("env", row["env"]), partial(self._choose_env, row["env"])),
                 }
-                for row in make_rows(rows, shown)
+                for row in make_rows(rows, shown, self._chosen)
             ],
         )
 
@@ -270,7 +285,7 @@ class EnvPanel(PagePart[SessionView]):
 
         entries = [
             sortable(name, f"first {name}", f"The first step at which {name} was true")
-            for name in entry_names(rows)
+            for name in entry_names(rows, self._chosen)
         ]
         plain = {
             "name": "reward",
@@ -280,6 +295,17 @@ class EnvPanel(PagePart[SessionView]):
         }
         start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
         return [*start, plain, *entries, *(sortable(name, name, HINTS[name]) for name in ("last", "flags"))]
+
+    def _entries(self, rows: EnvRows) -> list[dict[str, object]]:
+        shown = entry_names(rows, self._chosen)
+        return [
+            {
+                "name": name,
+                "on": name in shown,
+                "press": self._press(("entry", name), partial(self._toggle_entry, name)),
+            }
+            for name in bool_entries(rows)
+        ]
 
     # --- presses -----------------------------------------------------------------------------------
 
@@ -304,6 +330,14 @@ class EnvPanel(PagePart[SessionView]):
         self._descending = not self._descending if column == self._column else False
         self._column = column
         self._pages.go_to(0)
+
+    def _toggle_choosing(self) -> None:
+        self._choosing = not self._choosing
+
+    def _toggle_entry(self, name: str) -> None:
+        rows = self._session.env_rows()
+        if rows is not None:
+            self._chosen[name] = name not in entry_names(rows, self._chosen)
 
     def _choose_filter(self, wanted: Filter) -> None:
         self._filter = wanted

@@ -15,7 +15,7 @@ from workbench.ui.widgets.templates import counted, render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 RECORD, NEXT, SAVE = "Record", "Record the next episode", "Save what I just saw"
-SAVE_BEFORE = "Save the episode before"
+SAVE_BEFORE = "Save the previous episode"
 STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving"
 
 
@@ -30,29 +30,30 @@ class RecordPanel(PagePart[SessionView]):
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._button = server.gui.add_button(
             RECORD,
             icon=viser.Icon.PLAYER_RECORD,
-            color="red",
             hint="Reset and record every episode until it is stopped (C)",
         )
+        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._next = server.gui.add_button(
             NEXT,
             icon=viser.Icon.PLAYER_TRACK_NEXT,
+            color="gray",
             hint="Wait for the next reset and record that one episode",
         )
         self._save = server.gui.add_button(
             SAVE,
             icon=viser.Icon.HISTORY,
-            hint="Record after the fact: the episode at the moment that is shown (shift+C)",
+            color="gray",
+            hint="Record after the fact: the episode at the shown moment (shift+C)",
         )
         self._before = server.gui.add_button(
             SAVE_BEFORE,
             icon=viser.Icon.PLAYER_TRACK_PREV,
             color="gray",
             visible=False,
-            hint="The episode that ended before the one that is shown",
+            hint="The episode before the shown one",
         )
         self._about = server.gui.add_html("")
         self._status = server.gui.add_html("")
@@ -131,12 +132,12 @@ def what_saving_means(view: SessionView, all_envs: bool) -> str:
     if steps is None or view.task is None:
         return ""
     if view.timeline.shown is not None:
-        return f"{SAVE} takes the whole episode round the moment that is shown."
+        return f"{SAVE} saves the whole episode around the shown moment."
     count = f"{counted(steps, 'step')} so far"
     if all_envs and view.task.num_envs > 1:
-        return f"{SAVE} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
+        return f"{SAVE} saves the running episodes, ended or not (env {view.selected_env}: {count})."
     which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
-    return f"{SAVE} takes the {which} that runs: {count}, and not ended."
+    return f"{SAVE} saves the running {which}: {count}, not ended."
 
 
 def recording_html(recording: RecordingStatus) -> str:

@@ -128,10 +128,12 @@ class LogPanel(PagePart[SessionView]):
 
     def __init__(self, server: viser.ViserServer, clear: Callable[[], None]) -> None:
         self._filter = server.gui.add_text(
-            "Filter", "", hint="Only lines with this in them; stderr: or stdout: before it takes one stream."
+            "Filter",
+            "",
+            hint="Only lines that contain this; stderr: or stdout: before it selects one stream.",
         )
         limit_text(self._filter, LONGEST_FILTER)
-        self._hold = server.gui.add_checkbox("Hold still", False, hint="Let new lines wait while you read.")
+        self._hold = server.gui.add_checkbox("Pause", False, hint="New lines wait while you read.")
         self._html = server.gui.add_html("")
         self._clear = server.gui.add_button("Clear", icon=viser.Icon.ERASER, color="gray")
         self._vitals = server.gui.add_html("")

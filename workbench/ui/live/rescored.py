@@ -20,7 +20,7 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.rescored import RescoredPanel
 from workbench.ui.widgets.templates import render
 
-TITLE = "The past, rescored"
+TITLE = "History, rescored"
 
 
 class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
@@ -33,7 +33,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
             "Curve",
             names,
             visible=False,
-            hint="Which number is drawn, as recorded and as the new code has it",
+            hint="Which number is plotted, as recorded and with the new code",
         )
         self._add_chart()
         self._add_list()
@@ -125,10 +125,10 @@ def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, ...]:
 def in_a_line(rescored: RescoreView) -> str:
     """Summary in one line; empty while there is nothing to report."""
     if rescored.state == "loading":
-        return "Rescoring the past: loading the new code"
+        return "Rescoring the history: loading the new code"
     if rescored.state == "rescoring":
         # In tenths: each change is sent to the page.
-        return f"Rescoring the past: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
+        return f"Rescoring the history: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
     if rescored.state == "done":
         return f"{TITLE}: {verdict_text.headline(rescored.verdicts, others=rescored.differing_names)}"
     return f"{TITLE}: {rescored.why}" if rescored.why else ""

@@ -33,13 +33,13 @@ RANGE_EVERY = 0.5
 """Seconds. A slider whose ends move at every step cannot be held."""
 STANDS_STILL = 0.35
 """Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
-LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "step ›", "event ›", "now"
+LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
 EPISODE, EVERYTHING = "zoom to episode", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Continue from here"
 UNDO = "undo"
 """Start of the undo button's label; what is undone follows."""
-WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
+WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE, EPISODE)
 View = TypeVar("View", contravariant=True)
 
 
@@ -91,6 +91,7 @@ class TimeBar(PagePart[View]):
         # Across the bottom of the view: viser docks panels at the sides only.
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
         self._shown: int | None = None
+        self._folded = False
         self._before_slider: int | None = None
         """The place that was shown before the slider was last moved."""
 
@@ -100,10 +101,10 @@ class TimeBar(PagePart[View]):
     def commands(self) -> list[Command]:
         """Commands of the arrow keys."""
         return [
-            Command("A step back in time", lambda: self._step_by(-1), "arrowleft"),
-            Command("A step on in time", lambda: self._step_by(1), "arrowright"),
-            Command("To the event before", lambda: self._to_event(-1), "arrowleft", "shift"),
-            Command("To the next event", lambda: self._to_event(1), "arrowright", "shift"),
+            Command("One step back", lambda: self._step_by(-1), "arrowleft", buttons=(LAST_STEP,)),
+            Command("One step forward", lambda: self._step_by(1), "arrowright", buttons=(NEXT_STEP,)),
+            Command("Previous event", lambda: self._to_event(-1), "arrowleft", "shift", (LAST_EVENT,)),
+            Command("Next event", lambda: self._to_event(1), "arrowright", "shift", (NEXT_EVENT,)),
         ]
 
     def _step_by(self, steps: int) -> None:
@@ -127,6 +128,12 @@ class TimeBar(PagePart[View]):
     def _on_walk(self, name: str) -> None:
         next(does for label, does in self._does.items() if name.startswith(label))()
 
+    def fold(self, wanted: bool) -> None:
+        """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
+        if wanted != self._folded:
+            self._folded = wanted
+            (self._panel.minimize if wanted else self._panel.expand)()
+
     def _draw_panel(self, there: bool, shown: int | None) -> bool:
         self._panel.visible = there
         self._shown = shown
@@ -146,7 +153,7 @@ class TimelinePanel(TimeBar[SessionView]):
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         zooms = {EPISODE: partial(self._zoom, True), EVERYTHING: partial(self._zoom, False)}
-        does = {NOW: self.go_live, **zooms, UNDO: session.past.undo}
+        does = {LIVE: self.go_live, **zooms, UNDO: session.past.undo}
         super().__init__(server, session.past, "step of the past", does, clock)
         self._session, self._clock = session, clock
         self._travel.on_click(lambda event: self._on_travel(event.target.value))

@@ -37,15 +37,15 @@ class ReviewComparePanel(PagePart[ReviewView]):
             icon=viser.Icon.ARROWS_EXCHANGE,
             color="gray",
             visible=False,
-            hint="A becomes the other one",
+            hint="Makes the other recording A",
         )
         self._swap.on_click(lambda _: self._change_places())
         self._tolerance = gui.add_dropdown(
-            "Moved from",
+            "Tolerance",
             tuple(TOLERANCE_NAMES),
             initial_value=length(USUAL_TOLERANCE),
             visible=False,
-            hint="How far a body must be away to count as elsewhere.",
+            hint="How far apart a body must be to count as different.",
         )
         self._html = gui.add_html("")
         self._presses = Presses(server)
@@ -66,7 +66,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
         label = f"Swap A and {self._other.value}" if len(letters) > 1 else "Swap A and B"
         self._swap.label = label
         if not several:
-            self._html.content = render("note", text="Open two recordings, and this says where they part.")
+            self._html.content = render("note", text="Open two recordings to see where they diverge.")
             return
         other = 1 + letters.index(self._other.value)
         tolerance = TOLERANCE_NAMES[self._tolerance.value]
@@ -115,26 +115,28 @@ class ReviewComparePanel(PagePart[ReviewView]):
 
 def headline(found: Difference) -> str:
     if not found.compared:
-        return "As they are aligned, the two have no state at the same place."
+        return "Aligned like this, the two recordings do not overlap."
     if found.bodies is None:
-        return "One of them has no scene, so only numbers are compared."
+        return "One of them has no scene; only numbers are compared."
     if found.bodies.position is None:
-        apart = "" if found.bodies.largest == "0" else f", {found.bodies.largest} apart at most"
+        apart = "" if found.bodies.largest == "0" else f", at most {found.bodies.largest} apart"
         return f"All bodies stay together{apart}."
-    return f"They part at step {found.bodies.position}: {found.bodies.values} apart. At most {found.bodies.largest}."
+    return (
+        f"They diverge at step {found.bodies.position} ({found.bodies.values}), up to {found.bodies.largest}."
+    )
 
 
 def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
     said = []
     if a.episode.info.task != b.episode.info.task:
-        said.append("They are of different tasks.")
+        said.append("They are from different tasks.")
     elif not found.same_seed:
-        said.append("They are of different seeds, so they differ from the start.")
+        said.append("They have different seeds, so they differ from the start.")
     if a.length != b.length:
         said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
     of_batch = dict.fromkeys(name for each in (a, b) for name in (*each.episode.batch, *each.episode.texts))
     if of_batch:
-        said.append(f"Not compared, since they are not numbers of this env alone: {', '.join(of_batch)}.")
+        said.append(f"Not compared, because they are not per env: {', '.join(of_batch)}.")
     if abs(a.episode.info.control_dt - b.episode.info.control_dt) > 1e-9:
-        said.append("A step is not the same time in both.")
+        said.append("A step does not last equally long in both.")
     return said

@@ -18,7 +18,7 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import letter, render
 
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
-GHOSTS, GRID = "over each other", "side by side"
+GHOSTS, GRID = "overlaid", "side by side"
 GO_LIVE, STAY = "Continue live from here", "Stay here"
 
 
@@ -49,7 +49,7 @@ class ReviewPanel(PagePart[ReviewView]):
             icon=viser.Icon.PLAYER_TRACK_NEXT,
             color="gray",
             visible=False,
-            hint="Restores the state that is shown in the live env, with today's code (G).",
+            hint="Restores the shown state in the live env, with the current code (G).",
         )
         self._live.on_click(lambda _: self.enter_recording())
         self._speed = Control(
@@ -65,7 +65,7 @@ class ReviewPanel(PagePart[ReviewView]):
         self._problems = gui.add_html("")
         self._list = gui.add_html("")
         self._arrange = gui.add_dropdown(
-            "Draw them", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key changes it."
+            "Layout", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key switches."
         )
         align: viser.GuiDropdownHandle = gui.add_dropdown(
             "Align at", ("start",), initial_value="start", visible=False

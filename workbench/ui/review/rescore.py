@@ -64,7 +64,7 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
 
 def _todays(infos: Sequence[EpisodeInfo], named: Sequence[RecordedTask]) -> str:
     if not infos:
-        return "Each recording with the file that it names, as that is now."
+        return "Each recording with the file it names, as it is now."
     told = [_in_words(reference) for reference in named[:MOST_NAMED]]
     more = f", and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
     return f"With {', '.join(told)}{more}."
@@ -78,12 +78,12 @@ def _in_words(reference: RecordedTask) -> str:
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:
     hashes = list(dict.fromkeys(version for info in infos if (version := recorded_version(info))))
     version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
-    return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."
+    return f"With the code stored in each recording{version}. It runs here; for recordings made elsewhere you are asked first."
 
 
 IDLE = (
-    "Runs today's reward and evaluate over recorded episodes, from their seeds and with their actions, and lists what is "
-    "different now. Select recordings in the Library and press Rescore there, or rescore what is open."
+    "Runs the current reward and evaluate over recorded episodes, from their seeds and with their actions, and lists what is "
+    "different now. Select recordings in the Library and click Rescore there, or rescore the open ones."
 )
 
 
@@ -128,7 +128,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         self._rescorer, self._review = rescorer, review
         self._library, self._choices, self._known = library, choices, known
         gui = server.gui
-        self._begin = gui.add_button("Rescore what is open", icon=viser.Icon.GAVEL, visible=False)
+        self._begin = gui.add_button("Rescore the open recordings", icon=viser.Icon.GAVEL, visible=False)
         self._begin.on_click(lambda _: self.rescore([one.id for one in review.view().opened]))
         self._codes = codes_for((), ())
         self._codes_of: object = None
@@ -137,14 +137,14 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             "Code",
             labels,
             initial_value=RECORDED if choices.code.recorded else TODAYS,
-            hint="Today's code of the task, the text that the recording was made with, or a task file that is open here",
+            hint="The current code of the task, the recorded code, or a task file that is open here",
         )
         self._code.on_update(lambda _: self._chosen())
         self._told = gui.add_html("")
         self._states = gui.add_checkbox(
             "Recorded states",
             choices.use_env_states,
-            hint="Put the recorded state in after every step, so that nothing drifts from the record",
+            hint="Restore the recorded state after every step, so that nothing drifts",
         )
         self._states.on_update(lambda _: self._chosen())
         self._add_status("Stop", rescorer.rescoring.stop)
@@ -216,7 +216,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             # Its colour, if it is one of several open recordings.
             "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
             "name": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.of.name[-24:],
-            "hint": f"{verdict.of.name}. Press to open it"
+            "hint": f"{verdict.of.name}. Click to open it"
             + (f" at step {at}, the first that differs" if at is not None else ""),
             "selected": verdict.of.id == self._selected,
         }

@@ -17,6 +17,7 @@ from workbench.session.review.review import MOST_COMPARED, Review
 from workbench.session.review.view import Opened, ReviewView
 from workbench.ui.cameras.frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
+from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import (
     EnvLayout,
     SelectionMark,
@@ -188,15 +189,15 @@ class ReviewIn3D:
         self._view = ReviewView()
         """The one that the scene was drawn for: another recording may be open since."""
         self._scene_of: object = None
-        self._triangles = 0
-        """The limit that the bodies were built with."""
+        self._looks: Looks | None = None
+        """What the bodies were built with."""
         server.scene.on_click()(self._on_click)
 
     def draw(
         self,
         view: ReviewView,
         ghosts: bool,
-        triangles: int,
+        looks: Looks,
         cameras: tuple[CameraInfo, ...],
         pictures: dict[CameraKey, Picture],
     ) -> None:
@@ -204,7 +205,7 @@ class ReviewIn3D:
 
         Args:
             ghosts: Over each other, if there are several.
-            triangles: Approximate limit.
+            looks: How bodies are drawn.
             cameras: Of the selected recording.
             pictures: Shown in their frustums.
         """
@@ -212,14 +213,14 @@ class ReviewIn3D:
         if wanted != self._scene_of:
             self._scene_of = wanted
             self._scene = review_scene(view.opened, ghosts)
-            self._triangles = 0
+            self._looks = None
         scene, self._view = self._scene, view
         if scene is None:
             self._draw_nothing(view)
             return
-        if self._triangles != triangles:
-            self._triangles = triangles
-            self.bodies.build(scene.geometry, scene.layout, scene.poses(view.states), None, triangles)
+        if self._looks != looks:
+            self._looks = looks
+            self.bodies.build(scene.geometry, scene.layout, scene.poses(view.states), None, looks)
         self.bodies.move(scene.poses(view.states), scene.layout, None)
         in_grid = len(view.opened) > 1 and not scene.ghosts
         self._mark.draw(scene.layout, view.selected, shown=in_grid, name=caption(view, view.selected))

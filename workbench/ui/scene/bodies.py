@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -11,10 +12,20 @@ from numpy.typing import NDArray
 from workbench.core.scene.shapes import SceneGeometry, fingerprint
 from workbench.core.scene.simplify import reduce_mesh
 from workbench.ui.scene.env_grid import EnvLayout, InView, place_of_plane, plane_normal
-from workbench.ui.scene.glb import VisualGroup, as_glb, face_limit, group_visuals
+from workbench.ui.scene.glb import VisualGroup, as_glb, face_limit, group_visuals, lightened
 
 NAMES = ("/envs", "/floor")
 """Roots of its nodes in viser's tree."""
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How a scene is drawn."""
+
+    triangles: int = 200_000
+    """Approximate limit; rich shapes are simplified to fit."""
+    dark: bool = True
+    """The page's theme: in the light one a dark floor is lighter than the task's."""
 
 
 class SceneView:
@@ -31,7 +42,7 @@ class SceneView:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._drawn: dict[tuple[str, int, int], _DrawnGroup] = {}
+        self._drawn: dict[tuple[str, int, bool, int], _DrawnGroup] = {}
         self._number = 0
         look = {"cell_size": 0.5, "section_size": 1.0}
         colours = {"cell_color": (150, 150, 150), "section_color": (120, 120, 120)}
@@ -44,7 +55,7 @@ class SceneView:
         layout: EnvLayout,
         poses: NDArray[np.float32],
         only_env: int | None = None,
-        triangles: int = 200_000,
+        looks: Looks = Looks(),
     ) -> None:
         """Show this scene instead of the last; groups that look the same stay and are not sent again.
 
@@ -53,23 +64,24 @@ class SceneView:
             layout: The grid of the envs.
             poses: (N, B, 7) in env frames.
             only_env: Show this env alone; None shows all.
-            triangles: Approximate limit; rich shapes are simplified to fit.
+            looks: How it is drawn.
         """
         shown_envs = geometry.num_envs if only_env is None else 1
-        limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, triangles)
+        limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, looks.triangles)
         before, self._drawn = self._drawn, {}
         for group in group_visuals(geometry):
-            looks = fingerprint(group.visuals)
-            key = (looks, limit, sum(looks == known for known, _, _ in self._drawn))
+            shape = fingerprint(group.visuals)
             first = group.visuals[0]
             normals = [plane_normal(visual, geometry, poses) for visual in group.visuals]
             once = None if normals[0] is None else place_of_plane(normals[0], first, poses, layout)
             if any(normal is None for normal in normals):
                 once = None
+            lighter = once is not None and not looks.dark
+            key = (shape, limit, lighter, sum(shape == known for known, *_ in self._drawn))
             drawn = before.pop(key, None)
             if drawn is None:
                 self._number += 1
-                drawn = _DrawnGroup(self._server, self._number, group, limit)
+                drawn = _DrawnGroup(self._server, self._number, group, limit, lighter)
             drawn.set_instances(group, once)
             self._drawn[key] = drawn
         for drawn in before.values():
@@ -105,8 +117,11 @@ class SceneView:
 
 
 class _DrawnGroup:
-    def __init__(self, server: viser.ViserServer, number: int, group: VisualGroup, limit: int) -> None:
-        glb = as_glb([(reduce_mesh(visual.mesh, limit), visual.material) for visual in group.visuals])
+    def __init__(
+        self, server: viser.ViserServer, number: int, group: VisualGroup, limit: int, lighter: bool
+    ) -> None:
+        parts = [(reduce_mesh(visual.mesh, limit), visual.material) for visual in group.visuals]
+        glb = as_glb([(mesh, lightened(material)) for mesh, material in parts] if lighter else parts)
         # One instance far below the ground; the first move follows in the same batch.
         self.handle = server.scene.add_batched_glb(
             f"/envs/{number:03d} {group.name.replace('/', ' ')}",

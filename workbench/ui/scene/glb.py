@@ -17,6 +17,10 @@ LARGEST_TEXTURE = 1024
 """Pixels. A page loads every texture before it shows anything; 4k scans are megabytes each."""
 
 
+LIGHT = 0.6
+"""Mean of the sRGB channels from which on a floor counts as light."""
+DARKNESS_KEPT = 0.3
+
 LAYER = 4e-4
 """Metres between painted layers; two steps of a 24 bit depth buffer at ten metres."""
 
@@ -118,6 +122,20 @@ def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:
             vertices[:, axis] += np.sign(vertices[:, axis]) * rank * LAYER
             lifted[number] = replace(mesh, vertices=vertices)
     return lifted
+
+
+def lightened(material: Material) -> Material:
+    """A dark material nearer to white, so that a floor goes with the light theme; a light one as it is."""
+    if material.texture is not None:
+        rgb = material.texture[..., :3]
+        if rgb.mean() >= 255 * LIGHT:
+            return material
+        lighter = np.concatenate([(255 - (255 - rgb) * DARKNESS_KEPT), material.texture[..., 3:]], axis=-1)
+        return replace(material, texture=lighter.astype(np.uint8))
+    if np.mean(material.srgb_color[:3]) >= LIGHT:
+        return material
+    red, green, blue = (1 - (1 - c) * DARKNESS_KEPT**2 for c in material.base_color[:3])
+    return replace(material, base_color=(red, green, blue, material.base_color[3]))
 
 
 def _pbr(material: Material, number: int) -> PBRMaterial:

@@ -13,7 +13,7 @@ from viser.transforms import SO3
 from workbench.core.camera_data import Picture
 from workbench.session.live.view import SessionView
 from workbench.ui.scene.bodies import NAMES as BODIES
-from workbench.ui.scene.bodies import SceneView
+from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import EnvLayout, box_corners
 from workbench.ui.server.viser_private import remove_nodes_but
 from workbench.ui.widgets.parts import PagePart
@@ -269,8 +269,8 @@ class ViewPanel(PagePart[SessionView]):
         return self._theme.value != LIGHT
 
     @property
-    def triangles(self) -> int:
-        return DETAILS[self._detail.value]
+    def looks(self) -> Looks:
+        return Looks(DETAILS[self._detail.value], self.dark)
 
     def toggle_only_selected(self) -> None:
         self._show.value = ALL if self.only_selected else ONE

@@ -86,7 +86,7 @@ class RefusedRequest:
 Decision = Admitted | Entered | RefusedRequest
 
 _OTHER_TOKEN = (
-    "The token that it showed is not this workbench's. Each start makes a new one, and so does renewing it."
+    "Its token is not valid for this workbench. Each start makes a new one, and so does renewing it."
 )
 
 
@@ -186,7 +186,7 @@ def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     if host is None or not host_is_ours(rules, host[0]):
         return RefusedRequest(
             Why.NAME,
-            "It asked for this page under a name that the workbench does not know as its own. "
+            "It used a host name that is not one of the workbench's own. "
             "Use the machine's address or host name instead.",
         )
 
@@ -220,4 +220,4 @@ def decide(rules: AccessRules, asked: RequestParts) -> Decision:
         return Admitted(asked.host[0])
     if shown:
         return RefusedRequest(Why.OTHER_TOKEN, _OTHER_TOKEN)
-    return RefusedRequest(Why.NO_TOKEN, "This browser has not shown the token of this workbench.")
+    return RefusedRequest(Why.NO_TOKEN, "This browser did not give the token of this workbench.")

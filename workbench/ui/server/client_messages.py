@@ -174,7 +174,7 @@ def read_value(raw: msgspec.Raw) -> Value:
     Raises:
         ValueError: It is nested, bytes, or of a type that no control holds.
     """
-    return _decoded(_value_decoder, raw, ValueError("No control holds that."))
+    return _decoded(_value_decoder, raw, ValueError("That is not a valid value."))
 
 
 def _check_numbers(*numbers: float) -> None:

@@ -72,7 +72,7 @@ def checked_choice(value: object, options: Iterable[Choice], name: str) -> Choic
     for option in options:
         if type(option) is type(value) and option == value:
             return option
-    raise ValueError(f"That {name} is not one of those on offer.")
+    raise ValueError(f"That is not one of the choices for {name}.")
 
 
 LARGEST_INT = 2**53
@@ -121,7 +121,7 @@ def check_value(control: Any, value: object) -> None:
     elif isinstance(control, viser.GuiButtonHandle):
         # viser takes any value of a button as a press.
         if value is not True:
-            raise ValueError(f"The {name} can be pressed, and no more.")
+            raise ValueError(f"The {name} is a button and takes no value.")
     elif isinstance(control, (viser.GuiDropdownHandle, viser.GuiButtonGroupHandle)):
         checked_choice(value, control.options, name)
     elif isinstance(control, viser.GuiTextHandle):
@@ -131,16 +131,16 @@ def check_value(control: Any, value: object) -> None:
     elif isinstance(control, (viser.GuiVector2Handle, viser.GuiVector3Handle)):
         _check_components(value, control.value, control.min, control.max, name)
     else:
-        raise ValueError(f"The {name} takes nothing from a page.")
+        raise ValueError(f"The {name} cannot be set from a page.")
 
 
 def _check_text(control: viser.GuiTextHandle, value: object, name: str) -> None:
     limit = getattr(control, _LONGEST, None)
     longest = limit or (LONGEST_TEXT if control.multiline else LONGEST_LINE)
     if not isinstance(value, str):
-        raise ValueError(f"The {name} is a text.")
+        raise ValueError(f"The {name} must be a text.")
     if len(value) > longest:
-        raise ValueError(f"The {name} takes {longest} characters; those are {len(value)}.")
+        raise ValueError(f"The {name} takes at most {longest} characters, not {len(value)}.")
     if "\0" in value or (not control.multiline and len(value.splitlines()) > 1):
         raise ValueError(f"The {name} takes one line of text.")
     if limit and not control.multiline and not value.isprintable():

@@ -34,10 +34,10 @@ RESPONSE_SECONDS = 300.0
 too little for a recording."""
 
 TURNED_AWAY = {
-    access.Why.NAME: "Turned away a request{} for a host name that is not this machine's.",
-    access.Why.SITE: "Turned away a request{} that a page of another site made in a browser.",
-    access.Why.NO_TOKEN: "Turned away a request{} that did not show the token.",
-    access.Why.OTHER_TOKEN: "Turned away a request{} with a token that is not valid: a page that was open before, perhaps.",
+    access.Why.NAME: "Refused a request{} for a host name that is not this machine's.",
+    access.Why.SITE: "Refused a request{} made by a page of another site.",
+    access.Why.NO_TOKEN: "Refused a request{} without the token.",
+    access.Why.OTHER_TOKEN: "Refused a request{} with an invalid token, perhaps from a page that was open before.",
 }
 
 
@@ -64,7 +64,7 @@ class ServerOptions:
                 f"Port {self.port} does not exist; give one from 1 to 65535, or 0 for any free one."
             )
         if self.socket is not None and self.host != "127.0.0.1":
-            raise ValueError("A socket and a host to listen on are two places; give one of them.")
+            raise ValueError("Give a socket or a host to listen on, not both.")
         if self.socket is not None and not self.token:
             raise ValueError(
                 "The other end of ssh -L is a port of that machine, to which everyone there can connect. Leave the "
@@ -199,7 +199,7 @@ class _AccessCheck:
         """At the end: print what was held back, and how many requests were refused in all."""
         self._told.say_the_rest()
         if self.turned_away > 1:
-            self._told.happened("total", f"In all {self.turned_away} requests were turned away.")
+            self._told.happened("total", f"{self.turned_away} requests were refused in total.")
 
     def _count(self, refused: access.RefusedRequest, connection: ServerConnection) -> None:
         if self.tells:

@@ -110,7 +110,7 @@ def listen_on_port(host: str, port: int) -> Listening:
             made = socket.create_server((address[0], candidate), family=family, backlog=BACKLOG)
         except PermissionError:
             raise ServerError(
-                f"Port {candidate} needs root's rights; give one from 1024 on with --port."
+                f"Port {candidate} needs root privileges; give one from 1024 up with --port."
             ) from None
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
@@ -192,7 +192,7 @@ def _make_room(place: Path) -> None:
         return
     if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.getuid():
         raise ServerError(
-            f"{place} is there, and is not a socket of yours. It is left alone; give another path."
+            f"{place} exists already and is not a socket of yours. It was left alone; give another path."
         )
     with socket.socket(socket.AF_UNIX) as client:
         client.settimeout(2.0)
@@ -203,7 +203,7 @@ def _make_room(place: Path) -> None:
             return
         except OSError:  # it listens, too busy to answer
             pass
-    raise ServerError(f"Another program listens at {place}, a workbench perhaps; give another path.")
+    raise ServerError(f"Another program is listening at {place}, perhaps a workbench; give another path.")
 
 
 def _reach(host: str) -> str:

@@ -84,7 +84,7 @@ class PageGuard:
         if self._level < 0:
             self._slowed -= self._level / RATE
             if self._slowed > PATIENCE:
-                raise MalformedMessage("more messages than a page has to say")
+                raise MalformedMessage("too many messages")
             await asyncio.sleep(-self._level / RATE)
         elif self._turns % TURN == 0:
             await asyncio.sleep(0)
@@ -149,6 +149,6 @@ class PageGuard:
         control = self._page.control(uuid)
         if control is None:
             return
-        self._told.happened("value", f"A page sent a value that a control cannot hold: {why}")
+        self._told.happened("value", f"Rejected a value from a page: {why}")
         self._page.tell(why)
         self._page.show_again(control)

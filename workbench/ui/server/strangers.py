@@ -70,7 +70,7 @@ class Strangers:
             oldest.transport.abort()
             self._told.happened(
                 "crowd",
-                f"{MOST} connections at a time do not show the token{of_peer(busiest)}; the oldest are closed.",
+                f"{MOST} connections are open without the token{of_peer(busiest)}; the oldest are closed.",
             )
         self._waiting[connection] = peer
 
@@ -169,7 +169,7 @@ async def close_when_stalled(connection: ServerConnection) -> None:
         silent = 0 if left == 0 or left < before else silent + 1
         before = left
     log.warning(
-        "Closed a browser's connection: it has read nothing for %.0f s. It may come back at any time.",
+        "Closed a browser's connection: it has read nothing for %.0f s. It may reconnect at any time.",
         READ_WITHIN,
     )
     connection.transport.abort()
@@ -241,4 +241,4 @@ class RareLog:
 
 def _line(sentence: str, times: int) -> str:
     more = "once more" if times == 1 else f"{times} more times"
-    return short_line(sentence, LONGEST_LINE) + (f" ({more} since this was last said.)" if times else "")
+    return short_line(sentence, LONGEST_LINE) + (f" ({more} since the last message.)" if times else "")

@@ -129,7 +129,7 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
     if wanted.what == "film":
         cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
         if not cameras:
-            raise ValueError(f"{name} was recorded without pictures, so there is no film of it.")
+            raise ValueError(f"{name} was recorded without pictures, so there is no video of it.")
         paths = []
         for number, camera in enumerate(cameras):
             path = wanted.folder / file_name("film", name, camera)
@@ -140,11 +140,11 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
         return paths
     path = wanted.folder / file_name(wanted.what, name)
     if wanted.what == "scene":
-        seen = _counted(scene_frames(episode, wanted.eye), episode, f"{name}: the 3-D view", on_progress)
+        seen = _counted(scene_frames(episode, wanted.eye), episode, f"{name}: the 3D view", on_progress)
         write_mp4(path, seen, fps)
     elif wanted.what == "page":
         write_scene_html(
-            path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the moving page")
+            path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the animated page")
         )
     else:
         with new_file(path) as temporary:

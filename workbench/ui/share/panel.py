@@ -27,14 +27,14 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
 
 WHAT: dict[str, What] = {
-    "Film of a camera (mp4)": "film",
-    "Film of the 3-D view (mp4)": "scene",
-    "Moving 3-D page (html)": "page",
+    "Video of a camera (mp4)": "film",
+    "Video of the 3D view (mp4)": "scene",
+    "Animated 3D page (html)": "page",
     "Sheet of pictures (png)": "sheet",
     "LeRobot dataset": "lerobot",
 }
 ALL_CAMERAS = "every camera"
-SELECTED, OPENED = "what is selected in the library", "what is open in the review"
+SELECTED, OPENED = "the selected recordings", "the open recordings"
 MOST_SHOWN = 6
 """Results in the list; the newest."""
 MOST_NAMED = 5
@@ -69,7 +69,7 @@ class SharePanel:
         self._chosen = Chosen()
         self._drawn: object = None
         self._of = server.gui.add_dropdown(
-            "Of", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="It stays as you choose it"
+            "Of", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="Stays as you choose it"
         )
         self._about = server.gui.add_html("")
         self._what = server.gui.add_dropdown("Make", tuple(WHAT))
@@ -78,16 +78,16 @@ class SharePanel:
             "Only successes", True, hint="Leave out recordings that reach success at no step"
         )
         self._fitting = server.gui.add_checkbox(
-            "Only what fits",
+            "Only compatible ones",
             True,
             hint="Leave out recordings that cannot be read, or lack what the first one has; the result names them",
         )
         self._task = server.gui.add_text(
-            "Task", "", hint="In words, for policies that read; empty: the task's id"
+            "Task", "", hint="In words, for policies that take a language instruction; empty: the task's id"
         )
         self._will = server.gui.add_html("")
         self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
-        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         self._made = server.gui.add_html("")
         self._make.on_click(lambda event: self._start(event.client))
         self._stop.on_click(lambda _: self._making.stop())
@@ -171,7 +171,7 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str
         files = [file_name(what, name, known) for name in names for known in chosen.cameras]
     else:
         known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
-        return {"what": f"one film for each camera{known} {of}", "files": (), "where": ""}
+        return {"what": f"one video for each camera{known} {of}", "files": (), "where": ""}
     return {"what": counted(len(files), "file"), "files": list(zip(files, short_names(files))), "where": ""}
 
 

@@ -156,7 +156,9 @@ class RerunView:
         self._width = LEAST
         self._asked_at: float | None = None
         """When a page last requested the panel's content, if the panel has got no width since."""
-        self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
+        self._button = server.gui.add_button(
+            "Open in rerun", icon=viser.Icon.APP_WINDOW, color="gray", disabled=True
+        )
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
 

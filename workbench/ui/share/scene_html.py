@@ -50,7 +50,7 @@ def write_scene_html(
         OSError: it cannot be written there.
     """
     if episode.geometry is None or episode.poses is None:
-        raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to show.")
+        raise ValueError(f"The recording of {episode.info.task} holds no 3D scene to show.")
     eye = eye or default_eye(episode)
     with new_file(path) as temporary:
         # viser needs a running server; its address is never shown.

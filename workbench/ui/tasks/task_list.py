@@ -189,7 +189,7 @@ class OpenDialog(PagePart[object]):
     def add_button(self) -> None:
         """Add the button that opens it to the present container."""
         button = self._server.gui.add_button(
-            OPEN, icon=viser.Icon.FOLDER_OPEN, color="gray", hint="Another task (Ctrl O)"
+            OPEN, icon=viser.Icon.FOLDER_OPEN, color="gray", hint="Open another task"
         )
         button.on_click(lambda _: self.open())
 

@@ -80,7 +80,7 @@ class RedrawLoop:
             tell_all(
                 self._server,
                 "This page could not be drawn",
-                "The reason is in the terminal of the workbench. It is tried again.",
+                "The reason is in the terminal of the workbench. Trying again.",
                 "red",
                 5.0,
             )

@@ -42,7 +42,9 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         """As the status says it; the rows need not say it again."""
 
     def _add_status(self, label: str, stop: Callable[[], None]) -> None:
-        self._stop = self._server.gui.add_button(label, icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._stop = self._server.gui.add_button(
+            label, icon=viser.Icon.PLAYER_STOP, color="gray", visible=False
+        )
         self._stop.on_click(lambda _: stop())
         self._status = self._server.gui.add_html("")
 

@@ -1,0 +1,227 @@
+"""Every tab in the sizes and themes that people use: nothing is cut, covered or too close, and the view keeps its room."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.conftest import At
+from tests.browser.layout import FAULTS
+from tests.browser.tab_pictures import GOLDEN, LIVE_TABS, REVIEW_TABS
+from tests.drive.desk import Desk
+from tests.drive.page import close_notice, open_workbench, page_at, picture_of_view
+from tests.drive.studio import press
+from tests.drive.waiting import until
+
+pytestmark = pytest.mark.browser
+SLOW = pytest.mark.slow
+SIZES = [(1280, 720), pytest.param((1440, 900), marks=SLOW), pytest.param((1920, 1080), marks=SLOW)]
+DEFECTS = {
+    "buttons touch": ".mantine-Flex-root { gap: 0 !important }",
+    "cut": "label { display: block; width: 12px; overflow: hidden; white-space: nowrap }",
+    "a slider lies over": ".mantine-Slider-markLabel { margin-top: -4px !important }",
+    "a scroll bar lies over": ".wb-row { margin-right: -25px }",
+    "panels on each other": "[data-floating-window] { left: 600px !important }",
+    "text over a button's edge": ".mantine-Button-root { max-width: 30px; min-width: 0 !important }",
+    "on each other": ".wb-row { height: 4px; min-height: 0 !important }",
+}
+VIEW = "canvas[data-engine]"
+
+
+@pytest.fixture(scope="module")
+def opened(example: At, browser: Browser) -> Iterator[Desk]:
+    with example(browser) as desk:
+        close_notice(desk.page)
+        desk.press("r")
+        desk.tab("Reward")
+        desk.comes_to(0)
+        desk.press("s", "s")
+        desk.comes_to(2)
+        yield desk
+        assert not desk.errors
+
+
+@pytest.fixture
+def desk(opened: Desk) -> Desk:
+    opened.page.set_viewport_size({"width": 1280, "height": 720})
+    return opened
+
+
+def faults(page: Page) -> list[str]:
+    """What is still there when the page has come to rest."""
+    found: list[str] = []
+
+    def rests() -> bool:
+        before, found[:] = list(found), page.evaluate(FAULTS)
+        return not found or before == found
+
+    page.wait_for_timeout(300)
+    until(rests, "a page that stands still", seen=lambda: found)
+    return found
+
+
+def width_of(page: Page, what: str) -> float:
+    return page.evaluate("s => document.querySelector(s).parentElement.getBoundingClientRect().width", what)
+
+
+def look_at_all(page: Page, tabs: tuple[str, ...], table: str) -> dict[str, list[str]]:
+    found = {}
+    for tab in tabs:
+        page.get_by_role("tab", name=tab, exact=True).click()
+        if tab == "Studio":
+            expect(page.get_by_role("button", name=re.compile("Look through"))).to_be_visible()
+        found[tab] = faults(page)
+    page.keyboard.press("b")
+    found[table] = faults(page)
+    page.keyboard.press("b")
+    return {tab: said for tab, said in found.items() if said}
+
+
+def choose_camera(desk: Desk) -> None:
+    desk.tab("Studio")
+    camera = desk.page.locator("input[aria-haspopup=listbox]:visible").first
+    if camera.input_value() == "none":
+        camera.click()
+        desk.page.get_by_role("option", name=re.compile("^base_camera")).first.click()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_tab_of_the_live_page_in_both_themes(desk: Desk, size: tuple[int, int]) -> None:
+    choose_camera(desk)
+    desk.page.set_viewport_size({"width": size[0], "height": size[1]})
+    found = look_at_all(desk.page, LIVE_TABS, "Envs")
+    desk.press("d")
+    expect(desk.page.locator("html")).to_have_attribute("data-mantine-color-scheme", "light")
+    in_light = look_at_all(desk.page, LIVE_TABS, "Envs")
+    desk.press("d")
+    assert (found, in_light) == ({}, {})
+
+
+def test_what_is_wrong_is_found(desk: Desk) -> None:
+    desk.tab("Run")
+    for kind, css in DEFECTS.items():
+        sheet = desk.page.evaluate_handle(
+            "css => document.head.appendChild(Object.assign(document.createElement('style'), {textContent: css}))",
+            css,
+        )
+        until(lambda kind=kind: any(fault.startswith(kind) for fault in desk.page.evaluate(FAULTS)), kind)
+        sheet.evaluate("sheet => sheet.remove()")
+    assert faults(desk.page) == []
+
+
+def test_the_view_keeps_half_of_the_page_beside_the_envs(desk: Desk) -> None:
+    desk.press("b")
+    until(
+        lambda: width_of(desk.page, VIEW) >= 640,
+        "a view of half the page",
+        seen=lambda: width_of(desk.page, VIEW),
+    )
+    desk.page.set_viewport_size({"width": 1920, "height": 1080})
+    fits = "() => { const t = document.querySelector('.wb-env-table'); return t.scrollWidth <= t.closest('.mantine-ScrollArea-viewport').clientWidth && t.closest('[data-dock-region]').offsetWidth - t.offsetWidth < 40 }"
+    until(lambda: desk.page.evaluate(fits), "a table as wide as its columns")
+    pills = desk.page.locator(".wb-envs")
+    pills.get_by_text("columns ▾").click()
+    pills.get_by_text("✓ fail").click()
+    expect(desk.page.locator(".wb-env-table th", has_text="fail")).to_have_count(0)
+    pills.get_by_text("fail", exact=True).click()
+    expect(desk.page.locator(".wb-env-table th", has_text="fail")).to_have_count(1)
+    pills.get_by_text("columns ▴").click()
+    desk.press("b")
+
+
+def test_all_tabs_are_in_one_row_and_inputs_are_written_as_their_labels(desk: Desk) -> None:
+    for name in LIVE_TABS:
+        desk.tab(name)
+        rows = desk.page.evaluate(
+            "() => [...document.querySelectorAll('[role=tab]')].filter(e => e.closest('[data-dock-region=right]')).map(e => e.offsetTop)"
+        )
+        assert len(rows) == len(LIVE_TABS) and len(set(rows)) == 1
+    desk.tab("Run")
+    fonts = desk.page.evaluate(
+        "() => [...document.querySelectorAll('label, .mantine-Input-input')].filter(e => e.offsetParent && e.closest('[data-dock-region=right]')).map(e => getComputedStyle(e))"
+        ".map(s => [s.fontSize, s.fontFamily, s.letterSpacing].join())"
+    )
+    assert len(fonts) > 8 and len(set(fonts)) == 1, set(fonts)
+
+
+def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> None:
+    choose_camera(desk)
+    timeline = desk.page.locator("[data-floating-window]")
+    high = timeline.bounding_box()
+    press(desk.page, "Look through")
+    view = desk.page.evaluate("s => document.querySelector(s).getBoundingClientRect().toJSON()", VIEW)
+
+    def orange_rows() -> list[int]:
+        x, y = view["x"] + 20, view["y"]
+        picture = picture_of_view(
+            desk.page, {"x": x, "y": y, "width": view["width"] - 40, "height": view["height"]}
+        )
+        like = (np.abs(picture.astype(int) - (245, 159, 0)).max(axis=2) < 60).mean(axis=1)
+        return np.flatnonzero(like > 0.3).tolist()
+
+    until(lambda: len(orange_rows()) > 1, "the border of the picture", seen=orange_rows)
+    box = timeline.bounding_box()
+    assert box is not None and high is not None and box["height"] < 40
+    assert max(orange_rows()) + view["y"] < box["y"]
+    press(desk.page, "Back to my view")
+    until(lambda: timeline.bounding_box() == high, "the timeline as it was")
+
+
+def test_the_light_theme_has_a_light_view(desk: Desk) -> None:
+    clip = {"x": 420.0, "y": 10.0, "width": 200.0, "height": 60.0}
+    dark = picture_of_view(desk.page, clip).mean()
+    desk.press("d")
+    until(lambda: picture_of_view(desk.page, clip).mean() > 170, "a light floor")
+    assert dark < 130
+    desk.press("d")
+
+
+@pytest.fixture(scope="module")
+def review_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("golden")
+    shutil.copytree(GOLDEN / "v1", folder / "v1")
+    with open_workbench("v1", cwd=folder, what="review") as opened:
+        yield opened.url
+
+
+@SLOW
+@pytest.mark.parametrize("size", [(1280, 720), (1440, 900), (1920, 1080)])
+def test_every_tab_of_the_review_in_both_themes(
+    review_address: str, browser: Browser, size: tuple[int, int]
+) -> None:
+    with page_at(browser, review_address, *size) as (page, errors):
+        rows = page.locator(".wb-library").get_by_text(re.compile("/Golden"))
+        expect(rows).to_have_count(7, timeout=120_000)
+        close_notice(page)
+        rows.first.click()
+        page.keyboard.press("Enter")
+        expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible()
+        found = look_at_all(page, REVIEW_TABS, "Library")
+        page.keyboard.press("d")
+        in_light = look_at_all(page, REVIEW_TABS, "Library")
+        page.keyboard.press("d")
+        assert (found, in_light, errors) == ({}, {}, [])
+
+
+def test_a_browser_without_webgl_says_what_is_missing_and_what_to_do(
+    example: At, browser: Browser, chromium_path: str
+) -> None:
+    without = browser.browser_type.launch(
+        executable_path=chromium_path, args=["--no-sandbox", "--disable-3d-apis"]
+    )
+    with example(browser) as desk:
+        page = without.new_page()
+        page.goto(desk.opened.url)
+        told = page.get_by_role("alert").filter(has_text="This browser has no WebGL 2")
+        expect(told).to_be_visible()
+        expect(told).to_contain_text("Use graphics acceleration when available")
+        assert page.evaluate(
+            "() => { const r = document.querySelector('.wb-needs-webgl').getBoundingClientRect(); return r.width >= innerWidth && r.height >= innerHeight }"
+        )
+        expect(desk.page.get_by_text("This browser has no WebGL 2")).to_have_count(0)
+    without.close()
