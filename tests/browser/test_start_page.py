@@ -68,6 +68,7 @@ def runs(page: Page, title: str, envs: str = "2 envs") -> None:
 
 
 def open_list(page: Page) -> None:
+    expect(page.locator(".wb-status")).to_be_visible(timeout=PATIENT)
     page.keyboard.press("Control+o")
     expect(page.get_by_role("dialog").locator(".wb-tasks")).to_be_visible()
 
@@ -164,6 +165,7 @@ def test_options_are_applied_on_the_page_and_bad_ones_leave_the_envs(
         assert errors == []
 
 
+@pytest.mark.slow
 def test_the_list_is_in_the_review_too(started: Opened, browser: Browser) -> None:
     with page_at(browser, started.url) as (page, errors):
         open_list(page)

@@ -28,7 +28,8 @@ class Base:
     SUPPORTED_ROBOTS: Any = ["panda", ("panda", "panda")]
     SUPPORTED_OBS_MODES = ("state", "none", "any_textures")
     SUPPORTED_REWARD_MODES = ("dense", "none")
-    obs_mode, reward_mode, robot_uids = "state", "dense", "panda"
+    obs_mode, reward_mode = "state", "dense"
+    robot_uids: Any = "panda"
     control_mode = "pd_joint_pos"
     agent: Any = SimpleNamespace(uid="panda", supported_control_modes=["pd_joint_pos", "pd_ee_pose"])
 
