@@ -184,7 +184,7 @@ class OpenDialog(PagePart[object]):
         """
         self._server, self._chooser, self._asking, self._clock = server, chooser, asking, clock
         self._lock = threading.RLock()
-        self._shown: tuple[Dialog, TaskList] | None = None
+        self._shown: tuple[Dialog, TaskList, viser.CommandHandle] | None = None
 
     def add_button(self) -> None:
         """Add the button that opens it to the present container."""
@@ -202,14 +202,19 @@ class OpenDialog(PagePart[object]):
             with self._server.atomic():
                 dialog = Dialog(self._server, "Open a task", lambda: self._asking(False))
                 with dialog.modal:
-                    self._shown = dialog, TaskList(self._server, self._chooser, self.close, self._clock)
+                    listed = TaskList(self._server, self._chooser, self.close, self._clock)
+                # viser's windows do not hear it themselves.
+                escape = self._server.gui.add_command("Close the list of tasks", hotkey="escape")
+                escape.on_trigger(lambda _: self.close())
+                self._shown = dialog, listed, escape
             self._asking(True)
 
     def close(self) -> None:
         with self._lock:
             shown, self._shown = self._shown, None
-            if shown is not None:
-                shown[0].close()
+            # False if a page switch has removed both.
+            if shown is not None and shown[0].close():
+                shown[2].remove()
 
     def draw(self, view: object) -> None:
         with self._lock:
