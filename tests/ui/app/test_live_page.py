@@ -193,7 +193,11 @@ def test_inspect_shows_joints_and_studio_a_sensor_camera_as_soon_as_they_are_ope
     opened.draw()
     view = wait_until(opened.session, lambda view: view.inspection is not None, "the joints")
     opened.draw()
-    assert view.inspection.joints and "panda_joint1" in inspect.html("wb-inspect")
+    assert (
+        view.inspection is not None
+        and view.inspection.joints
+        and "panda_joint1" in inspect.html("wb-inspect")
+    )
     assert opened.session.view().studio.selected is None
     studio.press("unfolded")
     chosen = opened.session.view().studio.selected
