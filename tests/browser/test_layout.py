@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, FloatRect, Page, expect
 
 from tests.browser.conftest import At
 from tests.browser.layout import FAULTS
@@ -173,7 +173,7 @@ def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> Non
 
 
 def test_the_light_theme_has_a_light_view(desk: Desk) -> None:
-    clip = {"x": 420.0, "y": 10.0, "width": 200.0, "height": 60.0}
+    clip: FloatRect = {"x": 420.0, "y": 10.0, "width": 200.0, "height": 60.0}
     dark = picture_of_view(desk.page, clip).mean()
     desk.press("d")
     until(lambda: picture_of_view(desk.page, clip).mean() > 170, "a light floor")
