@@ -128,6 +128,7 @@ def finished(process: subprocess.Popen[str]) -> str:
     return said
 
 
+@pytest.mark.slow
 def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None:
     """The task lies there too: what is beside it is found, but for what has a library's name."""
     plant(tmp_path, *PLANTED)

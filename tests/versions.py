@@ -123,7 +123,9 @@ def install(name: str, version: str, torch: str, folder: Path) -> Path:
     venv = folder / f"{name}-{version}"
     python = venv / "bin" / "python"
     if not python.exists():
-        maker = [uv, "venv", "-q", "--python", version] if uv else [f"python{version}", "-m", "venv"]
+        maker = (
+            [uv, "venv", "-q", "--seed", "--python", version] if uv else [f"python{version}", "-m", "venv"]
+        )
         subprocess.run([*maker, str(venv)], check=True)
     installer = (
         [uv, "pip", "install", "--python", str(python)] if uv else [str(python), "-m", "pip", "install"]

@@ -373,6 +373,7 @@ def test_files_for_opencv_and_ros_say_what_the_page_says(page: Page) -> None:
     page.get_by_text("Matrices and files", exact=True).click()
 
 
+@pytest.mark.slow
 def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_be_stopped(page: Page) -> None:
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("r")

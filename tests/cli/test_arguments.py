@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import sys
+from pathlib import Path
+
 import pytest
 
+from workbench.cli import main
 from workbench.cli.arguments import EnvArguments, Rules, history_bytes
 
 
@@ -57,3 +62,18 @@ def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
     for wrong in ("robot_uids", "=1", "a-b=1", "1a=1"):
         with pytest.raises(ValueError, match="--env takes name=value"):
             EnvArguments(env=(wrong,)).options()
+
+
+def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # As if a name that an older viser lacks were imported.
+    monkeypatch.setitem(sys.modules, "workbench.cli.page", None)
+    with pytest.raises(ImportError):
+        main.main(["review", str(tmp_path)])
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: ["viser>=99"])
+    with pytest.raises(SystemExit) as ended:
+        main.main(["review", str(tmp_path)])
+    first, second = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2
+    assert first.startswith("viser>=99 is wanted, ") and second.endswith("install 'viser>=99'")

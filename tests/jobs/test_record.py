@@ -97,7 +97,8 @@ def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recor
 
 
 @pytest.mark.parametrize(
-    ("num_envs", "workers", "executor"), [(1, 1, None), (1, 1, Processes()), (3, 3, None)]
+    ("num_envs", "workers", "executor"),
+    [(1, 1, None), pytest.param(1, 1, Processes(), marks=pytest.mark.slow), (3, 3, None)],
 )
 def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
     recorded: Recorded, num_envs: int, workers: int, executor: Executor | None, tmp_path: Path
@@ -367,6 +368,7 @@ def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
         record(RecordOptions("PickCube-v1", tmp_path / "out", options=options))
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
     (tmp_path / "hangs.py").write_text(
         "from pathlib import Path\n\nasked = 0\n\n\n"

@@ -257,6 +257,7 @@ def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.
 # --- for a page ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreign: Path) -> None:
     rescorer = Rescorer()
     try:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import socket
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,30 @@ def test_a_version_that_was_not_tested_is_named_with_the_way_back(
     (finding,) = doctor._maniskill()
     assert finding.ok is None and f"not tested: viser {tested}" in finding.what
     assert finding.advice and "pip install" in finding.advice and "viser==0.1" in finding.advice
+
+
+def test_what_a_requirement_excludes_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        versions.importlib.metadata, "requires", lambda name: ["viser<1", "no-such-package>=2"]
+    )
+    (finding,) = doctor._packages()
+    assert finding.ok is False and "viser<1 is wanted" in finding.what
+    assert "no-such-package>=2 is missing" in finding.what
+    assert (
+        finding.advice and f"{sys.executable} -m pip install 'viser<1' 'no-such-package>=2'" in finding.advice
+    )
+
+
+def test_a_question_that_takes_too_long_is_told_without_its_program(
+    child_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "CHILD_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(doctor, "GPU_QUESTIONS", "import time; time.sleep(60)")
+    monkeypatch.setattr(doctor, "VERSION_QUESTIONS", "import time; time.sleep(60)")
+    found = {finding.topic: finding for finding in doctor.diagnose()}
+    for topic in ("CUDA", "ManiSkill"):
+        assert found[topic].what == "not known: it took more than 0.1 s", topic
+        assert "again" in (found[topic].advice or "")
 
 
 def test_gpu_physics_is_looked_for_without_fetching_it(

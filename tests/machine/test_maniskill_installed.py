@@ -23,6 +23,7 @@ WHEEL = "file:///somewhere/workbench.whl"
 @pytest.fixture
 def lacking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(maniskill_installed, "find_spec", lambda name: None)
+    monkeypatch.setattr(maniskill_installed, "installed_maniskills", dict)
 
 
 @pytest.fixture
@@ -102,6 +103,7 @@ def test_uvx_is_named_with_our_wheel_and_what_was_typed(lacking: None, environme
     assert lines is not None
     assert (
         lines[1] == f"Type: uvx --from 'maniskill-workbench[maniskill] @ {WHEEL}' workbench open 'my task.py'"
+        "  # with the -c and --find-links that you gave uvx"
     )
 
 
@@ -152,15 +154,29 @@ def test_two_that_are_mixed_are_told_with_how_to_keep_one(mixed: None, environme
     assert lines is not None
     assert lines[0].startswith("mani_skill==3.0.1 and mani_skill-nightly==2026.8.2.400 are both installed")
     pip = f"'{environment}/bin/python' -m pip"
-    assert lines[1] == (
-        f"Type: {pip} uninstall -y mani_skill mani_skill-nightly && {pip} install mani_skill==3.0.1"
-        "  (or mani_skill-nightly==2026.8.2.400)"
+    away = f"{pip} uninstall -y mani_skill mani_skill-nightly"
+    assert lines[1:] == (
+        f"To keep the release, type: {away} && {pip} install mani_skill==3.0.1",
+        f"To keep the nightly build, type: {away} && {pip} install mani_skill-nightly==2026.8.2.400",
     )
     made_by_uv(environment)
     lines = lines_if_mixed()
     assert (
         lines is not None and f"uv pip uninstall --python '{environment}/bin/python' mani_skill" in lines[1]
     )
+
+
+def test_of_two_that_were_mixed_the_one_that_is_left_without_files_is_put_back(
+    environment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(maniskill_installed, "find_spec", lambda name: None)
+    left = {"mani_skill-nightly": "2026.8.2.400"}
+    monkeypatch.setattr(maniskill_installed, "installed_maniskills", lambda: left)
+    lines = lines_if_lacking("It")
+    assert lines is not None and "mani_skill-nightly 2026.8.2.400 is installed" in lines[0]
+    pip = f"'{environment}/bin/python' -m pip"
+    both = f"{pip} uninstall -y mani_skill-nightly && {pip} install mani_skill-nightly==2026.8.2.400"
+    assert lines[1] == f"Type: {both}"
 
 
 def test_open_warns_of_the_mix_and_goes_on(mixed: None, capsys: pytest.CaptureFixture[str]) -> None:
@@ -183,4 +199,8 @@ def test_doctor_says_both(
 
 def test_doctor_warns_of_the_mix(mixed: None) -> None:
     (finding,) = doctor._maniskill()
-    assert finding.ok is None and "both" in finding.what and (finding.advice or "").startswith("Type: ")
+    assert finding.ok is None and "both" in finding.what
+    assert [line.partition(", type: ")[0] for line in (finding.advice or "").splitlines()] == [
+        "To keep the release",
+        "To keep the nightly build",
+    ]

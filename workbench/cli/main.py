@@ -354,6 +354,14 @@ def main(args: Sequence[str] | None = None) -> None:
         )
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds
         code = refuse("interrupted")
+    except ImportError:
+        # A package that is older than the range lacks what is imported of it.
+        from workbench.machine.versions import unmet_lines
+
+        if (unmet := unmet_lines()) is None:
+            raise
+        for line in unmet:
+            code = refuse(line)
     sys.exit(code)
 
 

@@ -33,7 +33,12 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CallSite, CameraKey, CameraKind
-from workbench.machine.versions import PrivateName, moved_text, untested_text
+from workbench.machine.versions import (
+    PrivateName,
+    command_for_tested_versions,
+    moved_text,
+    untested_text,
+)
 
 # --- what depends on which name ---------------------------------------------------------------------
 
@@ -110,7 +115,9 @@ def version_notice() -> str:
 
 def _with_advice(moved: Iterable[PrivateName]) -> str:
     text = moved_text(moved)
-    return f"{text} {untested_text()}".rstrip() if text else ""
+    if not text:
+        return ""
+    return f"{text} {untested_text() or f'The tested versions: {command_for_tested_versions()}'}"
 
 
 def draw_at(drawn: Any, pose: NDArray[np.float32]) -> None:

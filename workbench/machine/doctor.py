@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import importlib.metadata
 import json
 import os
 import platform
@@ -19,14 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from packaging.requirements import Requirement
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from workbench.machine import DISTRIBUTION, versions
 from workbench.machine.apt import has_apt, os_release
-from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
+from workbench.machine.maniskill_installed import lacks_maniskill, lines_if_lacking, lines_if_mixed
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 from workbench.machine.render_probe import driver_files
@@ -35,7 +33,7 @@ from workbench.machine.software_vulkan import ensure_render_device
 DEFAULT_PORT = 8080
 LEAST_MEMORY_GIB = 6.0
 """One worker with 16 envs and cameras on a software driver, its warm spare, the server and a browser."""
-CHILD_TIMEOUT_S = 60
+CHILD_TIMEOUT_S = 120
 
 GPU_QUESTIONS = """
 import json, torch
@@ -68,6 +66,10 @@ class DoctorFinding:
     """What to do; None if all is well."""
 
 
+class _TookTooLong(Exception):
+    """A child process did not answer in time."""
+
+
 def diagnose() -> list[DoctorFinding]:
     """Check everything. Never raises: a check that fails is a finding with the failure in it.
 
@@ -92,6 +94,9 @@ def diagnose() -> list[DoctorFinding]:
         failure = answer.exception()
         if failure is None:
             findings += answer.result()
+        elif isinstance(failure, _TookTooLong):
+            advice = "The machine is busy, or a driver hangs: run workbench doctor again."
+            findings.append(DoctorFinding(topic, None, f"not known: {failure}", advice))
         else:
             advice = "This question should not fail: please report it."
             findings.append(
@@ -117,7 +122,10 @@ def print_report(findings: Sequence[DoctorFinding], console: Console | None = No
         text = escape(finding.what) + (f"\n[bold]{escape(finding.advice)}[/]" if finding.advice else "")
         table.add_row(marks[finding.ok], finding.topic, text)
     console.print(table)
-    if exit_code(findings):
+    failed = {finding.topic for finding in findings if finding.ok is False}
+    if failed == {"ManiSkill"} and lacks_maniskill():
+        console.print("No task can be opened here yet; review, view, share and export work.", style="red")
+    elif failed:
         console.print("The workbench cannot run here yet.", style="red")
     elif any(finding.ok is None for finding in findings):
         console.print("The workbench runs here, with less where it says so.")
@@ -140,24 +148,13 @@ def _python() -> list[DoctorFinding]:
 
 def _packages() -> list[DoctorFinding]:
     """Installed versions against the distribution's requirements."""
-    try:
-        requirements = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
-    except importlib.metadata.PackageNotFoundError:
+    if versions.installed(DISTRIBUTION) is None:
         return [DoctorFinding("packages", False, f"{DISTRIBUTION} is not installed", "Type: make open")]
-    wrong: list[str] = []
-    for requirement in requirements:
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
-            continue
-        version = versions.installed(requirement.name)
-        if version is None:
-            wrong.append(f"{requirement} is missing")
-        elif not requirement.specifier.contains(version, prereleases=True):
-            wrong.append(f"{requirement} is wanted, {version} is installed")
     shown = [name for name in (*versions.TESTED, "torch", "numpy") if versions.installed(name) is not None]
     what = ", ".join(f"{name} {versions.installed(name)}" for name in (DISTRIBUTION, *shown))
-    if wrong:
-        advice = "Type: pip install -c constraints.txt -e '.[maniskill]'  (in a clone: make open)"
-        return [DoctorFinding("packages", False, f"{what}. {'; '.join(wrong)}", advice)]
+    if (unmet := versions.unmet_lines()) is not None:
+        wrong, advice = unmet
+        return [DoctorFinding("packages", False, f"{what}. {wrong}", f"{advice}\nIn a clone: make open")]
     return [DoctorFinding("packages", True, what)]
 
 
@@ -168,7 +165,7 @@ def _maniskill() -> list[DoctorFinding]:
     if (lacking := lines_if_lacking("A task")) is not None:
         return [DoctorFinding(topic, False, *lacking)]
     if (mixed := lines_if_mixed()) is not None:
-        return [DoctorFinding(topic, None, *mixed)]
+        return [DoctorFinding(topic, None, mixed[0], "\n".join(mixed[1:]))]
     answer = _ask_child(VERSION_QUESTIONS)
     if isinstance(answer, str):
         return [
@@ -185,9 +182,8 @@ def _maniskill() -> list[DoctorFinding]:
     if untested := versions.untested():
         names = ", ".join(f"{name} {version}" for name, version in untested.items())
         what = f"not tested: {names}; all private names that the workbench uses are there"
-        return [
-            DoctorFinding(topic, None, what, f"If something fails: {versions.command_for_tested_versions()}")
-        ]
+        advice = f"If something fails: {versions.command_for_tested_versions()}"
+        return [DoctorFinding("versions", None, what, advice)]
     found = versions.maniskill()
     if found is None:
         return [DoctorFinding(topic, True, "on Python's path, and not as an installed distribution")]
@@ -258,14 +254,18 @@ def _gpu() -> list[DoctorFinding]:
 
 def _ask_child(code: str) -> Any:
     """What `code` prints last, as JSON; if it fails, the last line of its error."""
-    child = subprocess.run(
-        python_command("-c", code),
-        env=child_environment(),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=CHILD_TIMEOUT_S,
-    )
+    try:
+        child = subprocess.run(
+            python_command("-c", code),
+            env=child_environment(),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=CHILD_TIMEOUT_S,
+        )
+    except subprocess.TimeoutExpired:
+        # Its own text is the whole program that was asked.
+        raise _TookTooLong(f"it took more than {CHILD_TIMEOUT_S} s") from None
     if child.returncode != 0:
         return (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
     return json.loads(child.stdout.strip().splitlines()[-1])

@@ -44,20 +44,28 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
     """
     if not lacks_maniskill():
         return None
+    if found := installed_maniskills():
+        name, version = next(iter(found.items()))
+        return (
+            f"{what} needs ManiSkill: {name} {version} is installed in {sys.prefix} without its files, which went when "
+            "another distribution of it was removed.",
+            f"Type: {pip_command('uninstall', name)} && {pip_command('install', f'{name}=={version}')}",
+        )
     command = command_to_install("mani_skill", arguments)
     return f"{what} needs ManiSkill, which is not installed in {sys.prefix}.", f"Type: {command}"
 
 
-def lines_if_mixed() -> tuple[str, str] | None:
-    """Two lines where both distributions are installed: what that means, and the command to type. None if there is no such mix."""
+def lines_if_mixed() -> tuple[str, str, str] | None:
+    """Three lines where both distributions are installed: what that means, and the command that keeps each. Else None."""
     found = installed_maniskills()
     if len(found) < 2:
         return None
     release, nightly = (f"{name}=={version}" for name, version in found.items())
-    yes = " -y" if _uv_environment() is None else ""
+    away = pip_command("uninstall", *found)
     return (
         f"{release} and {nightly} are both installed, and one has written over files of the other: keep one of them.",
-        f"Type: {_pip('uninstall')}{yes} {' '.join(found)} && {_pip('install')} {release}  (or {nightly})",
+        f"To keep the release, type: {away} && {pip_command('install', release)}",
+        f"To keep the nightly build, type: {away} && {pip_command('install', nightly)}",
     )
 
 
@@ -71,13 +79,20 @@ def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str
     if kind == "tool":
         return f"uv tool install --force {ours}"
     if kind == "uvx":
-        return f"uvx --from {ours} workbench {'...' if arguments is None else shlex.join(arguments)}"
-    return f"{_pip('install')} {shlex.quote(_requirement(name))}"
+        # What was given to uvx before --from is not known here.
+        rest = "..." if arguments is None else shlex.join(arguments)
+        return f"uvx --from {ours} workbench {rest}  # with the -c and --find-links that you gave uvx"
+    return pip_command("install", _requirement(name))
 
 
-def _pip(verb: str) -> str:
+def pip_command(verb: str, *requirements: str) -> str:
+    """What installs or uninstalls these in the environment of this process: with uv where uv has made it, else with pip."""
     python = shlex.quote(sys.executable)
-    return f"{python} -m pip {verb}" if _uv_environment() is None else f"uv pip {verb} --python {python}"
+    if _uv_environment() is not None:
+        command = f"uv pip {verb} --python {python}"
+    else:
+        command = f"{python} -m pip {verb}{' -y' if verb == 'uninstall' else ''}"
+    return f"{command} {' '.join(map(shlex.quote, requirements))}"
 
 
 def _requirement(name: str) -> str:

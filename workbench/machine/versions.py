@@ -11,7 +11,10 @@ from functools import cache
 from types import CodeType
 from typing import Any
 
-from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills
+from packaging.requirements import Requirement
+
+from workbench.machine import DISTRIBUTION
+from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills, pip_command
 
 MANISKILL = tuple(EXTRAS)
 """Two distributions with the same files: the release, and the build of a night."""
@@ -96,7 +99,35 @@ def untested(distributions: Iterable[str] = TESTED) -> dict[str, str]:
 def command_for_tested_versions() -> str:
     """The command that installs the tested versions of what is installed."""
     wanted = [f"{name}=={TESTED[name][0]}" for name in TESTED if installed(name) is not None]
-    return f"pip install {' '.join(wanted)}"
+    return pip_command("install", *wanted)
+
+
+def unmet_requirements() -> list[tuple[Requirement, str | None]]:
+    """What this distribution asks for and is lacking or of another version, which comes with it.
+
+    Raises:
+        PackageNotFoundError: The distribution itself is not installed.
+    """
+    found = []
+    for requirement in map(Requirement, importlib.metadata.requires(DISTRIBUTION) or []):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        version = installed(requirement.name)
+        if version is None or not requirement.specifier.contains(version, prereleases=True):
+            found.append((requirement, version))
+    return found
+
+
+def unmet_lines() -> tuple[str, str] | None:
+    """Two lines where requirements are unmet: which, and the command to type. None where all are met, or we are not installed."""
+    try:
+        unmet = unmet_requirements()
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    if not unmet:
+        return None
+    wrong = (f"{r} is {'missing' if v is None else f'wanted, {v} is installed'}" for r, v in unmet)
+    return f"{'; '.join(wrong)}.", f"Type: {pip_command('install', *(str(r) for r, _ in unmet))}"
 
 
 def untested_text() -> str:

@@ -134,6 +134,7 @@ def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_e
     assert rows.outliers.keys() == before.outliers.keys() - {2}
 
 
+@pytest.mark.slow
 def test_a_healthy_task_played_hard_has_none(child_process: None, tmp_path: Path) -> None:
     with live_session(TASKS / "push_cube.py", tmp_path, num_envs=4) as session:
         session.change(speed=math.inf)

@@ -68,6 +68,7 @@ def test_a_task_of_a_package_opens_and_is_followed(project: Path) -> None:
         session.close()
 
 
+@pytest.mark.slow
 def test_an_id_that_a_package_registers_is_recorded_with_import(project: Path) -> None:
     plain = (
         "--episodes",

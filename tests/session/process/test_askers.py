@@ -187,7 +187,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
         assert background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
 
 
-@pytest.mark.parametrize("aside", [True, False])
+@pytest.mark.parametrize("aside", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_afterwards(
     background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,7 +229,7 @@ def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_a
     assert told[-1] == "waiting for other work in the background"
 
 
-@pytest.mark.parametrize("aside", [True, False])
+@pytest.mark.parametrize("aside", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_what_was_begun_last_is_left_alone_by_what_waits_behind_it(
     background: Background, tmp_path: Path, aside: bool
 ) -> None:

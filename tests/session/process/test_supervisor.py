@@ -173,6 +173,7 @@ def test_the_third_death_in_a_row_is_the_last_until_somebody_asks() -> None:
         assert (fourth.asked, fourth.gives_up) == (False, False), "it waited to be asked, and begins anew"
 
 
+@pytest.mark.slow
 def test_a_task_that_was_loaded_forgives_earlier_deaths() -> None:
     with minded() as one:
         for times in (1, 2, 3, 4):
@@ -241,6 +242,7 @@ def test_a_load_waits_for_short_work_only() -> None:
         one.until(lambda: not one.worker.load_pending, "that it was taken up")
 
 
+@pytest.mark.slow
 def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
     with minded() as one:
         for times in (1, 2, 3):

@@ -38,7 +38,6 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 PAGES = {
-    "1.1.0": ("U9UogJuG6uytpJInzruiR1EViU26FzZRLcQtg8eGPAE=", "5Z0OMwGX2cL14pfD43ov2vozhQ3bvS8sliVyD1MG8XU="),
     "1.1.1": ("5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=", "o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE="),
 }
 """sha256 of the two scripts of viser's page, by viser's version: the one in the page, and the one that it unpacks.
