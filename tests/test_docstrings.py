@@ -90,7 +90,7 @@ def test_what_stands_under_raises_is_an_exception_that_there_is() -> None:
     assert wrong == []
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "web_assets/docs").glob("*.md")), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", sorted((ROOT / "web_assets/docs").rglob("*.md")), ids=lambda page: page.stem)
 def test_every_file_that_a_document_names_is_there(page: Path) -> None:
     named = set(PATH_IN_A_DOCUMENT.findall(page.read_text()))
     gone = [

@@ -7,7 +7,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import traceback
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from workbench.core.env.cpu_scene import SIM_BACKEND
 pytestmark = pytest.mark.thorough
 
 TASKS = Path(__file__).resolve().parents[1] / "tasks"
-README = TASKS.parent / "README.md"
 
 
 @pytest.fixture
@@ -409,26 +407,3 @@ def test_importing_the_package_imports_no_simulation(child_process: None) -> Non
 def test_a_name_that_the_package_lacks_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'patch'"):
         workbench.patch  # noqa: B018
-
-
-# --- the README ------------------------------------------------------------------------------------
-
-
-def readme_example() -> str:
-    section = README.read_text().split("## Batched on the CPU")[1].split("\n## ")[0]
-    return section.split("```python\n")[1].split("```")[0]
-
-
-@pytest.mark.slow
-def test_the_example_of_the_readme_learns(renderer: None, capsys: pytest.CaptureFixture[str]) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        threads = torch.get_num_threads()
-        try:
-            exec(compile(readme_example(), str(README), "exec"), {"__name__": "__main__"})
-        finally:
-            torch.set_num_threads(threads)
-    printed = capsys.readouterr().out.strip().splitlines()
-    assert len(printed) >= 2, printed
-    scores = [float(line.rsplit(maxsplit=1)[-1]) for line in printed]
-    assert scores[-1] > scores[0] + 0.2, printed

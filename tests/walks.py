@@ -1,6 +1,6 @@
 """Counts the files that three actions pass, by running them on the page with a tracer in every process.
 
-    python -m tests.walks          # prints the tables of web_assets/docs/architecture.md
+    python -m tests.walks          # prints the tables of web_assets/docs/developers/architecture.md
 
 A file is on the way if one of its functions is on the stack where the action is handed on: to another process, to the
 author's code or ManiSkill, to the state of the session, to the browser, to the disk. A function that is called on the way and has

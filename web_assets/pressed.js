@@ -19,6 +19,12 @@
     event.type === "pointerdown" ? event.pointerType === "mouse" && event.button === 0 : event.pointerType !== "mouse";
 
   window.wb = {
+    // With a counter in front: an input whose value stays the same sends nothing.
+    send(input, number) {
+      presses = (presses + 1) % 89;
+      type(input, presses * 1e8 + number);
+    },
+
     press(event) {
       if (counts(event)) document.getElementById(event.target.closest("[data-press]")?.dataset.press)?.click();
     },
@@ -30,8 +36,7 @@
       const twice = event.type === "dblclick";
       if (!row || !input || (twice ? tick : !counts(event))) return;
       const held = (event.ctrlKey || event.metaKey || tick ? 1 : 0) + (event.shiftKey ? 2 : 0);
-      presses = (presses + 1) % 89;
-      type(input, presses * 1e8 + row.dataset.row * 8 + (twice ? 4 : held));
+      wb.send(input, row.dataset.row * 8 + (twice ? 4 : held));
     },
 
     place(event) {

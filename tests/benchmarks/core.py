@@ -2,7 +2,7 @@
 
     python tests/benchmarks/core.py                       # everything, about 15 minutes on two cores
     python tests/benchmarks/core.py --parts speed shares  # some of it
-    python tests/benchmarks/core.py --write               # also into web_assets/docs/benchmarks.md, part by part
+    python tests/benchmarks/core.py --write               # also into web_assets/docs/reference/core_benchmarks.md, part by part
 
 Both sides of every comparison run in this one call, in turns, each turn in a process of its own. Take the
 ratios; the absolute numbers are those of the machine. Run it on a machine that does nothing else.
@@ -23,7 +23,7 @@ from typing import Any, Literal
 import core_sides as sides
 import tyro
 
-PAGE = Path(__file__).resolve().parents[2] / "web_assets" / "docs" / "benchmarks.md"
+PAGE = Path(__file__).resolve().parents[2] / "web_assets" / "docs" / "reference" / "core_benchmarks.md"
 Part = Literal["speed", "one", "shares", "scaling", "pictures", "snapshots", "memory"]
 PARTS: tuple[Part, ...] = ("speed", "one", "shares", "scaling", "pictures", "snapshots", "memory")
 MB = 1 << 20

@@ -1,6 +1,7 @@
-"""Takes the README's screenshots: python tests/browser/take_screenshots.py [NAME ...]
+"""Takes the pictures of README and the docs: .venv/bin/python tests/browser/take_screenshots.py [NAME ...]
 
-Not a test. It writes ``web_assets/screenshots/*.jpg``.
+Not a test. It opens the real pages and writes ``web_assets/screenshots/dark/NAME.jpg`` and ``light/NAME.jpg``, all of one size,
+and ``demo.webp``, which moves (`film.py`). Names choose among `SHOTS`; without one, all are taken, in some ten minutes.
 """
 
 from __future__ import annotations
@@ -11,287 +12,356 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Literal
 
 from PIL import Image
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.drive.page import close_notice, launch, new_page, open_workbench
+from tests.browser.film import take_film
+from tests.drive.page import browser_at, close_notice, new_page, open_workbench
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]
 OUT = ROOT / "web_assets" / "screenshots"
 TASK = ROOT / "tasks" / "push_cube.py"
+POLICY = Path(__file__).parent / "pusher.py"
+CONTROL = ("--env", "control_mode=pd_ee_delta_pos")
+"""What the policy is written for."""
+THEMES = ("dark", "light")
+FRAME = 4.0
+"""Seconds that a browser that draws in software may need for a frame of the 3-D view."""
 
 
-def shoot(page: Page, name: str) -> None:
-    if sys.argv[1:] and name not in sys.argv[1:]:
-        return
-    time.sleep(4.0)  # a browser that draws in software needs some seconds for a frame
-    page.screenshot(path=OUT / f"{name}.jpg", type="jpeg", quality=82)
-    print(OUT / f"{name}.jpg")
+@dataclass
+class Desk:
+    page: Page
+    file: Path
+    """The task: a copy of the example."""
+    theme: Literal["dark", "light"] = "dark"
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def button(self, name: str) -> None:
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def press(self, *keys: str) -> None:
+        # An input that has the focus would take them.
+        self.page.evaluate("document.activeElement?.blur()")
+        for key in keys:
+            self.page.keyboard.press(key)
+            time.sleep(0.1)
+
+    def choose(self, label: str, option: str) -> None:
+        self.page.get_by_label(label, exact=True).locator("visible=true").first.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def edit(self, old: str, new: str) -> None:
+        """Save the example with this change."""
+        text = TASK.read_text()
+        assert old in text
+        self.file.write_text(text.replace(old, new, 1))
+
+    def step(self, steps: int) -> None:
+        """As many steps as this also on a busy machine; returns when the page shows the last."""
+        self.press(*steps * ["s"])
+        timeline = self.page.locator(".wb-timeline")
+        shown = ""
+        while shown != (shown := timeline.inner_text()):
+            time.sleep(3.0)
+
+    def wear(self, theme: Literal["dark", "light"]) -> None:
+        if theme != self.theme:
+            self.press("d")
+            self.theme = theme
+            time.sleep(1.0)
+
+    def shoot(self, name: str, take: Callable[[Page], Image.Image] | None = None) -> None:
+        """Write the picture of this name, dark and light."""
+        for theme in THEMES:
+            self.wear(theme)
+            time.sleep(FRAME)
+            image = picture_of(self.page) if take is None else take(self.page)
+            path = OUT / theme / f"{name}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            image.convert("RGB").save(path, quality=82, optimize=True)
+            print(path, flush=True)
+        self.wear("dark")
 
 
-def tab(page: Page, name: str) -> None:
-    page.get_by_role("tab", name=name).click()
+def picture_of(page: Page) -> Image.Image:
+    return Image.open(BytesIO(page.screenshot()))
 
 
-def shoot_branch(page: Page) -> None:
-    """The selected env goes back 30 steps and on from there; then a moment of that branch is looked at."""
-    tab(page, "Run")
-    page.get_by_role("button", name="Reset all", exact=True).click()
-    for play in ("Play", "Pause"):
-        page.get_by_role("button", name=play, exact=True).click()
+@contextmanager
+def live_page(browser: Browser, *arguments: str, task: str = "") -> Iterator[Desk]:
+    """The page of a copy of the example, paused; `task` is another text of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / TASK.name
+        file.write_text(task or TASK.read_text())
+        shutil.copy(POLICY, file.parent)
+        with open_workbench(str(file), *arguments, cwd=file.parent) as opened:
+            page, _ = new_page(browser)
+            page.goto(opened.url)
+            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            close_notice(page)
+            yield Desk(page, file)
+            page.close()
+
+
+def take_policy(desk: Desk) -> None:
+    """The policy acts, which is careless in every fifth env."""
+    desk.choose("Source", "policy")
+    desk.choose("Known", f"{POLICY.name}:act")
+    time.sleep(3)
+
+
+# --- the live page ------------------------------------------------------------------------------------
+
+
+def shoot_page(browser: Browser) -> None:
+    """While it plays, the Run tab, the cameras, and a name that does not exist."""
+    with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
+        desk.tab("Cameras")
+        expect(desk.page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
+        desk.tab("Run")
+        take_policy(desk)
+        desk.press("Space")
+        desk.tab("Reward")
+        time.sleep(15)
+        desk.shoot("page")
+        desk.tab("Run")
+        desk.shoot("run")
+        desk.press("Space")
+        desk.tab("Cameras")
+        for tick in desk.page.locator("input[type=checkbox]:visible").all()[1:4]:
+            tick.check(force=True)
+        desk.shoot("cameras")
+        desk.tab("Reward")
+        desk.edit('"cube_to_goal": distance', '"cube_to_goal": distanec')
+        expect(desk.page.get_by_text("NameError").locator("visible=true").first).to_be_visible(timeout=60_000)
+        desk.shoot("banner")
+
+
+def shoot_reload(browser: Browser) -> None:
+    """What the Run tab says of a patched and of a rebuilt version, side by side."""
+    edits = {
+        "patched in": ("return reward\n", "return reward + 1\n"),
+        "rebuilt in": ('name="goal")', 'name="target")'),
+    }
+    with live_page(browser, "--num-envs", "16") as desk:
+        taken: dict[str, list[Image.Image]] = {theme: [] for theme in THEMES}
+        for level, edit in edits.items():
+            desk.edit(*edit)
+            expect(desk.page.get_by_text(level).first).to_be_visible(timeout=60_000)
+            desk.page.get_by_text("Code version", exact=True).scroll_into_view_if_needed()
+            desk.page.get_by_role("button", name="Rebuild", exact=True).scroll_into_view_if_needed()
+            for theme in THEMES:
+                desk.wear(theme)
+                time.sleep(FRAME)
+                whole = picture_of(desk.page)
+                left = (desk.page.locator(".wb-status").bounding_box() or {"x": 0.0})["x"] - 10
+                taken[theme].append(whole.crop((int(left), 0, whole.width, whole.height)))
+            desk.wear("dark")
+        # Beside the view as it is now, so that all pictures have one size.
+        both = {
+            theme: beside(whole_of, taken[theme])
+            for theme, whole_of in ((t, picture_in(desk, t)) for t in THEMES)
+        }
+        desk.shoot("reload", lambda page: both[desk.theme])
+
+
+def picture_in(desk: Desk, theme: Literal["dark", "light"]) -> Image.Image:
+    desk.wear(theme)
+    time.sleep(FRAME)
+    return picture_of(desk.page)
+
+
+def beside(whole: Image.Image, panels: list[Image.Image]) -> Image.Image:
+    """The view with both panels at its right edge."""
+    made = whole.copy()
+    x = whole.width
+    for panel in reversed(panels):
+        x -= panel.width
+        made.paste(panel, (x, 0))
+    return made
+
+
+def shoot_envs(browser: Browser) -> None:
+    """The table of envs: a policy that is careless in every fifth env, and one env that loses a number."""
+    good, lost = '"cube_height": height', "(self.elapsed_steps >= 20) & (torch.arange(len(height)) == 11)"
+    text = TASK.read_text()
+    assert good in text
+    text = text.replace(good, f"{good}.masked_fill({lost}, torch.nan)")
+    with live_page(browser, "--num-envs", "16", *CONTROL, task=text) as desk:
+        take_policy(desk)
+        desk.tab("Reward")
+        desk.step(62)
+        desk.press("b", "Shift+E", "f")
+        desk.shoot("envs")
+
+
+def shoot_studio(browser: Browser) -> None:
+    """A camera is chosen, moved with keys, and the change is shown; then it is measured over its envs."""
+    with live_page(browser, "--num-envs", "4") as desk:
+        desk.tab("Studio")
+        desk.choose("Camera", "base_camera · sensor")
+        show = desk.page.get_by_role("button", name="Show the change")
+        expect(show).to_be_visible()
+        desk.press(*12 * ["Alt+ArrowLeft"], *12 * ["Alt+Shift+ArrowRight"])
+        show.click()
+        write = desk.page.get_by_role("button", name=re.compile("^Save to"))
+        write.evaluate("e => e.scrollIntoView({block: 'end'})")
+        desk.shoot("studio")
+
+
+def shoot_measured_camera(browser: Browser) -> None:
+    """What a camera sees of all envs: the table, the depths, and the pictures."""
+    with live_page(browser, "--num-envs", "16") as desk:
+        desk.step(20)
+        desk.tab("Studio")
+        desk.choose("Camera", "base_camera · sensor")
+        desk.page.get_by_text("Measure", exact=True).click()
+        measure = desk.page.get_by_role("button", name="Measure this camera")
+        measure.click()
+        expect(desk.page.locator(".wb-planes")).to_be_visible()
+        desk.page.get_by_role("button", name="Pictures of all envs").click()
+        envs = desk.page.locator(".wb-sheet figure")
+        expect(envs).to_have_count(16)
+        envs.first.click()
+        measure.evaluate("e => e.scrollIntoView({block: 'start'})")
+        desk.shoot("measured_camera")
+
+
+def shoot_branch(browser: Browser) -> None:
+    """The selected env goes back some steps and on from there; then a moment of that branch is looked at."""
+    with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
+        take_policy(desk)
+        desk.step(40)
+        desk.press(*18 * ["ArrowLeft"], "g")
+        time.sleep(2)
+        desk.step(25)
+        desk.tab("Reward")
+        desk.press(*5 * ["ArrowLeft"])
+        desk.shoot("branch")
+
+
+def shoot_rescored(browser: Browser) -> None:
+    """A reward that asks for less is saved: what it says of the episodes so far, and one moment of them."""
+    with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
+        take_policy(desk)
+        desk.step(70)
+        desk.tab("Reward")
+        desk.edit("reach = 1 - torch.tanh(5 * distance)", "reach = 1 - torch.tanh(3 * distance)")
+        rows = desk.page.locator(".wb-again-table tbody tr")
+        expect(rows.nth(1)).to_be_visible(timeout=120_000)
+        rows.nth(1).click()
+        expect(rows.nth(1)).to_have_class("wb-selected")
         time.sleep(2.0)
-    for _ in range(18):
-        page.get_by_role("button", name="‹ step", exact=True).click()
-    page.get_by_role("button", name=re.compile("Continue from here")).click()
-    for play in ("Play", "Pause"):
-        page.get_by_role("button", name=play, exact=True).click()
-        time.sleep(1.0)
-    tab(page, "Reward")
-    for _ in range(5):
-        page.get_by_role("button", name="‹ step", exact=True).click()
-    shoot(page, "branch")
-    page.get_by_role("button", name="live", exact=True).click()
+        desk.page.locator(".wb-again-more").scroll_into_view_if_needed()
+        desk.shoot("rescored")
 
 
-def shoot_busy(page: Page, file: Path) -> None:
+def shoot_busy(browser: Browser) -> None:
     """A loop that does not end, in the reward of a new version."""
     lines = TASK.read_text().splitlines()
     place = next(i for i, line in enumerate(lines) if line.strip().startswith("def compute_dense_reward"))
     while not lines[place].rstrip().endswith(":"):
         place += 1
     lines[place + 1 : place + 1] = ["        while self.elapsed_steps.max() >= 0:", "            continue"]
-    file.write_text("\n".join(lines) + "\n")
-    expect(page.get_by_role("button", name="Interrupt", exact=True)).to_be_visible(timeout=60_000)
-    tab(page, "Log")
-    shoot(page, "busy")
+    with live_page(browser, "--num-envs", "16") as desk:
+        desk.step(25)
+        desk.file.write_text("\n".join(lines) + "\n")
+        expect(desk.page.get_by_role("button", name="Interrupt", exact=True)).to_be_visible(timeout=60_000)
+        desk.tab("Log")
+        desk.shoot("busy")
 
 
-def shoot_reloads(page: Page, file: Path) -> None:
-    """The Run tab's account of a patched and of a rebuilt version, side by side."""
-    tab(page, "Run")
-    folder = page.get_by_text("Code version", exact=True)
-    good, taken = TASK.read_text(), []
-    edits = [
-        ("patched in", "return reward\n", "return reward + 1\n"),
-        ("rebuilt in", 'name="goal")', 'name="target")'),
-    ]
-    for level, old, new in edits:
-        file.write_text(good.replace(old, new, 1))
-        expect(page.get_by_text(level).first).to_be_visible(timeout=60_000)
-        folder.scroll_into_view_if_needed()
-        page.get_by_role("button", name="Rebuild", exact=True).scroll_into_view_if_needed()
-        time.sleep(4.0)
-        box = page.locator(".wb-status").bounding_box()
-        assert box is not None
-        clip = {"x": box["x"] - 10, "y": 0, "width": 1280 - box["x"] + 10, "height": 720}
-        taken.append(Image.open(BytesIO(page.screenshot(clip=clip))))  # type: ignore[arg-type]
-    both = Image.new("RGB", (sum(image.width for image in taken), 720))
-    for i, image in enumerate(taken):
-        both.paste(image, (i * taken[0].width, 0))
-    both.save(OUT / "reload.jpg", quality=82)
-    print(OUT / "reload.jpg")
-    file.write_text(good)
-    time.sleep(4.0)
-
-
-def shoot_envs(chromium: str) -> None:
-    """The table of envs, while a policy that is careless in every fifth env plays, one of which loses a number."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "push_cube.py"
-        good, lost = '"cube_height": height', "(self.elapsed_steps >= 20) & (torch.arange(len(height)) == 11)"
-        file.write_text(TASK.read_text().replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
-        policy = f"{Path(__file__).parent / 'pusher.py'}:act"
-        arguments = (str(file), "--num-envs", "16", "--env", "control_mode=pd_ee_delta_pos")
-        with open_workbench(*arguments, cwd=Path(folder)) as opened, sync_playwright() as playwright:
-            page, _ = new_page(launch(playwright, chromium))
-            page.goto(opened.url)
-            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
-            close_notice(page)
-            page.locator("input[aria-haspopup=listbox]:visible").nth(2).click()
-            page.get_by_role("option", name="policy", exact=True).click()
-            field = page.locator("div", has=page.get_by_text("Policy", exact=True)).last
-            field.locator("xpath=../../..").locator("input").last.fill(policy)
-            time.sleep(3)
-            page.get_by_role("button", name="Play", exact=True).click()
-            tab(page, "Reward")
-            time.sleep(10)
-            page.evaluate("document.activeElement.blur()")  # or the space would press what has the focus
-            page.keyboard.press("Space")
-            page.keyboard.press("b")
-            page.keyboard.press("Shift+E")
-            time.sleep(3)
-            page.keyboard.press("f")
-            shoot(page, "envs")
-
-
-def shoot_studio(chromium: str) -> None:
-    """A camera is chosen, moved with keys, and the change is shown."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
-        with (
-            open_workbench(str(file), "--num-envs", "4", cwd=file.parent) as opened,
-            sync_playwright() as playwright,
-        ):
-            page, _ = new_page(launch(playwright, chromium), height=900)
-            page.goto(opened.url)
-            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
-            close_notice(page)
-            tab(page, "Studio")
-            page.locator("input[aria-haspopup=listbox]:visible").first.click()
-            page.get_by_role("option", name="base_camera · sensor", exact=True).click()
-            expect(page.get_by_role("button", name="Show the change")).to_be_visible()
-            page.evaluate("document.activeElement.blur()")
-            for key in 12 * ["Alt+ArrowLeft"] + 12 * ["Alt+Shift+ArrowRight"]:
-                page.keyboard.press(key)
-                time.sleep(0.1)
-            page.get_by_role("button", name="Show the change").click()
-            page.get_by_role("button", name="Save to push_cube.py").scroll_into_view_if_needed()
-            shoot(page, "studio")
+# --- the review ---------------------------------------------------------------------------------------
 
 
 def record(file: Path, folder: Path, *arguments: str) -> None:
-    """Eight episodes of a policy that is careless in some."""
-    policy = f"{Path(__file__).parent / 'pusher.py'}:act"
-    command = [
-        sys.executable,
-        "-m",
-        "workbench.cli.main",
-        "record",
-        str(file),
-        "--actions",
-        policy,
-        "--out",
-        str(folder),
-    ]
-    subprocess.run([*command, "--env", "control_mode=pd_ee_delta_pos", *arguments], check=True)
+    """Episodes of the policy."""
+    command = [sys.executable, "-m", "workbench.cli.main", "record", str(file)]
+    subprocess.run(
+        [*command, "--actions", f"{POLICY}:act", "--out", str(folder), *CONTROL, *arguments], check=True
+    )
 
 
-def shoot_review(chromium: str) -> None:
+def shoot_review(browser: Browser) -> None:
     """The library; one episode; and one seed under two versions of the task, over each other."""
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
+        file = Path(shutil.copy(TASK, Path(folder) / TASK.name))
         recordings = Path(folder) / "recordings"
         record(file, recordings, "--episodes", "8", "--num-envs", "8")
         file.write_text(TASK.read_text().replace("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.025"))
         record(file, recordings, "--episodes", "2", "--num-envs", "8", "--no-pictures")
-        with (
-            open_workbench(str(recordings), cwd=Path(folder), what="review") as opened,
-            sync_playwright() as playwright,
-        ):
-            page, _ = new_page(launch(playwright, chromium))
+        with open_workbench(str(recordings), cwd=Path(folder), what="review") as opened:
+            page, _ = new_page(browser)
             page.goto(opened.url)
             rows = page.locator(".wb-library").get_by_text(re.compile("seed0000"))
             expect(rows).to_have_count(2, timeout=120_000)
             close_notice(page)
+            desk = Desk(page, file)
             rows.last.click()
-            shoot(page, "library")
-            page.keyboard.press("Enter")
+            desk.shoot("library")
+            desk.press("Enter")
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=60_000)
             for _ in range(2):
-                page.keyboard.press("Shift+ArrowRight")
+                desk.press("Shift+ArrowRight")
                 time.sleep(1.0)
-            tab(page, "Cameras")
-            shoot(page, "review")
-            page.keyboard.press("b")
+            desk.tab("Cameras")
+            desk.shoot("review")
+            if not rows.first.is_visible():
+                desk.press("b")
             rows.first.click()
             page.keyboard.down("Control")
             rows.last.click()
             page.keyboard.up("Control")
-            page.keyboard.press("Enter")
-            tab(page, "Compare")
+            desk.press("Enter")
+            desk.tab("Compare")
             expect(page.get_by_text(re.compile("They diverge at"))).to_be_visible(timeout=60_000)
-            page.keyboard.press("End")
-            shoot(page, "compare")
+            desk.press("End")
+            desk.shoot("compare")
+            page.close()
 
 
-def shoot_measured_camera(page: Page) -> None:
-    """What a camera sees of all envs: the table, the depths, and the pictures."""
-    tab(page, "Studio")
-    page.locator("input[aria-haspopup=listbox]:visible").first.click()
-    page.get_by_role("option", name="base_camera · sensor", exact=True).click()
-    page.get_by_text("Measure", exact=True).click()
-    page.get_by_role("button", name="Measure this camera").click()
-    expect(page.locator(".wb-planes")).to_be_visible()
-    page.get_by_role("button", name="Pictures of all envs").click()
-    envs = page.locator(".wb-sheet figure")
-    expect(envs).to_have_count(16)
-    envs.first.click()
-    page.get_by_role("button", name="Measure this camera").evaluate("e => e.scrollIntoView({block: 'start'})")
-    shoot(page, "measured_camera")
-    page.locator("input[aria-haspopup=listbox]:visible").first.click()
-    page.get_by_role("option", name="none", exact=True).click()
+SHOTS: dict[str, Callable[[Browser], None]] = {
+    "page": shoot_page,
+    "reload": shoot_reload,
+    "envs": shoot_envs,
+    "studio": shoot_studio,
+    "measured_camera": shoot_measured_camera,
+    "branch": shoot_branch,
+    "rescored": shoot_rescored,
+    "busy": shoot_busy,
+    "review": shoot_review,
+}
+"""``page`` takes run, cameras and banner too, ``review`` library and compare."""
 
 
-def shoot_rescored(page: Page, file: Path) -> None:
-    """A reward that asks for less is saved: what it says of the episodes so far, and one moment of them."""
-    good = file.read_text()
-    asked = "reach = 1 - torch.tanh(5 * distance)"
-    assert asked in good
-    tab(page, "Reward")
-    file.write_text(good.replace(asked, asked.replace("5", "3")))
-    expect(page.get_by_text("episodes differ.")).to_be_visible(timeout=120_000)
-    rows = page.locator(".wb-again-table tbody tr")
-    rows.nth(1).click()
-    expect(rows.nth(1)).to_have_class("wb-selected")
-    time.sleep(2.0)
-    page.locator(".wb-again-more").scroll_into_view_if_needed()
-    shoot(page, "rescored")
-    page.get_by_role("button", name="live", exact=True).click()
-    file.write_text(good)
-    expect(page.get_by_text("Nothing differs").first).to_be_visible(timeout=120_000)
-
-
-def main() -> None:
+def main(names: list[str]) -> None:
     chromium = find_chromium()
     if chromium is None:
         sys.exit(how_to_get_chromium())
-    OUT.mkdir(exist_ok=True)
-    shoot_envs(chromium)
-    shoot_studio(chromium)
-    shoot_review(chromium)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
-        with (
-            open_workbench(str(file), "--num-envs", "16", cwd=Path(folder)) as opened,
-            sync_playwright() as playwright,
-        ):
-            page, _ = new_page(launch(playwright, chromium))
-            page.goto(opened.url)
-            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
-            tab(page, "Cameras")
-            expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
-            close_notice(page)
-            tab(page, "Run")
-            page.get_by_role("button", name="Play", exact=True).click()
-            tab(page, "Reward")
-            time.sleep(25)
-            shoot(page, "page")
-            tab(page, "Run")
-            shoot(page, "run")
-            page.get_by_role("button", name="Pause", exact=True).click()
-            shoot_branch(page)
-            shoot_rescored(page, file)
-            tab(page, "Cameras")
-            for tick in page.locator("input[type=checkbox]:visible").all()[1:4]:
-                tick.check(force=True)
-            time.sleep(4)
-            shoot(page, "cameras")
-            shoot_measured_camera(page)
-            shoot_reloads(page, file)
-            lines = TASK.read_text().splitlines()
-            place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)
-            lines[place] = lines[place].replace("distance", "distanec")
-            file.write_text("\n".join(lines) + "\n")
-            expect(page.get_by_text("NameError").first).to_be_visible(timeout=60_000)
-            tab(page, "Reward")
-            shoot(page, "banner")
-            shoot_busy(page, file)
+    unknown = set(names) - {*SHOTS, "demo"}
+    if unknown:
+        sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(SHOTS)} and demo")
+    for name, shot in SHOTS.items():
+        if not names or name in names:
+            with browser_at(chromium) as browser:
+                shot(browser)
+    if not names or "demo" in names:
+        with browser_at(chromium) as browser, live_page(browser, "--num-envs", "16", *CONTROL) as desk:
+            take_policy(desk)
+            take_film(desk, OUT / "demo.webp")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ from tests.drive.charts import drawn
 from tests.drive.page import page_at
 from tests.drive.panels import Clock
 from tests.drive.waiting import until
-from tests.ui.scenes import running
-from workbench.session.history.curves import Curves
+from tests.ui.scenes import running, step_of
+from workbench.session.history.curves import Curves, StepCurves
 from workbench.ui.live.reward import CurvesPanel
 
 pytestmark = pytest.mark.browser
@@ -29,13 +30,15 @@ def server() -> Iterator[viser.ViserServer]:
     server.stop()
 
 
-def past(first: int, last: int, lost: tuple[int, int] = (0, 0)) -> Curves:
-    """Control steps from `first` to `last`; the reward of env 0 is NaN in those of `lost`."""
-    tick = np.arange(first, last)
-    reward = np.sin(tick / 7)[:, None] + np.arange(ENVS, dtype=np.float32)
-    reward[(tick >= lost[0]) & (tick < lost[1]), 0] = np.nan
-    flags = np.zeros_like(reward)
-    return Curves(last, tick, reward, flags)
+def past(last: int, env: int = 0, lost: tuple[int, int] = (0, 0)) -> Curves:
+    """Control steps 1 to `last`; the reward of env 0 is NaN in those of `lost`."""
+    steps = StepCurves(ENVS)
+    result = step_of(np.zeros((ENVS, 1, 7), np.float32), success=np.zeros(ENVS, bool))
+    for tick in range(1, last + 1):
+        reward = np.sin(tick / 7) + np.arange(ENVS, dtype=np.float32)
+        reward[0] = np.nan if lost[0] <= tick < lost[1] else reward[0]
+        steps.add(replace(result, reward=reward))
+    return steps.curves(env)
 
 
 def widest_gap(columns: NDArray[np.float64]) -> float:
@@ -63,17 +66,17 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
             page.wait_for_timeout(1000 * CurvesPanel.every / 4)  # as fast as steps come while it plays
 
         for last in range(40, 200, 20):
-            draw(past(0, last))
+            draw(past(last))
         until(lambda: whole(page), "the curve")
         for last in range(200, 400, 20):
-            draw(past(0, last, (200, 300)))
+            draw(past(last, lost=(200, 300)))
         until(lambda: widest_gap(drawn(page)) > 0.15, "the gap")
         columns = drawn(page)
         assert columns[0] < 0.3 and columns[-1] > 0.9
         for last in range(400, 500, 20):
-            draw(past(0, last), env=last // 20 % ENVS)
+            draw(past(last, last // 20 % ENVS), env=last // 20 % ENVS)
         until(lambda: whole(page), "the curve of another env")
         for last in range(2, 60, 2):
-            draw(past(0, last), env=last // 20)
+            draw(past(last, last // 20), env=last // 20)
         until(lambda: whole(page), "the curve after a rebuild")
         assert errors == []

@@ -25,7 +25,7 @@ def test_a_step_is_one_message(walks: list[Walked]) -> None:
 
 
 def test_the_page_tells_the_ways_as_they_are(walks: list[Walked]) -> None:
-    page = (ROOT / "web_assets/docs/architecture.md").read_text()
+    page = (ROOT / "web_assets/docs/developers/architecture.md").read_text()
     for one in walks:
         assert table(one) in page, (
             f"not so in architecture.md (make it with python -m tests.walks):\n{table(one)}"

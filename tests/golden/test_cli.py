@@ -25,7 +25,7 @@ from workbench.cli import main
 from workbench.cli.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
-COMMANDS = ("open", "record", "review", "rescore", "share", "export", "view", "doctor")
+COMMANDS = ("open", "record", "review", "rescore", "share", "export", "view", "doctor", "help")
 CALLS = {
     "workbench": ["", "nonsense", "open --nonsense", "record"],
     "open": [
@@ -77,6 +77,7 @@ CALLS = {
         "export made --lerobot set --cameras gone",
     ],
     "view": ["view gone.rrd", "view push.py", "view empty"],
+    "help": ["help", "help camera", "help sliders", "help nonsense"],
 }
 
 

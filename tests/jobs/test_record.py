@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -419,6 +420,10 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     assert "Traceback" not in errors
     written = sorted(tmp_path.glob("*.json"))
     assert len(said.splitlines()) == len(written) + 1
+    told = re.findall(
+        r"^episode (\d+): 3 steps, return -?[\d.]+, no success, (\d+) of 100000 kept$", errors, re.M
+    )
+    assert [int(kept) for _, kept in told] == list(range(1, len(written) + 1)), "a line for each, in a pipe"
     assert not (tmp_path / ".writing").exists()
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
 

@@ -1,6 +1,6 @@
 """Every id in ManiSkill's registry, tried; and the page of the docs that says what came of it.
 
-    python tests/sweeps/task_ids.py                  all ids, and the page web_assets/docs/task_ids.md
+    python tests/sweeps/task_ids.py                  all ids, and the page web_assets/docs/reference/task_ids.md
     python tests/sweeps/task_ids.py PickCube-v1 ...  some ids, printed
 
 A task may end the process or never return, so the ids are tried in a child process: a crash or a hang is one
@@ -24,7 +24,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
-PAGE = REPOSITORY / "web_assets" / "docs" / "task_ids.md"
+PAGE = REPOSITORY / "web_assets" / "docs" / "reference" / "task_ids.md"
 MARK = "task_ids row: "
 LIMIT = 240.0
 """Seconds for one id: the slowest needs 60 alone on two cores, and the first compiles shaders besides."""

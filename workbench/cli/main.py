@@ -50,6 +50,7 @@ def open_page(
     memory_limit: str = "auto",
     spare: bool = True,
     trust: bool = False,
+    editor: str = "vscode",
     debug: bool = False,
     debug_port: int | None = None,
     debug_wait: bool = False,
@@ -65,6 +66,9 @@ def open_page(
         spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
             seconds more, and about 0.8 GB of memory less).
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
+        editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} (an absolute
+            path) and {line}. If the browser is on another machine than the file, VS Code opens it over ssh with
+            vscode://vscode-remote/ssh-remote+HOST{file}:{line}, where HOST is the machine as your ssh config names it.
         debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
             stops for it. Anyone who can log in to this machine can attach too.
         debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
@@ -81,6 +85,7 @@ def open_page(
     from workbench.session.process.memory_limit import parse_memory
     from workbench.session.process.supervisor import WorkerOptions
     from workbench.ui.server.gated_server import ServerOptions
+    from workbench.ui.widgets.editor import parse_editor
 
     try:
         options = envs.options()
@@ -94,9 +99,10 @@ def open_page(
         at_port = port_for_debugger(debug_port) if debug else None
         worker = WorkerOptions(parse_memory(memory_limit), spare, at_port, debug_wait)
         at = ServerOptions(**vars(page))
+        address = parse_editor(editor)
     except ValueError as error:
         return refuse(str(error))
-    return open_in_terminal(task, options, at, worker, recordings, past, trust)
+    return open_in_terminal(task, options, at, worker, recordings, past, trust, address)
 
 
 @app.command
@@ -144,6 +150,7 @@ def review(
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
     imports: Imports = (),
     trust: bool = False,
+    editor: str = "vscode",
 ) -> int:
     """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
 
@@ -157,6 +164,8 @@ def review(
         imports: a module that registers ids that recordings name, such as lab.tasks, imported in the processes that
             run their tasks; repeatable.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
+        editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} and {line};
+            see workbench open --help.
     """
     if not folder.is_dir():
         return refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab make one")
@@ -172,13 +181,15 @@ def review(
     from workbench.session.process.memory_limit import parse_memory
     from workbench.session.process.supervisor import WorkerOptions
     from workbench.ui.server.gated_server import ServerOptions
+    from workbench.ui.widgets.editor import parse_editor
 
     try:
         at = ServerOptions(**vars(page))
         base = TaskOptions(rules=rules, imports=imported(imports))
+        address = parse_editor(editor)
     except ValueError as error:
         return refuse(str(error))
-    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), base, trust)
+    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), base, trust, address)
 
 
 @app.command
@@ -330,6 +341,18 @@ def doctor() -> int:
     from workbench.machine.doctor import main
 
     return main()
+
+
+@app.command(name="help")
+def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
+    """Show a page of the documents, or list the topics.
+
+    Args:
+        topic: name of the page, such as cameras; without one, all are listed.
+    """
+    from workbench.cli import help
+
+    return help.show_help(topic)
 
 
 def _lacks_maniskill(command: str) -> bool:

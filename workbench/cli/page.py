@@ -35,11 +35,13 @@ def open_in_terminal(
     recordings: Path,
     history_bytes: int,
     trust: bool = False,
+    editor: str = "",
 ) -> int:
     """Serve the page of a task; returns (the exit code) only if the server cannot start.
 
     Args:
         trust: run code that recordings name without asking.
+        editor: address of a line in the author's editor.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
@@ -68,7 +70,7 @@ def open_in_terminal(
     session = _session(task, options, recordings, worker, on_event, history_bytes)
     make_session = _session_maker(recordings, WorkerOptions(worker.memory_limit))
     base = TaskOptions(rules=options.rules, imports=options.imports)
-    place = Workplace(gated_server, recordings, make_session, base, session, trust=trust, on_notice=warn)
+    place = Workplace(gated_server, recordings, make_session, base, session, (), trust, warn, editor)
     _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", requests, session.close)
 
 
@@ -79,18 +81,20 @@ def review_in_terminal(
     worker: WorkerOptions,
     base: TaskOptions,
     trust: bool = False,
+    editor: str = "",
 ) -> int:
     """Serve the page of a folder of recordings; returns (the exit code) only if the server cannot start.
 
     Args:
         worker, base: options of tasks that are opened from there.
         trust: run code that recordings name without asking.
+        editor: address of a line in the author's editor.
     """
     gated_server = _start_server(at, "Recordings")
     if isinstance(gated_server, int):
         return gated_server
     make_session = _session_maker(folder, worker)
-    place = Workplace(gated_server, folder, make_session, base, tasks=tasks, trust=trust, on_notice=warn)
+    place = Workplace(gated_server, folder, make_session, base, None, tasks, trust, warn, editor)
     requests = _PageRequests()
     requests.show_address()
     _serve(gated_server, place, "review", f"recordings in {folder}", requests, lambda: None)
@@ -137,7 +141,7 @@ def _serve(
     close_session: Callable[[], None],
 ) -> NoReturn:
     if gated_server.options.token:
-        place.commands = (Command("Renew the token and close every page", requests.renew),)
+        place.commands += (Command("Renew the token and close every page", requests.renew),)
     requests.handle_signals()
     try:
         place.pages.start(first)

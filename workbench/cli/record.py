@@ -1,4 +1,4 @@
-"""Runs ``workbench record``: a progress bar, then a list of the episodes. Ctrl-C keeps finished episodes."""
+"""Runs ``workbench record``: a progress bar, or a line for each episode, then a list of them. Ctrl-C keeps finished episodes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from types import FrameType
 
+from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
@@ -15,7 +16,7 @@ from workbench.authoring.problem import TaskError
 from workbench.cli.terminal import err, print_finding, print_problem, print_text, progress_bar, refuse, warn
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.pool import PoolError
-from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, record, with_given_actions
+from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record, with_given_actions
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 from workbench.session.rescore.recordings import hidden_modules_text
@@ -26,6 +27,7 @@ class _RecordBar:
 
     def __init__(self, bar: Bar, total: int | None) -> None:
         self._bar, self._row = bar, bar.add_task("opening", total=total)
+        self._total = total
         self.stop_requested = False
         self._began: float | None = None
         """When the first episode began."""
@@ -53,6 +55,17 @@ class _RecordBar:
         self._bar.update(self._row, completed=now.kept)
         if not self.stop_requested:
             self.describe(f"recording, {now.steps / seconds:.0f} steps a second")
+        if now.over is not None and not err.is_terminal:
+            # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
+            err.print(escape(_episode_line(*now.over, now.kept, self._total)), soft_wrap=True)
+
+
+def _episode_line(number: int, kept: Written | None, count: int, total: int | None) -> str:
+    so_far = f"{count} of {total} kept"
+    if kept is None:
+        return f"episode {number}: not kept, {so_far}"
+    ended = {None: "", True: ", success", False: ", no success"}[kept.success]
+    return f"episode {number}: {kept.steps} steps, return {kept.total_reward:.3f}{ended}, {so_far}"
 
 
 def record_in_terminal(what: RecordOptions) -> int:

@@ -42,6 +42,7 @@ from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.maniskill_private import parse_cameras, version_notice
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
+from workbench.core.scene.scene_index import joint_names
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
 from workbench.machine.versions import moved_text, untested, untested_text
 
@@ -273,6 +274,7 @@ def describe(
         in_place_of=None if loaded.in_place_of is None else loaded.in_place_of.name,
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env),
+        joints=joint_names(env),
         parse_cameras=parse_cameras.__name__,
     )
 

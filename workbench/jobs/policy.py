@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.machinery
 import importlib.util
@@ -162,6 +163,57 @@ def _find(name: str, task_folder: Path | None) -> Path:
             f"there is no {name} in {Path.cwd()}, where the command was started, nor in the folder of the task, {task_folder}"
         )
     return there
+
+
+MOST_FILES, MOST_LISTED = 100, 40
+"""Of a folder that are read, and policies that are listed."""
+_MOST_BYTES = 256 * 1024
+"""Of a file that is looked through: a larger one is no policy that a person wrote."""
+
+
+def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
+    """Functions that may be policies, as ``file.py:function``: those of one required parameter, in the files of a folder and
+    beside the task. They are read, not imported. Those whose parameter is called obs or observation come first.
+
+    Args:
+        here: the folder where the command was started.
+    """
+    found: list[tuple[bool, str]] = []
+    taken: set[str] = set()
+    folders = [here.resolve()] if task_folder is None else [here.resolve(), task_folder.resolve()]
+    for folder in folders if folders[0] != folders[-1] else folders[:1]:
+        for file in _python_files(folder):
+            # As `find_policy` finds it: a file of the first folder hides one of the same name.
+            name = str(file) if file.name in taken else file.name
+            taken.add(file.name)
+            found += [(not likely, f"{name}:{function}") for function, likely in _functions_that_fit(file)]
+    return tuple(reference for _, reference in sorted(found, key=lambda one: one[0])[:MOST_LISTED])
+
+
+def _python_files(folder: Path) -> list[Path]:
+    try:
+        files = sorted(file for file in folder.iterdir() if file.suffix == ".py")
+    except OSError:
+        return []  # it is gone, or not readable: there is nothing to list
+    return [file for file in files if not file.name.startswith(("test_", "conftest", "setup."))][:MOST_FILES]
+
+
+def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
+    """Names of public functions of one required parameter, and whether it is called as an observation."""
+    try:
+        tree = ast.parse(read_regular_file(file, _MOST_BYTES))
+    except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
+        return []  # a file that cannot be read has no policy to list; choosing it by name says why
+    found = []
+    for node in tree.body:
+        if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+            continue
+        given = node.args
+        named = [*given.posonlyargs, *given.args]
+        required = named[: len(named) - len(given.defaults)]
+        if len(required) == 1 and None not in given.kw_defaults:
+            found.append((node.name, required[0].arg.startswith("obs")))
+    return found
 
 
 class PolicyFile:

@@ -69,6 +69,8 @@ class RecordProgress:
     """Episodes kept so far."""
     steps: int
     """Control steps so far, over all envs with an episode."""
+    over: tuple[int, Written | None] | None = None
+    """The episode that has just ended: its number, and what was kept of it; None where none has."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +203,7 @@ class _Recording:
             self.deal.lower(last + 1)
             for surplus in [number for number in self._kept if number > last]:
                 self._remove(self._kept.pop(surplus))
-        self._on_progress(RecordProgress(len(self._kept), self._steps))
+        self._on_progress(RecordProgress(len(self._kept), self._steps, (number, self._kept.get(number))))
 
     def _on_update(self, update: str | int | Finding) -> None:
         if isinstance(update, str):

@@ -86,6 +86,8 @@ class TaskDescription:
     """Keywords of ``gym.make`` for such an env, as far as JSON can hold them."""
     objects: tuple[ObjectToSee, ...] = ()
     """Objects that a camera can be measured on."""
+    joints: tuple[str, ...] = ()
+    """Names of `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
     """Notices about a task that works, as sentences."""
     parse_cameras: str = "parse_camera_configs"

@@ -18,6 +18,7 @@ def test_every_field_counts() -> None:
         "poses": np.zeros((3, 5, 7), np.float32),
         "action": np.zeros((3, 2), np.float32),
         "sound_obs": np.zeros(3, bool),
+        "qpos": np.zeros((3, 9), np.float32),
     }
     evaluate, others = {"success": np.zeros(3, bool)}, {"mean": OtherEntry("float", ("0.5",))}
     assert {one.name for one in fields(StepResult)} == {*arrays, "evaluate", "others"}

@@ -6,11 +6,26 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 
 from tests.session.moments import N, stepped
 from workbench.core.env.step_result import OtherEntry, StepResult
-from workbench.session.history.curves import MOST, Columns, RecentSteps
+from workbench.session.history.curves import (
+    MOST,
+    REWARD,
+    SUCCESS,
+    Column,
+    Columns,
+    Curves,
+    Group,
+    StepCurves,
+    spans_of,
+)
+
+REACH = Column(Group.TERM, "reach")
 
 
 def step(number: int, **terms: Any) -> StepResult:
@@ -19,96 +34,148 @@ def step(number: int, **terms: Any) -> StepResult:
     return replace(result, evaluate={**result.evaluate, **entries})
 
 
-def test_a_row_is_a_step() -> None:
-    recent = RecentSteps(N)
+def line(curves: Curves, column: Column, mean: bool = False) -> tuple[list[float], list[float]]:
+    x, (values,) = curves.lines([(column, mean)])
+    return x.tolist(), values.tolist()
+
+
+def test_a_step_is_a_point_of_each_env_and_of_the_mean() -> None:
+    steps = StepCurves(N)
     for number in (1, 2, 3):
-        recent.add(step(number))
-    curves = recent.curves()
-    assert curves.serial == recent.count == 3 and curves.tick.tolist() == [1, 2, 3]
-    assert curves.reward.tolist() == [[1.0] * N, [2.0] * N, [3.0] * N]
-    assert curves.success.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
+        steps.add(step(number, reach=[number, 2 * number, 0]))
+    curves = steps.curves(1)
+    assert curves.serial == steps.count == 3
+    assert line(curves, REWARD) == ([1, 2, 3], [1, 2, 3])
+    assert line(curves, REACH) == ([1, 2, 3], [2, 4, 6])
+    assert line(curves, REACH, mean=True) == ([1, 2, 3], [1, 2, 3])
+    assert line(steps.curves(2), SUCCESS)[1] == [0, 1, 0]
 
 
 def test_a_task_has_empty_curves_before_its_first_step() -> None:
-    curves = RecentSteps(N).curves()
-    assert curves.tick.tolist() == [] and curves.reward.shape == curves.success.shape == (0, N)
-    assert curves.terms == {}
+    curves = StepCurves(N).curves(0)
+    assert (curves.serial, curves.columns) == (0, ())
+    assert [part.tolist() for part in curves.lines([])] == [[], []]
 
 
-@pytest.mark.parametrize("count", [999, 1000, 1001, 2048, 2500])
-def test_only_the_newest_are_kept_oldest_first(count: int) -> None:
-    recent = RecentSteps(N)
-    for number in range(count):
-        recent.add(step(number, reach=[number, -number, 0]))
-    curves = recent.curves()
-    kept = list(range(max(0, count - 1000), count))
-    assert curves.tick.tolist() == [number + 1 for number in kept]
-    assert curves.reward[:, 1].tolist() == curves.terms["reach"][:, 0].tolist() == kept
-    assert curves.serial == count
-
-
-def test_curves_that_were_taken_do_not_change_and_a_task_without_success_has_none() -> None:
-    recent = RecentSteps(N)
-    recent.add(replace(step(1), evaluate={"reward_terms/reach": np.ones(N)}))
-    curves = recent.curves()
-    before = curves.reward.copy(), curves.terms["reach"].copy()
-    assert np.shares_memory(recent.curves().reward, curves.reward), "nothing is copied"
+def test_curves_that_were_taken_do_not_change() -> None:
+    steps = StepCurves(N)
+    steps.add(step(1, reach=[1, 1, 1]))
+    curves = steps.curves(0)
     for number in range(2000):
-        recent.add(step(number))
-    assert np.array_equal((curves.reward, curves.terms["reach"]), before) and np.isnan(curves.success).all()
+        steps.add(step(number))
+    assert line(curves, REACH) == ([1], [1]) and curves.newest.tolist() == [1] * N
 
 
-def test_terms_are_kept_by_their_name_and_other_entries_are_not() -> None:
-    recent = RecentSteps(N)
-    recent.add(step(1, reach=[1, 2, 0]))
-    recent.add(step(2, reach=[3, 4, 0], push=[5, 6, 7]))
-    curves = recent.curves()
-    assert curves.tick.tolist() == [1, 2]
-    assert curves.terms.keys() == {"reach", "push"}
-    assert curves.terms["reach"].tolist() == [[1, 2, 0], [3, 4, 0]]
-    np.testing.assert_array_equal(curves.terms["push"], [[np.nan] * 3, [5, 6, 7]])
+NUMBERS = arrays(
+    np.float32,
+    st.tuples(st.just(2), st.integers(1, 1100)),
+    elements=st.one_of(st.integers(-3, 3).map(float), st.sampled_from([np.nan, np.inf, -np.inf])),
+    fill=st.sampled_from([0.0, np.nan]),
+)
+
+
+@given(NUMBERS)
+@settings(max_examples=15, deadline=None)
+def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
+    rewards: NDArray[np.float32],
+) -> None:
+    steps = StepCurves(2)
+    base = stepped(1).step
+    for number in range(rewards.shape[1]):
+        steps.add(replace(base, reward=rewards[:, number], evaluate={}))
+    curves = steps.curves(1)
+    spans, whole = curves.spans, spans_of(rewards[1:])
+    assert spans.width == whole.width and spans.low.shape[1] <= 400
+    for kept, made in ((spans.low, whole.low), (spans.high, whole.high), (spans.gap, whole.gap)):
+        np.testing.assert_array_equal(kept[:1], made)
+    known = np.isfinite(whole.low)
+    np.testing.assert_array_equal(spans.low_at[:1][known], whole.low_at[known])
+    np.testing.assert_array_equal(spans.high_at[:1][known], whole.high_at[known])
+    x, (one,) = curves.lines([(REWARD, False)])
+    assert (np.diff(x) > 0).all() and len(x) <= 3 * 400 + 1
+    if np.isfinite(rewards[1]).any():
+        finite = rewards[1][np.isfinite(rewards[1])]
+        assert (np.nanmin(one), np.nanmax(one)) == (finite.min(), finite.max())
+    drawn = np.isfinite(one)
+    np.testing.assert_array_equal(rewards[1][x[drawn].astype(int) - 1], one[drawn])
+    lost = ~np.isfinite(rewards[1])
+    assert np.isnan(one).any() == lost.any()
+
+
+def test_a_spike_of_one_step_among_many_is_drawn_at_its_step() -> None:
+    steps = StepCurves(N)
+    for number in range(1, 10_001):
+        result = step(1)
+        result.reward[1] = 50 if number == 7_777 else 1
+        steps.add(result)
+    x, values = line(steps.curves(1), REWARD)
+    assert [at for at, value in zip(x, values, strict=True) if value == 50] == [7_777]
+    assert x[0] == 1 and x[-1] == 10_000 and 400 <= len(x) <= 801
+
+
+def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
+    steps = StepCurves(N, joints=("hinge", "slide"))
+    entries = {
+        "height": np.arange(3.0),
+        "at": np.zeros((N, 3)),
+        "picture": np.zeros((N, 64)),
+        "none": np.zeros((N, 0)),
+    }
+    result = step(1, reach=[1, 2, 0])
+    mean = OtherEntry("float", numbers=np.array(0.5))
+    steps.add(
+        replace(
+            result,
+            evaluate={**result.evaluate, **entries},
+            others={"mean": mean, "phase": OtherEntry("str", ("push",))},
+            qpos=np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]], np.float32),
+        )
+    )
+    curves = steps.curves(2)
+    assert [column.label for column in curves.columns] == [
+        *("reward", "success", "reach", "fail", "height", "at[0]", "at[1]", "at[2]", "mean", "hinge", "slide")
+    ]
+    assert line(curves, Column(Group.JOINT, "slide"))[1] == [3.0]
+    assert line(curves, Column(Group.EVALUATE, "mean"))[1] == [0.5]
+
+
+def test_a_term_that_comes_later_has_no_line_before() -> None:
+    steps = StepCurves(N)
+    steps.add(step(1, reach=[1, 2, 0]))
+    steps.add(step(2, reach=[3, 4, 0], push=[5, 6, 7]))
+    np.testing.assert_array_equal(line(steps.curves(0), Column(Group.TERM, "push"))[1], [np.nan, 5])
 
 
 def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
-    recent = RecentSteps(N)
+    steps = StepCurves(N)
     result = step(1, reach=[1, 2, 3], both=[[1, 2]] * N)
     mean, note = OtherEntry("float", numbers=np.array(0.5)), OtherEntry("str", ("none",))
     result = replace(result, others={"reward_terms/mean": mean, "reward_terms/note": note, "other": note})
     for _ in range(2):
-        recent.add(result)
-    curves = recent.curves()
-    assert (list(curves.terms), curves.no_curve) == (["reach"], ("both", "mean", "note"))
-    recent.add(replace(result, others={"reward_terms": note}, evaluate={}))
-    assert recent.curves().no_curve == ("reward_terms",)
-    recent.add(step(1, reach=[1, 2, 3]))
-    assert recent.curves().no_curve == ()
+        steps.add(result)
+    curves = steps.curves(0)
+    assert [column.name for column in curves.columns if column.group is Group.TERM] == ["reach"]
+    assert curves.no_curve == ("both", "mean", "note")
+    steps.add(replace(result, others={"reward_terms": note}, evaluate={}))
+    assert steps.curves(0).no_curve == ("reward_terms",)
+    steps.add(step(1, reach=[1, 2, 3]))
+    assert steps.curves(0).no_curve == ()
 
 
 def test_a_success_of_several_numbers_counts_by_its_first() -> None:
-    recent = RecentSteps(N)
-    recent.add(replace(step(1), evaluate={"success": np.array([[0, 1], [1, 0], [1, 1]], np.float32)}))
-    assert recent.curves().success.tolist() == [[0, 1, 1]]
+    steps = StepCurves(N)
+    steps.add(replace(step(1), evaluate={"success": np.array([[0, 1], [1, 0], [1, 1]], np.float32)}))
+    assert [line(steps.curves(env), SUCCESS)[1] for env in range(N)] == [[0], [1], [1]]
 
 
-def test_a_term_that_a_new_version_drops_goes_when_its_last_value_goes() -> None:
-    recent = RecentSteps(N)
-    recent.add(step(1, reach=[1, 1, 1]))
-    for number in range(999):
-        recent.add(step(number, push=[1, 1, 1]))
-    assert recent.curves().terms.keys() == {"reach", "push"}
-    recent.add(step(1, push=[1, 1, 1]))
-    assert recent.curves().terms.keys() == {"push"}
-
-
-def test_the_number_of_terms_is_bounded_and_those_that_are_long_gone_make_room() -> None:
-    recent = RecentSteps(N)
-    recent.add(step(1, **{f"term{i}": [0] * N for i in range(MOST + 5)}))
-    recent.add(step(2, other=[1] * N))
-    assert list(recent.curves().terms) == [f"term{i}" for i in range(MOST)]
-    for number in range(1100):
-        recent.add(step(number))
-    recent.add(step(3, other=[1] * N))
-    assert list(recent.curves().terms) == ["other"]
+def test_columns_are_bounded_and_those_that_a_version_has_dropped_make_room() -> None:
+    steps = StepCurves(N)
+    steps.add(step(1, **{f"term{i}": [0] * N for i in range(MOST + 5)}))
+    kept = steps.curves(0).columns
+    assert len(kept) == MOST and kept[:2] == (REWARD, SUCCESS)
+    steps.add(step(2, other=[1] * N))
+    assert [column.name for column in steps.curves(0).columns] == ["reward", "success", "other", "fail"]
+    assert line(steps.curves(0), REWARD) == ([1, 2], [1, 2])
 
 
 def test_rows_that_are_wanted_stay_with_their_numbers_and_a_missing_value_is_none() -> None:

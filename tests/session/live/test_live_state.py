@@ -74,18 +74,19 @@ def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on()
     shown = view(running())
     assert (shown.state, shown.activity, shown.playing) == ("running", "", True)
     assert (shown.timeline.last, shown.step_serial, shown.timeline.moments) == (3, 3, 4)
-    assert shown.curves is not None and shown.curves.tick.tolist() == [1, 2, 3]
+    assert shown.curves is not None and shown.curves.serial == 3
 
 
-def test_curves_are_not_copied_for_a_look() -> None:
+def test_curves_stay_as_they_were_taken_and_are_of_the_selected_env() -> None:
     state = running()
     state.stepped(stepped(4, jumped=True))
     first = view(state).curves
+    assert view(state).curves is first, "nothing is made for a look"
     state.stepped(stepped(5))
+    state.change(selected_env=1)
     now = view(state).curves
-    assert first is not None and first.tick.tolist() == [1, 2, 3] and len(first.reward) == 3
-    assert now is not None and now.tick.tolist() == [1, 2, 3, 4]
-    assert np.shares_memory(first.reward, now.reward)
+    assert first is not None and (first.serial, first.env) == (3, 0)
+    assert now is not None and (now.serial, now.env) == (4, 1)
 
 
 def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> None:
@@ -260,3 +261,31 @@ def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path
         assert (sent[-1].speed, sent[-1].episode_end) == (2.0, "continue")
     finally:
         session.close()
+
+
+def test_every_load_is_remembered_also_one_that_was_refused() -> None:
+    state = running()
+    for number in range(30):
+        state.take(Loading("importing"))
+        state.take(LoadFailed(problem(f"NameError: {number}"), kept=True))
+    loads = view(state).loads
+    assert len(loads) == 20 and loads[0].reason == "NameError: 29" and loads[0].problem is not None
+    state.take(LoadFailed(problem("ValueError: in a step"), kept=True))
+    assert view(state).loads == loads, "it is no load"
+    state.loaded(loaded(report("patched")), restored=False, stale=False)
+    assert [load.level for load in view(state).loads[:2]] == ["patched", None]
+
+
+def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
+    task, beside = tmp_path / "lab" / "push.py", tmp_path / "lab" / "helper.py"
+    outside = tmp_path / "secret.py"
+    task.parent.mkdir()
+    for file in (task, beside, outside):
+        file.write_text("")
+    state = LiveState(str(task), TaskOptions(), 10**8)
+    assert state.knows_file(str(task)) and state.knows_file(str(beside))
+    assert not state.knows_file(str(outside))
+    assert not state.knows_file(str(task.parent / ".." / "secret.py"))
+    assert not state.knows_file(str(task.parent / "gone.py")) and not state.knows_file("/etc/passwd")
+    state.change(action_source="policy", policy=f"{outside}:act")
+    assert state.knows_file(str(outside)), "its policy"

@@ -1,3 +1,5 @@
+"""The curves of the Reward tab: which are drawn, of which env, and what a click on one asks for."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -6,89 +8,153 @@ import numpy as np
 import pytest
 
 from tests.drive.panels import Panels
-from tests.ui.scenes import running
-from workbench.session.history.curves import Curves
+from tests.ui.scenes import running, step_of
+from workbench.core.env.step_result import StepResult
+from workbench.session.history.curves import Curves, Group, StepCurves
 from workbench.session.live.timeline import TimelineView
+from workbench.session.live.view import SessionView
 from workbench.ui.live.reward import CurvesPanel
-from workbench.ui.widgets.line_chart import LONGEST
+
+JOINTS = ("hinge", "slide")
 
 
-def curves(length: int, num_envs: int, success: float | None = 0.0, serial: int = 1) -> Curves:
-    reward = np.arange(length * num_envs, dtype=np.float32).reshape(length, num_envs)
-    flags = np.full_like(reward, np.nan if success is None else success)
-    return Curves(serial, np.arange(length), reward, flags)
+def step(number: int, num_envs: int, success: float | None = 0.0, **entries: object) -> StepResult:
+    evaluate = {} if success is None else {"success": np.full(num_envs, success, bool)}
+    result = step_of(np.zeros((num_envs, 1, 7), np.float32), **evaluate, **entries)
+    reward = np.arange(num_envs, dtype=np.float32) + number * num_envs
+    return replace(result, reward=reward, qpos=np.full((num_envs, 2), number, np.float32))
+
+
+def curves(
+    length: int, num_envs: int, env: int = 0, success: float | None = 0.0, **entries: object
+) -> Curves:
+    """The reward of env k at step t is k + t N."""
+    steps = StepCurves(num_envs, JOINTS)
+    for number in range(1, length + 1):
+        steps.add(step(number, num_envs, success, **entries))
+    return steps.curves(env)
+
+
+def reward(length: int, num_envs: int, env: int) -> list[float]:
+    return [env + number * num_envs for number in range(1, length + 1)]
+
+
+def seen(length: int, num_envs: int, env: int = 0, past: int | None = None, **entries: object) -> SessionView:
+    """A view after so many steps; `past` is the step that is shown, if not the last."""
+    view = running(num_envs, curves=curves(length, num_envs, env, **entries), selected_env=env)
+    shown = step(length if past is None else past, num_envs)
+    timeline = TimelineView(0, length, past, tick=length if past is None else past)
+    assert view.task is not None
+    return replace(view, step=shown, timeline=timeline, task=replace(view.task, joints=JOINTS))
 
 
 @pytest.fixture
-def panel(panels: Panels) -> CurvesPanel:
-    return CurvesPanel(panels.server)
+def asked() -> list[int]:
+    return []
+
+
+@pytest.fixture
+def panel(panels: Panels, asked: list[int]) -> CurvesPanel:
+    return CurvesPanel(panels.server, asked.append)
 
 
 def test_selected_env_against_the_mean(panels: Panels, panel: CurvesPanel) -> None:
-    past = curves(5, 4)
-    panel.draw(running(4, curves=past, selected_env=2))
+    panel.draw(seen(5, 4, env=2))
     chart = panels.charts()[0]
     x, mean, one = chart.data
-    np.testing.assert_array_equal(x, past.tick)
-    np.testing.assert_allclose(mean, past.reward.mean(axis=1))
-    np.testing.assert_array_equal(one, past.reward[:, 2])
+    assert x.tolist() == [1, 2, 3, 4, 5]
+    assert mean.tolist() == [1.5 + 4 * number for number in x] and one.tolist() == reward(5, 4, 2)
     assert [series.get("label") for series in chart.series] == ["step", "mean of the batch", "env 2"]
 
 
-def test_only_the_newest_part_is_sent(panels: Panels, panel: CurvesPanel) -> None:
-    past = curves(LONGEST * 3, 2)
-    panel.draw(running(2, curves=past))
+def test_all_steps_are_sent_in_few_points(panels: Panels, panel: CurvesPanel) -> None:
+    panel.draw(seen(3000, 2))
     for chart in panels.charts():
-        assert {len(values) for values in chart.data} == {LONGEST}
-        assert chart.data[0][-1] == past.tick[-1] and chart.data[1][-1] in (past.reward[-1].mean(), 0)
+        assert {len(values) for values in chart.data} == {len(chart.data[0])} and len(chart.data[0]) < 1000
+        assert chart.data[0][0] == 1 and chart.data[0][-1] == 3000
 
 
 def test_single_env_has_one_line(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(running(1, curves=curves(5, 1), selected_env=0))
+    panel.draw(seen(5, 1))
     assert [series.get("label") for series in panels.charts()[0].series] == ["step", "env 0"]
 
 
 def test_other_env_shows_its_own_past(panels: Panels, panel: CurvesPanel) -> None:
-    past = curves(50, 4)
-    panel.draw(running(4, curves=past, selected_env=0))
-    panel.draw(running(4, curves=past, selected_env=3))
+    panel.draw(seen(50, 4))
+    panel.draw(seen(50, 4, env=3))
     chart = panels.charts()[0]
-    assert len(chart.data[0]) == 50
-    np.testing.assert_array_equal(chart.data[2], past.reward[:, 3])
+    assert chart.data[2].tolist() == reward(50, 4, 3)
     assert chart.series[2].get("label") == "env 3"
 
 
+@pytest.mark.parametrize("length", [50, 3000])
 def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(
-    panels: Panels, panel: CurvesPanel
+    panels: Panels, panel: CurvesPanel, length: int
 ) -> None:
-    past = curves(50, 4)
-    panel.draw(running(4, curves=past, selected_env=3, timeline=TimelineView(0, 60, 27, tick=17)))
-    for chart, values in zip(panels.charts(), (past.reward, past.success), strict=True):
-        *_, one, dot = chart.data
-        np.testing.assert_array_equal(one, values[:, 3])
-        assert np.flatnonzero(np.isfinite(dot)).tolist() == [17] and dot[17] == values[17, 3]
-        assert [series.get("label") for series in chart.series][-2:] == ["env 3", "shown"]
+    panel.draw(seen(length, 4, env=3, past=17))
+    drawn = panels.charts()
+    assert [chart.title for chart in drawn] == ["reward", "success"]
+    x, *_, dot = drawn[0].data
+    (at,) = np.flatnonzero(np.isfinite(dot))
+    assert abs(x[at] - 17) <= 8 and dot[at] == 3 + 17 * 4
+    assert [series.get("label") for series in drawn[0].series][-2:] == ["env 3", "shown"]
+    panel.draw(seen(length, 4, env=3))
+    assert "shown" not in [series.get("label") for series in panels.charts()[0].series]
 
 
 def test_each_part_of_the_reward_has_a_line_of_the_selected_env(panels: Panels, panel: CurvesPanel) -> None:
-    term = np.arange(2.0 * LONGEST * 3, dtype=np.float32).reshape(-1, 3)
-    parts = {"reach": term, "<b>": -term, "gone": np.full_like(term, np.nan)}
-    found = replace(curves(2 * LONGEST, 3), parts=parts, no_curve=("sum",))
-    panel.draw(running(3, curves=found, selected_env=1))
+    terms = {"reward_terms/reach": np.array([1.0, 2, 3]), "reward_terms/<b>": np.array([-1.0, -2, -3])}
+    view = seen(4, 3, env=1, **terms)
+    assert view.curves is not None
+    panel.draw(replace(view, curves=replace(view.curves, no_curve=("sum",))))
     *_, chart = panels.charts()
     assert chart.title == "reward terms, env 1"
     assert [series.get("label") for series in chart.series] == ["step", "reach", "<b>"]
-    x, reach, other = chart.data
-    np.testing.assert_array_equal(x, found.tick[-LONGEST:])
-    np.testing.assert_array_equal(reach, term[-LONGEST:, 1])
-    np.testing.assert_array_equal(other, -term[-LONGEST:, 1])
-    assert "No curve of sum" in panels.html()
+    assert [values.tolist() for values in chart.data[1:]] == [[2.0] * 4, [-2.0] * 4]
+    assert "No curve of sum" in panels.html() and "<b>" not in panels.html().replace("<b>⚑", "")
+
+
+def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(
+    panels: Panels, panel: CurvesPanel
+) -> None:
+    entries = {"height": np.array([0.1, 0.2]), "at": np.ones((2, 3)), "touches": np.array([True, False])}
+    view = seen(3, 2, env=1, **entries)
+    panel.draw(view)
+    for entry in ((Group.EVALUATE, "height"), (Group.EVALUATE, "at"), (Group.JOINT, "slide")):
+        panels.press(f"{entry[0].value} {entry[1]}")
+    panels.press("evaluate success")
+    panel.draw(view)
+    assert [chart.title for chart in panels.charts()] == ["reward", "height", "at, env 1", "joints, env 1"]
+    _, height, at, joints = panels.charts()
+    np.testing.assert_allclose(height.data[1:], [[0.15] * 3, [0.2] * 3], rtol=1e-6)
+    assert [series.get("label") for series in at.series] == ["step", "at[0]", "at[1]", "at[2]"]
+    assert joints.data[1].tolist() == [1, 2, 3]
+    assert view.task is not None
+    panel.draw(replace(view, task=replace(view.task, class_name="Other")))
+    assert [chart.title for chart in panels.charts()] == ["reward", "success"]
+    panel.draw(view)
+    assert [chart.title for chart in panels.charts()] == ["reward", "height", "at, env 1", "joints, env 1"]
+
+
+def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named(
+    panels: Panels, panel: CurvesPanel, asked: list[int]
+) -> None:
+    view = seen(50, 2)
+    panel.draw(view)
+    panels.set("step of a curve", 7 + 10**8 * 3)
+    assert asked == [7]
+    kept = TimelineView(30, 50, 30, tick=31)
+    panel.draw(replace(view, timeline=kept))
+    assert "Step 7 is no longer in memory: the oldest that is, step 31, is shown" in panels.html()
+    panels.set("step of a curve", 40)
+    panel.draw(replace(view, timeline=replace(kept, shown=39, tick=40)))
+    assert "no longer in memory" not in panels.html()
 
 
 def test_how_parts_get_a_curve_is_said_where_a_dense_reward_names_none(
     panels: Panels, panel: CurvesPanel
 ) -> None:
-    view = running(2, curves=curves(2, 2))
+    view = seen(2, 2)
     assert view.task is not None
     panel.draw(view)
     says = "put info[&#34;reward_terms&#34;]" in panels.html()
@@ -97,32 +163,37 @@ def test_how_parts_get_a_curve_is_said_where_a_dense_reward_names_none(
     assert "put info" in panels.html()
     panel.draw(replace(view, task=replace(view.task, reward_mode="sparse")))
     assert "put info" not in panels.html()
-    assert [chart.title for chart in panels.charts()] == ["reward", "success"]
 
 
 def test_task_without_success_has_no_curve_of_it(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(running(4, curves=curves(50, 4, success=None)))
+    panel.draw(seen(50, 4, success=None))
     assert [chart.title for chart in panels.charts()] == ["reward"]
     assert "Curves appear" not in panels.html()
 
 
 def test_without_a_past_nothing_is_drawn(panels: Panels, panel: CurvesPanel) -> None:
     panel.draw(running(4, curves=None))
-    panel.draw(running(4, curves=curves(1, 4)))
+    panel.draw(seen(1, 4))
     assert panels.charts() == [] and "Curves appear after the second step." in panels.html()
-    panel.draw(running(4, curves=curves(2, 4, serial=2)))
+    panel.draw(seen(2, 4))
     assert len(panels.charts()) == 2 and "Curves appear" not in panels.html()
+    panel.draw(seen(1, 4))
+    assert panels.charts() == []
 
 
 def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(
     panels: Panels, panel: CurvesPanel
 ) -> None:
-    past = curves(50, 4)
-    past.reward[40:, :3] = np.nan
-    panel.draw(running(4, curves=past, selected_env=0))
+    steps = StepCurves(4)
+    for number in range(50):
+        result = step(number, 4)
+        if number >= 40:
+            result.reward[:3] = np.nan
+        steps.add(result)
+    panel.draw(replace(seen(50, 4), curves=steps.curves(0)))
     chart = panels.charts()[0]
-    np.testing.assert_array_equal(chart.data[1][40:], past.reward[40:, 3])
+    assert chart.data[1][40:].tolist() == [3 + 4 * number for number in range(40, 50)]
     assert np.isnan(chart.data[2][40:]).all()
     assert "NaN in 3 of 4 envs; the mean is of the others" in panels.html()
-    panel.draw(running(4, curves=curves(50, 4, serial=2)))
+    panel.draw(seen(50, 4))
     assert "NaN" not in panels.html()

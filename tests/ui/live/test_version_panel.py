@@ -6,6 +6,7 @@ from typing import Any, cast
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import problem, running
+from workbench.session.live.view import PastLoad
 from workbench.session.protocol.messages import ReloadReport
 from workbench.ui.live.version_panel import MOST_SHOWN, VersionPanel, took, version_html
 
@@ -63,7 +64,7 @@ def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: P
         < told.index("The previous version is still running")
         < told.index("only evaluate")
     )
-    assert "push.py, line 88" in told and "KeyError" in told
+    assert "push.py:88" in told and "KeyError" in told
     panel.draw(running(4, reload=good, stale=True, state="loading", refused=problem()))
     assert "not loaded" not in panels.html()  # another one is being tried
 
@@ -93,3 +94,19 @@ def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fail
     panel.draw(failed)
     assert panels.shows("Task") and panels.control("Task").value == "TwoEnv"
     assert panels.control("Task").options == ("OneEnv", "TwoEnv")
+
+
+def test_the_last_loads_are_listed_newest_first_with_level_reason_and_time(panels: Panels) -> None:
+    panel = VersionPanel(panels.server, cast(Any, StillSession()))
+    first = PastLoad(1_000_000_000.0, None, "the first version", 900.0)
+    panel.draw(running(4, loads=(first,)))
+    assert "the first version" not in panels.html(), "one load is no list"
+    refused = PastLoad(1_000_000_060.0, None, "KeyError: '<goal>'", problem=problem())
+    patched = PastLoad(1_000_000_120.0, "patched", "only evaluate changed", 43.0)
+    panel.draw(running(4, loads=(patched, refused, first)))
+    told = panels.html("wb-loads")
+    places = [
+        told.index(words)
+        for words in ("patched", "43 ms", "only evaluate", "refused", "push.py:88", "900 ms")
+    ]
+    assert places == sorted(places) and "&lt;goal&gt;" in told

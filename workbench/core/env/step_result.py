@@ -53,6 +53,8 @@ class StepResult:
     """(N, A) that led here; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None
     """(N,) whether the env's observation is finite, pictures left out; None if unknown."""
+    qpos: NDArray[np.float32] | None = None
+    """(N, J) positions of the joints of `core.scene.scene_index.joint_names`, in rad or m; None if there are none."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
     """All other entries of ``evaluate()``; no name is also in `evaluate`."""
 

@@ -25,7 +25,7 @@ from workbench.core.env.strict import StrictMixin
 from workbench.core.env_numbers import envs_of_batch
 from workbench.core.maniskill_private import episode_seeds, flatten_observation, keep_observation
 from workbench.core.rules import Degree, Finding, degrees_of
-from workbench.core.scene.scene_index import read_poses
+from workbench.core.scene.scene_index import read_joints, read_poses
 from workbench.core.snapshots.snapshot import (
     RestoreReport,
     Snapshot,
@@ -301,6 +301,7 @@ class TaskEnv:
             evaluate=evaluate,
             others=others,
             poses=read_poses(self.env),
+            qpos=read_joints(self.env),
             action=None if action is None else np.array(action, dtype=np.float32),
             sound_obs=_sound(self.obs, count) if look else None,
         )

@@ -170,6 +170,37 @@ def read_poses(env: Any) -> NDArray[np.float32]:
     return poses
 
 
+@once_a_scene
+def joints_of_scene(env: Any) -> tuple[tuple[str, Any], ...]:
+    """Articulations that every env has, by name, with as many active joints in each: their joints can be compared."""
+    found = []
+    for name, articulation in env.scene.articulations.items():
+        count = len(articulation.active_joints)
+        everywhere = len(maniskill_private.envs_of(articulation)) == env.num_envs
+        if count and everywhere and tuple(articulation.get_qpos().shape) == (env.num_envs, count):
+            found.append((name, articulation))
+    return tuple(found)
+
+
+def joint_names(env: Any) -> tuple[str, ...]:
+    """(J,) names of the joints of `read_joints`: with the articulation's where there are several."""
+    found = joints_of_scene(env)
+    return tuple(
+        joint.name if len(found) == 1 else f"{name}/{joint.name}"
+        for name, articulation in found
+        for joint in articulation.active_joints
+    )
+
+
+def read_joints(env: Any) -> NDArray[np.float32] | None:
+    """(N, J) positions of the joints of all articulations that every env has, in rad or m; None if there are none."""
+    found = joints_of_scene(env)
+    if not found:
+        return None
+    rows = [articulation.get_qpos() for _, articulation in found]
+    return np.concatenate([np.array(row.numpy(force=True), np.float32) for row in rows], axis=1)
+
+
 def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
     """For each hidden Actor: the slots (M,) of its entities and their true poses (M, 7).
 

@@ -48,7 +48,7 @@ class Snapshot(NamedTuple):
     contacts, and the last bit of an articulation's root. Nothing else is missing (tested: an uninterrupted run whose bodies
     move into a new scene, with no number written, continues as the restored one). Five steps later that is nothing for a
     cart-pole, 1e-3 rad of a joint where a hand holds or pushes, 2e-2 rad for a humanoid that lies on the ground, and without bound where a
-    fall or a slip hangs on it (``tests/benchmarks/restore_distance.py``; figures in ``web_assets/docs/task_ids.md``). Writing
+    fall or a slip hangs on it (``tests/benchmarks/restore_distance.py``; figures in ``web_assets/docs/reference/task_ids.md``). Writing
     an earlier state and repeating the steps does not help. Exact is a snapshot at an *exact point* (`begin_anew`, or right
     after a restore) with every step since then made again; the session goes back so (`session.worker.go_back`).
     """

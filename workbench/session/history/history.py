@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pickle
 import sys
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Protocol
@@ -17,7 +18,7 @@ from workbench.core.camera_data import CameraKind, Picture
 from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.packing import WholeSnapshot
 from workbench.jobs.task import NO_MOMENT, Restored, Stepped
-from workbench.session.history.curves import Columns, RecentSteps
+from workbench.session.history.curves import Columns, StepCurves
 from workbench.session.history.env_table import KEPT_REWARDS, NONFINITE_REWARD_KEY, EnvRows, EnvTable
 from workbench.session.protocol.messages import PastPictures, Pictures, ReplayPath
 
@@ -97,7 +98,7 @@ class Moment:
     """(N,) as `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
     tick: int
-    """`Curves.tick` of this moment."""
+    """`Curves.serial` of this moment."""
     event_flags: NDArray[np.uint8]
     """(N,) event flags (`RESET` ...), added up."""
     restored: Restored | None
@@ -168,12 +169,15 @@ class History:
     moments.
     """
 
-    def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
+    def __init__(
+        self, table: EnvTable, limit: int, first_serial: int = 0, joints: Sequence[str] = ()
+    ) -> None:
         """
         Args:
             table: of the envs, without events so far.
             limit: bytes; the newest moment is always kept.
             first_serial: the number of the first moment.
+            joints: names of `StepResult.qpos`.
         """
         self._table, num_envs = table, table.rows().num_envs
         self._num_envs = num_envs
@@ -186,7 +190,7 @@ class History:
         self._pictured: deque[int] = deque()
         self._jumps: deque[Moment] = deque()
         self._columns = Columns(num_envs, first_serial)
-        self.steps = RecentSteps(num_envs)
+        self.steps = StepCurves(num_envs, joints)
 
     # --- events ------------------------------------------------------------------------------------
 
@@ -304,6 +308,12 @@ class History:
     def at(self, serial: int) -> Moment | None:
         """The moment of this serial, if it is kept."""
         return self._moments[serial - self.first] if self.first <= serial <= self.last else None
+
+    def serial_of_tick(self, tick: int) -> int:
+        """Serial of the moment after this control step (`Moment.tick`), or of the nearest kept one."""
+        serials = range(self.first, self.last + 1)
+        found = bisect_left(serials, tick, key=lambda serial: self._moments[serial - self.first].tick)
+        return serials[min(found, len(serials) - 1)] if serials else self.last
 
     def snapshot_at(self, serial: int) -> bytes | None:
         """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch at that moment, or None."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,10 +21,11 @@ from workbench.authoring.loading.reference import (
 from workbench.authoring.problem import Problem
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
+from workbench.jobs.policy import NoPolicy, find_policy
 from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
 from workbench.session.history.env_table import EnvTable
 from workbench.session.live.timeline import Timeline
-from workbench.session.live.view import SessionView
+from workbench.session.live.view import PastLoad, SessionView
 from workbench.session.process.heartbeat import death_problem, own_files_of
 from workbench.session.process.supervisor import Death
 from workbench.session.protocol.messages import (
@@ -43,6 +46,8 @@ from workbench.session.protocol.messages import (
     Status,
 )
 from workbench.session.record.save_past import PastEpisode, SaveRequest, find_episode
+
+_MOST_LOADS = 20
 
 
 @dataclass
@@ -106,6 +111,8 @@ class LiveState:
             activity="",
             stale=stale,
         )
+        level, reason = (None, "the first version") if report is None else (report.level, report.reason)
+        self._remember(PastLoad(time.time(), level, reason, self.now.load_milliseconds))
         self.first_step_due = not kept
         if not kept:
             # Broken rules of the new scene are reported after it.
@@ -141,7 +148,7 @@ class LiveState:
         if self.timeline is None or not its_past_stays:
             last = -1 if self.timeline is None else self.timeline.history.last
             table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode)
-            self.timeline = Timeline(table, self.history_bytes, last + 1)
+            self.timeline = Timeline(table, self.history_bytes, last + 1, task.joints)
 
     def stepped(self, event: Stepped) -> None:
         if self.timeline is None:
@@ -163,6 +170,8 @@ class LiveState:
         elif isinstance(event, LoadFailed):
             self.set_problem(event.problem)
             self.problem_at_run = now.state != "loading"
+            if not self.problem_at_run:
+                self._remember(PastLoad(time.time(), None, event.problem.message, problem=event.problem))
             self.set(
                 state="error",
                 activity="",
@@ -242,6 +251,9 @@ class LiveState:
         """A new worker has no version to load: the problem stays."""
         if self.now.state == "starting":
             self.set(state="error", activity="")
+
+    def _remember(self, load: PastLoad) -> None:
+        self.set(loads=(load, *self.now.loads[: _MOST_LOADS - 1]))
 
     def set_problem(self, problem: Problem | None) -> None:
         self.set(problem=problem, problem_serial=self.now.problem_serial + 1)
@@ -331,6 +343,17 @@ class LiveState:
 
     # --- reading -------------------------------------------------------------------------------------
 
+    def knows_file(self, path: str) -> bool:
+        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder."""
+        known = [Path(file).absolute() for file in self.own_files()]
+        if self.policy is not None:
+            with contextlib.suppress(NoPolicy):
+                known.append(Path(find_policy(self.policy, self.folder)[0]).absolute())
+        file = Path(path)
+        # A module that has never loaded is in no `source_files`. Resolved: a path may leave the folder again by "..".
+        beside = self.own_folder is not None and file.resolve().is_relative_to(self.own_folder.resolve())
+        return file in known or (beside and file.suffix == ".py" and file.is_file())
+
     def own_files(self) -> list[str]:
         """The known files of the author."""
         return own_files_of(() if self.now.task is None else self.now.task.source_files, self.own_file)
@@ -372,8 +395,8 @@ class LiveState:
         if timeline is None:
             return replace(now, refused=refused, **known)
         env, moment = now.settings.selected_env, timeline.shown
-        past = timeline.view(env, now.settings.cameras)
-        view = replace(now, refused=refused, curves=timeline.history.steps.curves(), timeline=past, **known)
+        past, curves = timeline.view(env, now.settings.cameras), timeline.history.steps.curves(env)
+        view = replace(now, refused=refused, curves=curves, timeline=past, **known)
         if moment is None:
             return view
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))

@@ -157,6 +157,12 @@ class Session:
         return self._shared.wait(seen, timeout)
 
     @property
+    def task_folder(self) -> Path | None:
+        """Folder of the task's own file, where policies are looked for too."""
+        with self._lock:
+            return self._state.folder
+
+    @property
     def worker_pid(self) -> int | None:
         """Process id of the worker; None while there is none."""
         return self._worker.pid

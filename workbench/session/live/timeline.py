@@ -35,7 +35,7 @@ class TimelineView:
     shown: int | None = None
     """The shown moment; None while live."""
     tick: int = 0
-    """`Curves.tick` of the shown moment."""
+    """Control steps until the shown moment, as of `Curves`."""
     used: int = 0
     limit: int = 0
     """Bytes."""
@@ -79,9 +79,11 @@ class Timeline:
     moment, to undo a jump, and to draw a moment that has no pictures.
     """
 
-    def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
+    def __init__(
+        self, table: EnvTable, limit: int, first_serial: int = 0, joints: tuple[str, ...] = ()
+    ) -> None:
         """See `History`."""
-        self.history = History(table, limit, first_serial)
+        self.history = History(table, limit, first_serial, joints)
         self._num_envs = table.rows().num_envs
         self._shown: int | None = None
         self._jump: Restored | None = None
@@ -130,6 +132,10 @@ class Timeline:
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if serials:
             self.seek(serials[min(serials, key=lambda known: abs(known - step))])
+
+    def seek_tick(self, tick: int) -> None:
+        """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one."""
+        self.seek(self.history.serial_of_tick(tick))
 
     def seek_event(self, env: int, direction: int) -> None:
         """Go to the next (1) or previous (-1) event of this env; forward from the last one is live."""
@@ -297,6 +303,10 @@ class TimeTravel:
     def seek_step(self, env: int, step: int) -> None:
         """Show the moment of a step of this env's present episode."""
         self._seek(lambda timeline: timeline.seek_step(env, step))
+
+    def seek_tick(self, tick: int) -> None:
+        """Show the moment after a control step, counted as the curves count."""
+        self._seek(lambda timeline: timeline.seek_tick(tick))
 
     def seek_event(self, direction: int) -> None:
         """Show the next (1) or previous (-1) event of the selected env: reset, success, fail, truncation, jump back."""

@@ -206,6 +206,11 @@ class Versions:
         with self._shared.lock:
             return self._shared.state.own_files()
 
+    def knows_file(self, path: str) -> bool:
+        """See `LiveState.knows_file`."""
+        with self._shared.lock:
+            return self._shared.state.knows_file(path)
+
     def running_load(self) -> Load | None:
         """Loads the running version into another worker; None if no task runs."""
         with self._shared.lock:

@@ -16,7 +16,7 @@ from workbench.session.live.timeline import TimelineView
 from workbench.session.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Vitals
-from workbench.session.protocol.messages import ReloadReport, RulesBroken, Settings
+from workbench.session.protocol.messages import ReloadLevel, ReloadReport, RulesBroken, Settings
 from workbench.session.record.live import RecordingStatus
 from workbench.session.rescore.background import RescoreView
 
@@ -47,6 +47,20 @@ class ShownCameras:
 
 
 @dataclass(frozen=True)
+class PastLoad:
+    """One attempt to load the file."""
+
+    at: float
+    """Seconds since the epoch."""
+    level: ReloadLevel | None
+    """None for the first version, and for one that was refused."""
+    reason: str
+    milliseconds: float = 0.0
+    problem: Problem | None = None
+    """Why it was refused."""
+
+
+@dataclass(frozen=True)
 class SessionView:
     """Immutable; its serials tell the redraw loop cheaply which parts are new, so that nothing is drawn twice."""
 
@@ -65,6 +79,8 @@ class SessionView:
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
     """How the running version came in; None for the first."""
+    loads: tuple[PastLoad, ...] = ()
+    """The last loads, newest first."""
     choices: tuple[str, ...] = ()
     """Task classes of the file, the chosen one first; empty if it has only one."""
     step: StepResult | None = None

@@ -52,7 +52,7 @@ class RescoredCurve:
     """One number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
-    """(T,) as `Curves.tick`."""
+    """(T,) as `Curves.serial`."""
     serial: NDArray[np.int64]
     """(T,) serials of the moments."""
     old: NDArray[np.float32]

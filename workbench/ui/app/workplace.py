@@ -20,6 +20,7 @@ from workbench.session.live.session import Session
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.recorded_scene import SceneProcess
 from workbench.session.review.review import Review
+from workbench.ui.app import help_pages
 from workbench.ui.app.go_live import GoLive, MakeSession
 from workbench.ui.app.review_page import ReviewPage
 from workbench.ui.app.trust_dialog import TrustDialog
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Which = Literal["live", "review"]
+HELP = Command("Help", lambda: None)
+"""The browser itself opens the page (``web_assets/help.js``)."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ class Workplace:
         tasks: Task files that may define the envs of foreign recordings.
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
+        editor: Address of a line in the author's editor, as `parse_editor` gives it.
     """
 
     def __init__(
@@ -69,21 +73,25 @@ class Workplace:
         tasks: tuple[Path, ...] = (),
         trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
+        editor: str = "",
     ) -> None:
         self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
-        self._imports, self._on_notice = base.imports, on_notice
+        self._imports, self._on_notice, self._editor = base.imports, on_notice, editor
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._recovering: threading.Thread | None = None
-        self.commands: tuple[Command, ...] = ()
+        self.commands: tuple[Command, ...] = (HELP,)
         """In the palette of both pages; set before the first page is shown."""
         self.session = session
         """Shown by the live page when it is next built."""
+        self.newest_opened = False
+        """The review has begun with the newest recording; it does so once."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
         self.go_live = GoLive(self, make_session, clearances, base)
         self.rescorer, self.rescore_choices = Rescorer(clearances, base), RescoreChoices()
         self.sharing = Sharing(gated_server)
+        gated_server.add_route(help_pages.ADDRESS, help_pages.reply, help_pages.HEADERS)
         self.stage = Stage(self.server)
         self.pages = Pages(self.server, self.stage, self._page)
 
@@ -145,7 +153,13 @@ class Workplace:
 
         assert self.session is not None, "the live page is shown with its session"
         return Page(
-            self.server, self.session, dark, lambda: self.pages.show("review"), self.stage, self.commands
+            self.server,
+            self.session,
+            dark,
+            lambda: self.pages.show("review"),
+            self.stage,
+            self.commands,
+            editor=self._editor,
         )
 
 

@@ -8,6 +8,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP
+from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
@@ -15,6 +16,7 @@ WIDEST, BUSY_WIDEST = 520, 460
 """Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
 version is still used."""
 
+RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Start a new worker"
 SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
@@ -56,13 +58,15 @@ class Banner(PagePart[SessionView]):
         server: The page.
         reload: Asks the session to load the file again.
         restart: Asks the session for a new worker process.
+        link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, reload, restart) -> None:
+    def __init__(self, server: viser.ViserServer, reload, restart, link: LinkTo = no_links) -> None:
+        self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
-            self._reload = server.gui.add_button("Reload the file", icon=viser.Icon.REFRESH, color="gray")
+            self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
             self._restart = server.gui.add_button(
                 "Restart the worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
@@ -85,12 +89,12 @@ class Banner(PagePart[SessionView]):
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:
             self._drawn = drawn
-            self._html.content = banner_html(problem, view)
+            self._html.content = banner_html(problem, view, self._link)
             self._panel.visible = True
             self._panel.expand()
 
 
-def banner_html(problem: Problem, view: SessionView) -> str:
+def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:
     """The banner's content."""
     if problem.stage == "policy":
         subject = "The policy"
@@ -101,7 +105,7 @@ def banner_html(problem: Problem, view: SessionView) -> str:
     doing = DOING.get(problem.stage, f"failed in {problem.stage}")
     if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
-    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view))
+    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
 
 
 def _kept(view: SessionView) -> str:
@@ -130,15 +134,17 @@ class BusyBanner(PagePart[SessionView]):
         server: The page.
         interrupt: Asks the session to interrupt the author's code.
         restart: Asks the session for another worker process.
+        link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, interrupt, restart) -> None:
+    def __init__(self, server: viser.ViserServer, interrupt, restart, link: LinkTo = no_links) -> None:
+        self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-11.0)
         with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
-            self._interrupt = server.gui.add_button("Interrupt", icon=viser.Icon.HAND_STOP)
-            self._restart = server.gui.add_button("Restart", icon=viser.Icon.POWER, color="gray")
+            self._interrupt = server.gui.add_button(INTERRUPT, icon=viser.Icon.HAND_STOP)
+            self._restart = server.gui.add_button(RESTART, icon=viser.Icon.POWER, color="gray")
         self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
         self._interrupt.on_click(lambda _: interrupt())
         self._restart.on_click(lambda _: restart())
@@ -148,7 +154,7 @@ class BusyBanner(PagePart[SessionView]):
         if busy is None or not is_busy_for_long(view):
             self._panel.visible = False
             return
-        self._html.content = busy_html(busy, view)
+        self._html.content = busy_html(busy, view, self._link)
         # An element of its own: the changing seconds would close an open traceback.
         trace = (
             render("traceback", traceback=busy.traceback) if busy.ignores_interrupt and busy.traceback else ""
@@ -162,7 +168,7 @@ class BusyBanner(PagePart[SessionView]):
             self._panel.expand()
 
 
-def busy_html(busy: Busy, view: SessionView) -> str:
+def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
     """The banner's content."""
     if busy.ignores_interrupt:
         advice = (
@@ -177,4 +183,4 @@ def busy_html(busy: Busy, view: SessionView) -> str:
             "restores the last good version where it was. Saving a fixed file does the same."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
-    return render("busy", subject=subject, busy=busy, advice=advice)
+    return render("busy", subject=subject, busy=busy, advice=advice, link=link)

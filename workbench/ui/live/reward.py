@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,66 +11,215 @@ from numpy.typing import NDArray
 
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.machine.text import mean_text, nonfinite_text, number_text
-from workbench.session.history.curves import MOST, Curves
+from workbench.session.history.curves import REWARD, SUCCESS, Column, Curves, Group, columns_of
 from workbench.session.live.view import SessionView
-from workbench.ui.widgets.line_chart import LONGEST, YES_OR_NO, ChartLine, LineChart
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.line_chart import YES_OR_NO, ChartLine, LineChart
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, short_text
 
-HEIGHT, TERMS_HEIGHT = 150, 170
+HEIGHT, TALL = 150, 170
+"""Pixels of a chart with one entry, and of one with many lines."""
 BATCH_COLOUR = "#868e96"
 COLOURS = (
     "#228be6", "#f08c00", "#2f9e44", "#be4bdb", "#e03131", "#12b886",
     "#fab005", "#7950f2", "#fd7e14", "#15aabf", "#e64980", "#868e96",
 )  # fmt: skip
-NO_CURVES = Curves(0, np.zeros(0, np.int64), np.zeros((0, 1), np.float32), np.zeros((0, 1), np.float32))
-NEWEST = slice(-LONGEST, None)
+MOST_LINES = len(COLOURS)
+MOST_CHARTS = 12
+"""Entries of ``evaluate`` with a chart."""
+MOST_NAMED = 12
+CHOICE = "Choose curves"
 HOW_TO = (
     'For a curve of each part of the reward, put info["reward_terms"] = {"reach": reach, ...} (tensors of shape '
     "(num_envs,)) into the info that compute_dense_reward receives."
 )
+AT_FIRST = (Group.REWARD, Group.TERM)
+"""Drawn unless a person turns them off, as success is."""
+Entry = tuple[Group, str]
+"""What is chosen: a column, or all parts of an entry of several."""
 
 
 class CurvesPanel(PagePart[SessionView]):
-    """Curves of the selected env and of the mean over the batch, from the history: selecting an env keeps its past."""
+    """Curves of the selected env and of the mean over the batch, over all steps: selecting an env keeps its past.
+
+    A person chooses which; the choice is kept for each task. A press on a curve shows its step.
+
+    Args:
+        seek: Shows the moment after a control step.
+    """
 
     every = 0.2
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, seek: Callable[[int], None] = lambda tick: None) -> None:
+        self._server, self._seek = server, seek
         gui = server.gui
-        folder = gui.add_folder(None)
-        self._reward, self._success = (LineChart(server, folder, HEIGHT) for _ in range(2))
+        self._choice_folder = gui.add_folder(CHOICE, expand_by_default=False, visible=False)
+        with self._choice_folder:
+            self._choice = gui.add_html("")
+        self._folder = gui.add_folder(None)
+        self._charts: dict[Entry, LineChart] = {}
+        self._toggled: dict[str, set[Entry]] = {}
+        """By task, what a person has turned on or off."""
+        self._turned = 0
+        self._task = ""
+        self._asked: int | None = None
+        """The step that was pressed last."""
+        self._presses = Presses(server)
+        self._hint = gui.add_html("", visible=False)
         self._lost = gui.add_html("", visible=False)
         self._empty = gui.add_html(render("note", text="Curves appear after the second step."))
-        self._terms = LineChart(server, gui.add_folder(None), TERMS_HEIGHT)
         self._about_terms = gui.add_html("", visible=False)
 
     def key(self, view: SessionView) -> object:
         drawn = None if view.curves is None else view.curves.serial
-        return drawn, view.task_serial, view.step_serial, view.selected_env, view.timeline.shown
+        return drawn, view.task_serial, view.step_serial, view.selected_env, view.timeline.shown, self._turned
 
     def draw(self, view: SessionView) -> None:
-        curves = NO_CURVES if view.curves is None or len(view.curves.tick) < 2 else view.curves
-        self._empty.visible = curves is NO_CURVES
-        lost = "" if self._empty.visible else said_of(curves.reward[-1])
-        self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
-        x, env, terms = curves.tick[NEWEST], view.selected_env, curves.terms
-        for chart, title, values, span in (
-            (self._reward, "reward", curves.reward, None),
-            (self._success, "success", curves.success, YES_OR_NO),
-        ):
-            lines = env_lines(values[NEWEST], env)
-            shown = np.where(x == view.timeline.tick, lines[-1].values, np.nan)
-            chart.draw(title, x, lines, None if view.timeline.shown is None else shown, span)
-        dense = len(x) and view.task is not None and "dense" in view.task.reward_mode
-        text = HOW_TO if dense and not terms else ""
-        text = no_curve_text(curves.no_curve) if curves.no_curve else text
-        self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
+        curves, task = view.curves, view.task
+        there = curves is not None and curves.serial >= 2
+        self._empty.visible = not there
+        self._hint.visible = self._choice_folder.visible = there
+        self._draw_notes(view, curves if there else None)
+        if curves is None or not there:
+            for chart in self._charts.values():
+                chart.hide()
+            return
+        self._task = "" if task is None else f"{task.file} {task.class_name}"
+        entries = {entry_of(column): None for column in curves.columns}
+        chosen = [entry for entry in entries if self._is_on(entry)]
+        self._draw_choice(list(entries), chosen)
+        drawn = self._draw_charts(view, curves, chosen)
+        for key, chart in self._charts.items():
+            if key not in drawn:
+                chart.hide()
+
+    # --- what is chosen ------------------------------------------------------------------------------
+
+    def _is_on(self, entry: Entry) -> bool:
+        at_first = entry[0] in AT_FIRST or entry == entry_of(SUCCESS)
+        return at_first != (entry in self._toggled.get(self._task, ()))
+
+    def _toggle(self, entry: Entry) -> None:
+        self._toggled[self._task] = self._toggled.get(self._task, set()) ^ {entry}
+        self._turned += 1
+
+    def _draw_choice(self, entries: Sequence[Entry], chosen: Sequence[Entry]) -> None:
+        def press(entry: Entry) -> str:
+            group, name = entry
+            return self._presses.id_of((group.value, name), lambda _: self._toggle(entry))
+
+        names = {
+            Group.REWARD: "reward",
+            Group.TERM: "reward terms",
+            Group.EVALUATE: "evaluate",
+            Group.JOINT: "joints",
+        }
+        groups = [(names[group], [entry for entry in entries if entry[0] is group]) for group in Group]
+        self._choice.content = render("curve_choice", groups=groups, chosen=chosen, press_id=press)
+
+    # --- charts --------------------------------------------------------------------------------------
+
+    def _draw_charts(self, view: SessionView, curves: Curves, chosen: Sequence[Entry]) -> set[Entry]:
+        """Draw what is chosen; returns the keys of the charts."""
+        env, drawn = view.selected_env, set()
+        singles = [entry for entry in chosen if entry[0] in (Group.REWARD, Group.EVALUATE)]
+        for entry in singles[: MOST_CHARTS + 2]:
+            columns = [column for column in curves.columns if entry_of(column) == entry]
+            if columns[0].part is not None:
+                self._draw_lines(entry, f"{entry[1]}, env {env}", curves, columns)
+            else:
+                self._draw_one(entry, view, curves, columns[0])
+            drawn.add(entry)
+        for group, title in ((Group.TERM, "reward terms"), (Group.JOINT, "joints")):
+            columns = [
+                column for column in curves.columns if column.group is group and self._is_on(entry_of(column))
+            ]
+            if columns:
+                self._draw_lines((group, ""), f"{title}, env {env}", curves, columns)
+                drawn.add((group, ""))
+        return drawn
+
+    def _draw_one(self, entry: Entry, view: SessionView, curves: Curves, column: Column) -> None:
+        x, (one, mean) = curves.lines(((column, False), (column, True)))
+        env, batch = (
+            ChartLine(f"env {view.selected_env}", one),
+            ChartLine("mean of the batch", mean, BATCH_COLOUR, 1.4),
+        )
+        dot = None
+        if view.timeline.shown is not None and view.step is not None and len(x):
+            dot = np.full(len(x), np.nan)
+            dot[np.abs(x - view.timeline.tick).argmin()] = value_at(view, column)
+        yes_or_no = column == SUCCESS or (view.step is not None and is_yes_or_no(view.step, column))
+        several = len(curves.newest) > 1
+        self._chart(entry).draw(
+            column.name, x, [batch, env] if several else [env], dot, YES_OR_NO if yes_or_no else None
+        )
+
+    def _draw_lines(self, key: Entry, title: str, curves: Curves, columns: Sequence[Column]) -> None:
+        """Several lines of the selected env in one chart."""
+        x, values = curves.lines([(column, False) for column in columns[:MOST_LINES]])
         lines = [
-            ChartLine(name, values[NEWEST, min(env, values.shape[1] - 1)], colour, 1.6)
-            for (name, values), colour in zip(terms.items(), COLOURS, strict=False)
+            ChartLine(column.label, line, colour, 1.6)
+            for column, line, colour in zip(columns, values, COLOURS, strict=False)
+            if np.isfinite(line).any()
         ]
-        self._terms.draw(f"reward terms, env {env}", x, lines)
+        self._chart(key).draw(title, x, lines)
+
+    def _chart(self, key: Entry) -> LineChart:
+        if key not in self._charts:
+            first = {
+                entry_of(REWARD): 1.0,
+                entry_of(SUCCESS): 2.0,
+                (Group.TERM, ""): 3.0,
+                (Group.JOINT, ""): 1e5,
+            }
+            order = first.get(key, 10.0 + len(self._charts))
+            height = HEIGHT if key[1] else TALL
+            self._charts[key] = LineChart(self._server, self._folder, height, order)
+        return self._charts[key]
+
+    # --- notes ---------------------------------------------------------------------------------------
+
+    def _draw_notes(self, view: SessionView, curves: Curves | None) -> None:
+        """
+        Args:
+            curves: None where none are drawn.
+        """
+        lost = "" if curves is None else said_of(curves.newest)
+        self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
+        past, asked = view.timeline, self._asked
+        gone = asked is not None and past.shown is not None and past.shown == past.first and asked < past.tick
+        pressed = self._presses.number_id("step of a curve", self._go_to)
+        self._hint.content = render(
+            "curve_hint", seek=pressed, first=0, gone=asked if gone else None, kept=past.tick
+        )
+        dense = curves is not None and view.task is not None and "dense" in view.task.reward_mode
+        terms = curves is not None and any(column.group is Group.TERM for column in curves.columns)
+        text = HOW_TO if dense and not terms else ""
+        text = no_curve_text(curves.no_curve) if curves is not None and curves.no_curve else text
+        self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
+
+    def _go_to(self, tick: int) -> None:
+        self._asked = tick
+        self._seek(tick)
+
+
+def entry_of(column: Column) -> Entry:
+    return column.group, column.name
+
+
+def value_at(view: SessionView, column: Column) -> float:
+    """The shown moment's number of the selected env; NaN if it has none."""
+    assert view.step is not None
+    joints = () if view.task is None else view.task.joints
+    values = columns_of(view.step, joints).get(column)
+    return float("nan") if values is None else float(values[min(view.selected_env, len(values) - 1)])
+
+
+def is_yes_or_no(step: StepResult, column: Column) -> bool:
+    values = step.evaluate.get(column.name)
+    return column.group is Group.EVALUATE and values is not None and values.dtype.kind == "b"
 
 
 def said_of(reward: NDArray[np.float32]) -> str:
@@ -87,25 +237,10 @@ def said_of(reward: NDArray[np.float32]) -> str:
     )
 
 
-def env_lines(values: NDArray[np.float32], env: int) -> list[ChartLine]:
-    """The mean of the batch, if N > 1, and one env's column of `values` (T, N)."""
-    env = min(env, values.shape[1] - 1)
-    one = ChartLine(f"env {env}", values[:, env])
-    if values.shape[1] == 1:
-        return [one]
-    return [ChartLine("mean of the batch", mean_of_numbers(values), BATCH_COLOUR, 1.4), one]
-
-
-def mean_of_numbers(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(T,) mean over the envs with a finite value; NaN where there is none."""
-    there = np.isfinite(values)
-    total = np.where(there, values, 0.0).sum(axis=1, dtype=np.float64)
-    count = there.sum(axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
 def no_curve_text(names: tuple[str, ...]) -> str:
-    listed = ", ".join(names[:MOST]) + (f" and {len(names) - MOST} more" if len(names) > MOST else "")
+    listed = ", ".join(names[:MOST_NAMED]) + (
+        f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    )
     return f'No curve of {listed} in info["reward_terms"]: a curve needs one number for each env, of shape (num_envs,).'
 
 

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import threading
+import time
 from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
 
 import viser
 
+from workbench.jobs.policy import NoPolicy, find_policy, list_policies
 from workbench.jobs.task import ActionDimension, ActionSource
+from workbench.machine.kept_choices import keep_policy, used_policies
+from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import EpisodeEnd
@@ -107,7 +115,53 @@ SOURCES: dict[str, ActionSource] = {
 }
 STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
 PREVIOUS, NEXT = "‹ previous", "next ›"
+CHOOSE = "choose one"
+KNOWN_HINT = "Functions of one parameter in the files where the command was started and beside the task, and policies used before."
+LOOK_EVERY = 5.0
+"""Seconds."""
 LARGEST_SEED = 2**31 - 1
+
+
+class KnownPolicies:
+    """Policies to choose from: those that were used in this folder, and what the files there and beside the task hold."""
+
+    def __init__(self) -> None:
+        self._here = Path.cwd()
+        self._found: tuple[str, ...] = ()
+        self._looked = -math.inf
+        self._looking: threading.Thread | None = None
+        self._kept: str | None = None
+
+    def look(self, task_folder: Path | None, acting: str | None) -> tuple[str, ...]:
+        """What is known; looked up again every `LOOK_EVERY` seconds on a thread, since it reads many files.
+
+        Args:
+            acting: the policy that is chosen; kept for the next run if there is such a file or module.
+        """
+        if acting is not None and acting != self._kept:
+            self._kept = acting
+            with contextlib.suppress(NoPolicy):
+                find_policy(acting, task_folder)
+                keep_policy(self._here, acting)
+                self._looked = -math.inf
+        looking = self._looking is not None and self._looking.is_alive()
+        if not looking and time.monotonic() - self._looked > LOOK_EVERY:
+            self._looked = time.monotonic()
+            self._looking = watched_thread("policies", lambda: self._look(task_folder))
+            self._looking.start()
+        return self._found
+
+    def _look(self, task_folder: Path | None) -> None:
+        used = [one for one in used_policies(self._here) if _is_there(one, task_folder)]
+        self._found = tuple(dict.fromkeys([*used, *list_policies(self._here, task_folder)]))
+
+
+def _is_there(reference: str, task_folder: Path | None) -> bool:
+    try:
+        find_policy(reference, task_folder)
+    except NoPolicy:
+        return False
+    return True
 
 
 class RunPanel(PagePart[SessionView]):
@@ -172,6 +226,12 @@ class RunPanel(PagePart[SessionView]):
                 settle=0.8,
             )
             limit_text(self._policy.handle, 500)
+            add_dropdown: Any = gui.add_dropdown  # viser infers the type of the options from the first
+            self._found = Control(
+                add_dropdown("Known", (CHOOSE,), hint=KNOWN_HINT, visible=False),
+                send=self._choose_found,
+            )
+            self._policies = KnownPolicies()
             self._policy_hint = gui.add_html(render("policy_hint"))
             self._sliders = ActionSliders(server, session)
 
@@ -224,6 +284,7 @@ class RunPanel(PagePart[SessionView]):
         policy_wanted = view.settings.action_source == "policy"
         self._policy.handle.visible = policy_wanted
         self._policy_hint.visible = policy_wanted and not view.settings.policy
+        self._draw_found(view.settings.policy if policy_wanted else None, policy_wanted)
         self._sliders.draw(view.settings.action_source == "sliders", view.settings.sliders)
 
     def _draw_play(self, playing: bool, can_act: bool) -> None:
@@ -251,6 +312,18 @@ class RunPanel(PagePart[SessionView]):
         # Without a name it is a source too: the next step reports what is missing.
         policy = self._policy.handle.value.strip() if source == "policy" else ""
         self._session.change(action_source=source, policy=policy or None)
+
+    def _draw_found(self, policy: str | None, wanted: bool) -> None:
+        options = self._policies.look(self._session.task_folder, policy) if wanted else ()
+        handle = self._found.handle
+        handle.visible = bool(options)
+        if options and handle.options != (CHOOSE, *options):
+            handle.options = (CHOOSE, *options)
+        self._found.show(policy if policy in options else CHOOSE)
+
+    def _choose_found(self, reference: str) -> None:
+        if reference != CHOOSE:
+            self._session.change(action_source="policy", policy=reference)
 
     def _read_policy(self, value: str) -> str:
         text = value.strip()

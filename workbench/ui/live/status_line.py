@@ -18,6 +18,7 @@ from workbench.ui.live.env_panel import first_flagged, mask
 from workbench.ui.live.timeline import step_in_words
 from workbench.ui.live.version_panel import took
 from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import place, render
 
@@ -163,7 +164,8 @@ class RulesMark(PagePart[SessionView]):
     A broken rule that only warns stops nothing, so the mark stays until the file is fixed.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
+        self._link = link
         self._html = server.gui.add_html("", visible=False)
         # Not in a folder: viser draws a folder without a label as if its parts stood in the container, and all that
         # follows the hidden buttons, the tabs too, would be hidden.
@@ -176,7 +178,7 @@ class RulesMark(PagePart[SessionView]):
             self._html.visible = False
             return
         # Equal content is not sent: an open list keeps its scroll position.
-        self._html.content = rules_html(view.rules, self._open, self._press)
+        self._html.content = rules_html(view.rules, self._open, self._press, self._link)
         self._html.visible = True
 
     def toggle(self) -> None:
@@ -184,12 +186,12 @@ class RulesMark(PagePart[SessionView]):
         self._open = not self._open
 
 
-def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:
+def rules_html(rules: RulesBroken, open: bool, press_id: str, link: LinkTo = no_links) -> str:
     """The mark, and the list if it is open."""
     newest = next((place(row) for row in rules.rows if row.file), "")
     if newest and len(rules.rows) > 1:
         newest += f" and {len(rules.rows) - 1} more"
-    known = {"RULES": RULES, "times": times}
+    known = {"RULES": RULES, "times": times, "link": link}
     return render("rules", open=open, press_id=press_id, newest=newest, rules=rules, **known)
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import viser
 
 from workbench.authoring.problem import Problem
 from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
+from workbench.session.live.view import PastLoad, SessionView
 from workbench.session.protocol.messages import LoadLevel, ReloadReport
+from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
@@ -21,6 +23,7 @@ LEVELS: dict[str, LoadLevel] = {
     CAMERAS: "cameras",
     REBUILT: "rebuilt",
 }
+LAST_LOADS = "Last reloads"
 MOST_SHOWN = 8
 """Items not carried over that are named; the rest is counted."""
 
@@ -32,8 +35,8 @@ class VersionPanel(PagePart[SessionView]):
     only the reward was patched, looks for a bug that is not there.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._session = session
+    def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
+        self._session, self._link = session, link
         self._names: tuple[str, ...] = ("",)
         # viser's annotations infer the option type from the first options.
         add_dropdown: Any = server.gui.add_dropdown
@@ -51,6 +54,9 @@ class VersionPanel(PagePart[SessionView]):
                 "and new code mixed.",
             )
             self._again.on_click(lambda event: self._load(event.target.value))
+            self._loads_folder = server.gui.add_folder(LAST_LOADS, expand_by_default=False, visible=False)
+            with self._loads_folder:
+                self._loads = server.gui.add_html("")
 
     def draw(self, view: SessionView) -> None:
         task = view.task
@@ -66,8 +72,10 @@ class VersionPanel(PagePart[SessionView]):
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
         self._html.content = version_html(
-            view.reload, view.load_milliseconds, task is not None, refused, notices
+            view.reload, view.load_milliseconds, task is not None, refused, notices, self._link
         )
+        self._loads_folder.visible = len(view.loads) > 1
+        self._loads.content = loads_html(view.loads, self._link)
 
     def _load(self, value: str) -> None:
         self._session.versions.reload(LEVELS[value])
@@ -79,6 +87,7 @@ def version_html(
     loaded: bool,
     refused: Problem | None = None,
     notices: tuple[str, ...] = (),
+    link: LinkTo = no_links,
 ) -> str:
     """The panel's text about the running version, and about the file where that was refused.
 
@@ -88,6 +97,7 @@ def version_html(
         loaded: whether a version runs.
         refused: why the file's present text does not run.
         notices: further notes for the author.
+        link: links the line at which the file was refused.
     """
     return render(
         "version",
@@ -97,7 +107,20 @@ def version_html(
         refused=refused,
         notices=notices,
         most=MOST_SHOWN,
+        link=link,
     )
+
+
+def loads_html(loads: tuple[PastLoad, ...], link: LinkTo = no_links) -> str:
+    """The list of the last loads, newest first: time, level, duration, reason."""
+
+    def clock(at: float) -> str:
+        return time.strftime("%H:%M:%S", time.localtime(at))
+
+    def day(at: float) -> str:
+        return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at))
+
+    return render("loads", loads=loads, link=link, clock=clock, day=day, took=took)
 
 
 def took(milliseconds: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from workbench.core.env.step_result import StepResult
 from workbench.recording.episode.episode import Episode
+from workbench.session.history.curves import spans_of
 from workbench.session.review.view import ACTION, REWARD, TERMS, ReviewView, column_at, curves
 from workbench.ui.live.reward import COLOURS as LINE_COLOURS
 from workbench.ui.live.reward import NumberRow, number_rows
 from workbench.ui.review.scene import shown_together
-from workbench.ui.widgets.line_chart import LONGEST, ChartLine, LineChart, span_of
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import colour, letter, render
 
@@ -59,7 +61,17 @@ class ReviewCurves(PagePart[ReviewView]):
 
     every = 0.15
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(
+        self, server: viser.ViserServer, seek: Callable[[int], None] = lambda position: None
+    ) -> None:
+        """
+        Args:
+            seek: shows a position.
+        """
+        self._first = 0
+        """The first position of the charts."""
+        pressed = Presses(server).number_id("position of a curve", lambda offset: seek(self._first + offset))
+        self._pressed = pressed
         folder = server.gui.add_folder(None)
         self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Also", ("-",), initial_value="-", visible=False
@@ -69,6 +81,7 @@ class ReviewCurves(PagePart[ReviewView]):
             name: LineChart(server, folder, height, order)
             for order, (name, height) in enumerate(CHARTS.items(), start=1)
         }
+        self._hint = server.gui.add_html("", visible=False)
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
@@ -84,6 +97,9 @@ class ReviewCurves(PagePart[ReviewView]):
         # By id: a recording that gets its scene later stays the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
+        self._first = view.first
+        self._hint.visible = bool(shown)
+        self._hint.content = render("curve_hint", seek=self._pressed, first=view.first, gone=None, kept=0)
         self._offer(view, shown)
         self._draw_entry("reward", REWARD, view, shown)
         self._draw_entry("also", self._entry.value if self._entry.visible else "", view, shown)
@@ -155,15 +171,19 @@ class ReviewCurves(PagePart[ReviewView]):
         drawn: list[ChartLine],
         dotted: ChartLine | None = None,
     ) -> None:
-        """Draw at most `LONGEST` positions, and the dot of one line at the present position."""
-        axis = axis_of(view)
-        every = slice(None, None, max(1, -(-len(axis) // LONGEST)))
-        x, lines = axis[every], [replace(line, values=line.values[every]) for line in drawn]
+        """Draw the lines, with their peaks where there are many positions, and the dot of one at the present position."""
+        # First, since the steps are those of the first line's peaks.
+        ordered = sorted(drawn, key=lambda line: line is not dotted)
+        if not ordered:
+            self._charts[chart].hide()
+            return
+        x, values = spans_of(np.stack([line.values for line in ordered]), first=view.first).points()
+        found = {id(line): own for line, own in zip(ordered, values, strict=True)}
+        lines = [replace(line, values=found[id(line)]) for line in drawn]
         dot = None
-        if dotted is not None:
-            at = view.position - view.first
+        if dotted is not None and len(x):
             dot = np.full(len(x), np.nan)
-            dot[min(round(at / every.step), len(x) - 1)] = dotted.values[at]
+            dot[np.abs(x - view.position).argmin()] = dotted.values[view.position - view.first]
         self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
 
 

@@ -34,6 +34,7 @@ SCRIPTS = (
     "let_in.js",
     "typed_first.js",
     "pressed.js",
+    "curve_clicks.js",
     "keys.js",
     "pressed_by_key.js",
     "view_stays.js",
@@ -42,8 +43,10 @@ SCRIPTS = (
     "envs_width.js",
     "unfolded.js",
     "typed_numbers.js",
+    "key_help.js",
     "steady_resolution.js",
     "tab_title.js",
+    "help.js",
 )
 """Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"
@@ -217,6 +220,7 @@ def content_type(name: str) -> str:
         ".json": "application/json",
         ".svg": "image/svg+xml",
         ".wasm": "application/wasm",
+        ".webp": "image/webp",
     }
     return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 

@@ -96,5 +96,7 @@ def _environment() -> jinja2.Environment:
     filters = (place, size, percent, counted, short_text, letter, colour)
     environment.filters.update({filter.__name__: filter for filter in filters})
     macros = environment.get_template("can_be_pressed.html").module
-    environment.globals.update({name: getattr(macros, name) for name in ("press", "to_copy", "badge")})
+    environment.globals.update(
+        {name: getattr(macros, name) for name in ("press", "to_copy", "at_line", "badge")}
+    )
     return environment

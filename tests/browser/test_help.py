@@ -1,0 +1,92 @@
+"""The documents in the browser: every page with its pictures, and the ways to them from the pages of the workbench."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import At
+from tests.drive.page import page_at
+from workbench.ui.app import help_pages
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+
+BROKEN = (
+    "[...document.images].filter(one => !one.complete || one.naturalWidth < 20).map(one => one.currentSrc)"
+)
+WIDER_THAN_THE_WINDOW = "document.documentElement.scrollWidth - innerWidth"
+
+
+@pytest.fixture(scope="module")
+def served(child_process: None) -> Iterator[GatedServer]:
+    gated_server = open_server(ServerOptions(port=0))
+    gated_server.add_route(help_pages.ADDRESS, help_pages.reply, help_pages.HEADERS)
+    yield gated_server
+    gated_server.close()
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_every_page_of_the_documents_opens_with_its_pictures(
+    served: GatedServer, browser: Browser, theme: str
+) -> None:
+    with page_at(browser, served.addresses("/help/")[0]) as (page, errors):
+        page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
+        names = [topic.name for topic in help_pages.topics()]
+        entries = page.locator("nav li a")
+        expect(entries).to_have_count(len(names))
+        for number, name in enumerate(names):
+            entries.nth(number).click()
+            page.wait_for_url(f"**/help/{name}")
+            expect(page.locator("nav [aria-current=page]")).to_have_count(1)
+            assert page.evaluate(BROKEN) == [], name
+            assert page.evaluate(WIDER_THAN_THE_WINDOW) <= 0, name
+            shown = page.evaluate(
+                "[...document.images].map(one => one.currentSrc).filter(one => one.includes('screenshots/'))"
+            )
+            assert [one for one in shown if ("/light/" if theme == "dark" else "/dark/") in one] == []
+        assert errors == []
+
+
+def test_without_the_token_no_document_is_served(served: GatedServer, browser: Browser) -> None:
+    page = browser.new_context().new_page()
+    answer = page.goto(served.addresses("/help/safety")[0].partition("?")[0])
+    assert answer is not None and answer.status == 403 and "HMAC" not in page.content()
+    page.context.close()
+
+
+def test_a_link_to_a_part_of_a_page_shows_that_part(served: GatedServer, browser: Browser) -> None:
+    with page_at(browser, served.addresses("/help/tasks")[0]) as (page, errors):
+        page.get_by_role("link", name="rules", exact=True).click()
+        page.wait_for_url("**/help/batched_env#what-goes-wrong-on-a-gpu-goes-wrong-here")
+        expect(
+            page.get_by_role("heading", name="What goes wrong on a GPU goes wrong here")
+        ).to_be_in_viewport()
+        assert errors == []
+
+
+def test_help_opens_the_documents_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
+    with example_without_pictures(browser) as desk:
+
+        def leads_to_help(press: str) -> None:
+            with desk.page.expect_popup() as opened:
+                if press == "palette":
+                    desk.press("Control+k")
+                    desk.page.get_by_placeholder("Search commands...").fill("help")
+                    expect(desk.page.get_by_role("button", name="Help", exact=True).last).to_be_visible()
+                    desk.press("Enter")
+                else:
+                    desk.page.get_by_role("link", name="Help", exact=True).click()
+            expect(opened.value.get_by_role("heading", level=1)).to_have_text("Workbench")
+            opened.value.close()
+
+        leads_to_help("link")
+        leads_to_help("palette")
+        desk.leave_inputs()
+        desk.press("v")
+        expect(desk.page.get_by_role("tab", name="Library")).to_be_visible()
+        leads_to_help("link")
+        leads_to_help("palette")
+        desk.leave_inputs()
+        desk.press("v")
+        expect(desk.button("Play")).to_be_visible()

@@ -1,0 +1,85 @@
+"""``workbench help``: the list of topics, one topic in the terminal, and what is said of a name that is none."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import termios
+
+import pytest
+
+from workbench.cli import main
+from workbench.cli.help import for_terminal
+from workbench.cli.terminal import Exit
+from workbench.machine.processes.child_python import python_command
+from workbench.ui.app.help_pages import Topic, topics
+
+
+def said(capsys: pytest.CaptureFixture[str], *call: str) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main.main(["help", *call])
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out + told.err
+
+
+def test_without_a_topic_all_are_listed_with_their_titles(capsys: pytest.CaptureFixture[str]) -> None:
+    code, text = said(capsys)
+    assert code == Exit.DONE
+    assert [topic.name for topic in topics() if not re.search(rf"^ +{topic.name} ", text, re.M)] == []
+    assert all(topic.title.split()[0] in text for topic in topics())
+
+
+@pytest.mark.parametrize("topic", topics(), ids=lambda topic: topic.name)
+def test_a_topic_is_shown(topic: Topic, capsys: pytest.CaptureFixture[str]) -> None:
+    code, text = said(capsys, topic.name)
+    assert code == Exit.DONE
+    title = topic.text.partition("\n")[0].removeprefix("# ")
+    assert title in " ".join(text.split()) and "\x1b" not in text
+    assert "<picture" not in text and "<source" not in text and "](" not in text
+
+
+def test_a_link_names_the_command_that_shows_its_page() -> None:
+    text = "![a picture](x.jpg)\n<!-- mark -->\nSee [Limits](limits.md) and [below](#here) and [it](https://github.com/x).\n"
+    topic = Topic("x", "x", "Use it", "web_assets/docs/x.md", text)
+    assert for_terminal(topic) == "See Limits (`workbench help limits`) and below and it.\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("camera", "Did you mean 'cameras'?"),
+        ("gizmo", "architecture"),
+        ("zzz", "no topic mentions it"),
+        ("\x1b[2J", "no topic"),
+    ],
+)
+def test_a_name_that_is_no_topic_is_answered_with_advice(
+    name: str, advice: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text = said(capsys, name)
+    assert code == Exit.REFUSED and advice in text and "\x1b" not in text
+
+
+def test_in_a_terminal_a_pager_has_it(child_process: None) -> None:
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    env = {**os.environ, "TERM": "xterm", "PAGER": "sed -e 's/^/PAGED /'", "MANPAGER": ""}
+    env.pop("COLUMNS", None)
+    command = [*python_command("-m", "workbench.cli.main"), "help", "limits"]
+    process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=env, close_fds=True)
+    os.close(theirs)
+    shown = b""
+    try:
+        while chunk := os.read(ours, 65536):
+            shown += chunk
+    except OSError:  # the other end was closed
+        pass
+    finally:
+        os.close(ours)
+    assert process.wait(60) == 0
+    lines = shown.decode().splitlines()
+    assert len(lines) > 24 and all(line.startswith("PAGED ") for line in lines)

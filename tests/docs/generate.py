@@ -1,0 +1,189 @@
+"""Writes the parts of the docs that are made from the code: the keys, the commands, and the rules of GPU simulation.
+
+    python -m tests.docs.generate          # `test_generated.py` fails where a page says something else
+
+Keys are those of both pages as they are built, commands what ``--help`` prints, rules what `core.rules` lists.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+from tests.docs.pages import DOCS
+from tests.drive.scripted import no_success, scripted
+from workbench.cli import main
+from workbench.core.rules import RULES
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+from workbench.ui.app.workplace import Workplace
+from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.ui.widgets.hotkeys import Command
+
+KEYS = DOCS / "reference" / "keys.md"
+CLI = DOCS / "reference" / "cli.md"
+RULES_PAGE = DOCS / "batched_env.md"
+COMMANDS = ("open", "review", "record", "rescore", "share", "export", "view", "doctor", "help")
+"""In the order in which a reader meets them; `test_generated.py` compares them with those that there are."""
+
+
+# --- keys ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Commands:
+    live: tuple[Command, ...]
+    review: tuple[Command, ...]
+
+
+def commands_of_both_pages() -> Commands:
+    """As the pages register them; built on a session without a worker, and an empty folder of recordings."""
+    found: list[tuple[Command, ...]] = []
+
+    def keep(server: object, commands: Sequence[Command]) -> None:
+        found.append(tuple(commands))
+
+    with ExitStack() as stack:
+        for module in ("live_page", "review_page"):
+            stack.enter_context(patch(f"workbench.ui.app.{module}.register", keep))
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        gated_server = open_server(ServerOptions(port=0))
+        stack.callback(gated_server.close)
+        worker = scripted(2, no_success, None)
+        session = Session(str(folder / "push.py"), TaskOptions(2), recordings=folder, make_worker=worker)
+        stack.callback(session.close)
+
+        def no_session(task: object, options: object) -> Session:
+            raise AssertionError("nothing is opened from a recording")
+
+        place = Workplace(gated_server, folder, no_session, TaskOptions(), session)
+        stack.callback(place.close)
+        place.pages.start("live")
+        place.pages.show("review")
+        assert place.pages.wait_for("review", 60)
+    live, review = found
+    return Commands(live, review)
+
+
+def keys_page(commands: Commands) -> str:
+    live = [one for one in commands.live if one.key]
+    camera = [one for one in live if (one.modifier or "").startswith(("alt", "cmd"))]
+    return "\n".join(
+        [
+            "# Keys",
+            "",
+            "Ctrl+K opens a list of all commands by name, those without a key too. Keys do not work while you type in a text or number",
+            "field. This page is made from the code.",
+            "",
+            "## Live page",
+            "",
+            *table(one for one in live if one not in camera),
+            "",
+            "### The camera that is chosen in the Studio",
+            "",
+            *table(camera),
+            "",
+            "## Review and library",
+            "",
+            *table(commands.review),
+            "",
+        ]
+    )
+
+
+def table(commands: Iterator[Command] | Sequence[Command]) -> list[str]:
+    rows = [f"| {key_of(one)} | {one.label} |" for one in commands if one.key]
+    return ["| key | what it does |", "| --- | --- |", *rows]
+
+
+def key_of(command: Command) -> str:
+    """``Shift+R``; the page writes it with a space."""
+    held = [part for part in (command.modifier or "").split("+") if part]
+    name = command.key_name.split(" ", len(held))[-1]
+    return "+".join([*(part.removeprefix("cmd/").capitalize() for part in held), name])
+
+
+# --- commands -----------------------------------------------------------------------------------------
+
+
+def cli_page() -> str:
+    lines = [
+        "# Commands",
+        "",
+        "What `workbench COMMAND --help` prints. This page is made from the code.",
+        "",
+    ]
+    for name in COMMANDS:
+        lines += [f"## {name}", "", "```text", help_of(name), "```", ""]
+    return "\n".join(lines)
+
+
+def help_of(command: str) -> str:
+    """In a hundred columns, without colours."""
+    plain = {"COLUMNS": "100", "NO_COLOR": "1"}
+    said = io.StringIO()
+    with patch.dict(os.environ, plain), redirect_stdout(said):
+        for name in ("FORCE_COLOR", "TTY_COMPATIBLE"):
+            os.environ.pop(name, None)
+        try:
+            main.main([command, "--help"])
+        except SystemExit as ended:
+            assert not ended.code, command
+    return "\n".join(line.rstrip() for line in said.getvalue().strip().splitlines())
+
+
+# --- rules --------------------------------------------------------------------------------------------
+
+
+def rules_table() -> str:
+    rows = [
+        f"| {rule.id} | {rule.degree} | {code(rule.asks)} | {code(rule.otherwise)} |"
+        for rule in RULES.values()
+    ]
+    return "\n".join(
+        [
+            "| rule | degree | what the task does | what the GPU does otherwise |",
+            "| --- | --- | --- | --- |",
+            *rows,
+        ]
+    )
+
+
+def code(sentence: str) -> str:
+    """Names of functions and attributes set as code."""
+    return re.sub(
+        r"(?<![`\w])((?:\w+\.)*\w*_\w+(?:\.\w+)*(?:\([\w, ]*\))?|\w+\.\w+\(\)|evaluate\(\))",
+        r"`\1`",
+        sentence,
+    )
+
+
+def with_rules(text: str) -> str:
+    """The page with the table between its marks."""
+    before, begin, rest = text.partition("<!-- rules -->\n")
+    _, end, after = rest.partition("<!-- /rules -->")
+    assert begin and end
+    return f"{before}{begin}{rules_table()}\n{end}{after}"
+
+
+def pages() -> dict[Path, str]:
+    """The text of every page that is made here."""
+    return {
+        KEYS: keys_page(commands_of_both_pages()),
+        CLI: cli_page(),
+        RULES_PAGE: with_rules(RULES_PAGE.read_text()),
+    }
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+            print(f"wrote {path}")

@@ -1,0 +1,42 @@
+"""README and the docs as tests read them: pages, and the fences of a page."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "web_assets" / "docs"
+PAGES = (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))
+_FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Fence:
+    page: Path
+    line: int
+    """Of its first line of text, counted from 1."""
+    language: str
+    mark: str
+    """What stands behind the language: ``slow``, ``fragment``, ``wrong``, or nothing."""
+    text: str
+
+    @property
+    def place(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+@cache
+def fences(page: Path) -> tuple[Fence, ...]:
+    text = page.read_text()
+    found = []
+    for match in _FENCE.finditer(text):
+        language, _, mark = match[1].partition(" ")
+        found.append(Fence(page, text.count("\n", 0, match.start(2)) + 1, language, mark, match[2]))
+    return tuple(found)
+
+
+def without_fences(page: Path) -> str:
+    return _FENCE.sub("", page.read_text())

@@ -1,0 +1,206 @@
+"""What README and the docs tell people to type works: every fence is run, parsed, or gives the message it promises."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import io
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import urllib.request
+import warnings
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from http.cookiejar import CookieJar
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+
+from tests.docs.pages import PAGES, ROOT, Fence, fences, without_fences
+from tests.drive.page import open_workbench
+from workbench.cli import main
+
+KINDS = {
+    *(("python", mark) for mark in ("", "slow", "fragment", "wrong")),
+    *(("sh", mark) for mark in ("", "slow", "fragment", "wrong")),
+    ("json", ""),
+    ("text", ""),
+}
+RUN = ("", "slow", "wrong")
+OPENS_A_PAGE = ("open", "review")
+COMMANDS = {"open": main.open_page} | {
+    name: getattr(main, name) for name in ("record", "review", "rescore", "share", "export", "view", "doctor")
+}
+TYPED = [
+    page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))
+]
+
+
+def learns(printed: str) -> None:
+    """The example of the page on the batched env finds a policy that pushes better than the first ones."""
+    shares = [float(share) for share in re.findall(r"succeeded ([\d.]+)", printed)]
+    assert len(shares) >= 2 and shares[-1] > shares[0] + 0.2, shares
+
+
+PRINTS = {
+    "batched_env": lambda printed: all(
+        words in printed for words in ("actor cube", "{}", "table-workspace")
+    ),  # the restore report, and a contact
+    "api": lambda printed: "table-workspace" in printed,
+}
+"""Of pages whose Python prints what readers are told to look for."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_fence_says_what_it_is(page: Path) -> None:
+    kinds = {(fence.language, fence.mark) for fence in fences(page)}
+    assert kinds <= KINDS
+    prose = without_fences(page)
+    assert "```" not in prose
+    # Code that is set in by four spaces would be run by nobody.
+    assert re.findall(r"\n\n    .*", prose) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_fragment_is_well_formed(page: Path) -> None:
+    for fence in fences(page):
+        if fence.language == "json":
+            json.loads(fence.text)
+        elif fence.language == "python":
+            ast.parse(fence.text, fence.place)
+        elif fence.language == "sh":
+            for words in commands(fence):
+                well_formed(words, fence)
+
+
+def commands(fence: Fence) -> Iterator[list[str]]:
+    """The commands of a fence, as words; what follows a # or redirects is not among them."""
+    for line in re.sub(r"\\\n", "", fence.text).splitlines():
+        words = shlex.split(line, comments=True)
+        if words:
+            yield words
+
+
+def well_formed(words: list[str], fence: Fence) -> None:
+    if words[0] == "workbench" and len(words) > 1:
+        # Only its arguments are read: the command itself does nothing.
+        command = functools.wraps(COMMANDS[words[1]])(lambda *args, **named: 0)
+        config = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
+        assert tyro.cli(command, args=words[2:], config=config) == 0, fence.place
+    elif words[0] == "make":
+        targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+        assert {word for word in words[1:] if "=" not in word} <= targets, fence.place
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with what the pages take for granted: the examples, a task, a policy, and a package with a task."""
+    shutil.copytree(ROOT / "tasks", tmp_path / "tasks", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "tasks" / "push_cube.py", tmp_path / "my_task.py")
+    shutil.copy(ROOT / "tests" / "browser" / "pusher.py", tmp_path / "my_policy.py")
+    text = (ROOT / "tasks" / "minimal.py").read_text()
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "__init__.py").touch()
+    (tmp_path / "lab" / "tasks.py").write_text(
+        text.replace("WorkbenchMinimal-v1", "MyTask-v1").replace("MinimalEnv", "MyEnv")
+    )
+    bin_folder = tmp_path / "bin"
+    bin_folder.mkdir()
+    (bin_folder / "workbench").symlink_to(Path(sys.executable).parent / "workbench")
+    monkeypatch.setenv("PATH", f"{bin_folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", TYPED, ids=lambda page: page.stem)
+def test_what_a_page_says_to_type_works(page: Path, desk: Path, renderer: None, child_process: None) -> None:
+    printed = type_all(page, desk, ("", "wrong"))
+    if page.stem in PRINTS:
+        assert PRINTS[page.stem](printed), printed
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize(
+    "page",
+    [page for page in TYPED if any(f.mark == "slow" for f in fences(page))],
+    ids=lambda page: page.stem,
+)
+def test_all_that_a_page_says_to_type_works(
+    page: Path, desk: Path, renderer: None, child_process: None
+) -> None:
+    printed = type_all(page, desk, RUN)
+    if page.stem == "batched_env":
+        learns(printed)
+
+
+def type_all(page: Path, desk: Path, marks: tuple[str, ...]) -> str:
+    """Run the fences of a page in its order; returns what its Python printed."""
+    names: dict[str, object] = {"__name__": "__main__"}
+    out = io.StringIO()
+    threads = torch.get_num_threads()
+    try:
+        for fence, below in zip(fences(page), (*fences(page)[1:], None)):
+            if fence.mark not in marks or fence.language not in ("python", "sh"):
+                continue
+            wanted = promised(fence, below)
+            if fence.language == "python":
+                run_python(fence, names, out, wanted)
+            else:
+                for words in commands(fence):
+                    run_command(words, fence, desk, wanted)
+    finally:
+        torch.set_num_threads(threads)
+    return out.getvalue()
+
+
+def promised(fence: Fence, below: Fence | None) -> str | None:
+    """The message that a wrong one must give."""
+    if fence.mark != "wrong":
+        return None
+    assert below is not None and below.language == "text", f"{fence.place}: its message is missing below it"
+    return " ".join(below.text.split())
+
+
+def run_python(fence: Fence, names: dict[str, object], out: io.StringIO, wanted: str | None) -> None:
+    # With its real line numbers in a traceback.
+    code = compile("\n" * (fence.line - 1) + fence.text, str(fence.page), "exec")
+    with redirect_stdout(out), warnings.catch_warnings():
+        if wanted is None:
+            warnings.simplefilter("error", UserWarning)
+            exec(code, names)
+            return
+        with pytest.raises(Exception) as raised:
+            exec(code, names)
+    said = " ".join(f"{type(raised.value).__name__}: {raised.value}".split())
+    assert wanted in said, f"{fence.place} says {said}"
+
+
+def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) -> None:
+    if wanted is None and words[:1] == ["workbench"] and words[1] in OPENS_A_PAGE:
+        opens(words, desk)
+        return
+    ended = subprocess.run(
+        words, cwd=desk, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=800
+    )
+    said = " ".join((ended.stdout + ended.stderr).split())
+    assert (ended.returncode == 0) == (wanted is None), f"{fence.place}: {shlex.join(words)} says {said}"
+    assert wanted is None or wanted in said, f"{fence.place}: {shlex.join(words)} says {said}"
+
+
+def opens(words: list[str], desk: Path) -> None:
+    """It prints an address, the page answers there, and Ctrl-C ends it."""
+    with open_workbench(*words[2:], cwd=desk, what=words[1]) as opened:
+        browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
+        with browser.open(opened.url, timeout=60) as answer:
+            assert answer.status == 200 and b"workbench/" in answer.read()
+        if words[1] == "open":
+            opened.wait_for_line("^loaded ", 120)

@@ -1,0 +1,13 @@
+// The command Help of the palette (Ctrl+K) opens the documents in a tab of its own, as the link of that name does.
+//
+// The server cannot: it hears of the press later, and a browser lets a page open a tab only while a press is handled. Enter
+// is a click on the entry too.
+"use strict";
+addEventListener(
+  "click",
+  (event) => {
+    const label = event.target.closest?.(".mantine-Spotlight-action")?.querySelector(".mantine-Spotlight-actionLabel");
+    if (label?.textContent === "Help") open("/help/", "_blank", "noopener");
+  },
+  true,
+);

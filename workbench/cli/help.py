@@ -1,0 +1,80 @@
+"""The documents in a terminal: the list of topics, and one topic."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import shutil
+
+from rich.markdown import Markdown
+from rich.markup import escape
+from rich.table import Table
+
+from workbench.cli.terminal import Exit, out, refuse
+from workbench.machine.text import plain_text
+from workbench.ui.app.help_pages import GROUPS, Topic, by_path, find_topic, topics, topics_about
+
+WIDEST = 100
+"""Columns: longer lines are hard to read."""
+_HIDDEN = re.compile(r"^<picture>.*?^</picture>\n|^!\[.*?\]\(.*?\)\n|^<!--.*?-->\n", re.DOTALL | re.MULTILINE)
+_LINK = re.compile(r"\[([^]]+)\]\(([^)]+)\)")
+
+
+def show_help(name: str) -> int:
+    """Show a topic, or the list of all where no name is given; returns the exit code."""
+    if not name.strip():
+        _list_topics()
+        return Exit.DONE
+    topic = find_topic(name)
+    if topic is None:
+        return refuse(_not_found(name))
+    page = Markdown(for_terminal(topic), hyperlinks=False)
+    width = min(out.width, WIDEST)
+    if not out.is_terminal:
+        out.print(page, width=width)
+        return Exit.DONE
+    # A page that fits the window is printed, and colours are passed on; LESS of the person's own says otherwise.
+    os.environ.setdefault("LESS", "FRX")
+    with out.pager(styles=shutil.which("less") is not None):
+        out.print(page, width=width)
+    return Exit.DONE
+
+
+def _list_topics() -> None:
+    longest = max(len(topic.name) for topic in topics())
+    for _, group in GROUPS:
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
+        table.add_column(style="cyan", no_wrap=True, min_width=longest)
+        table.add_column()
+        for topic in topics():
+            if topic.group == group:
+                table.add_row(topic.name, escape(topic.title))
+        out.print(f"[bold]{escape(group)}[/]")
+        out.print(table)
+    out.print(
+        "Type [cyan]workbench help TOPIC[/], or press [cyan]Help[/] on the page to read them in the browser."
+    )
+
+
+def _not_found(name: str) -> str:
+    said = plain_text(name.strip())
+    names = [topic.name for topic in topics()]
+    close = difflib.get_close_matches(said.lower(), names, 1)
+    if close:
+        return f"There is no topic {said!r}. Did you mean {close[0]!r}? workbench help lists all."
+    about = [topic.name for topic in topics_about(said)]
+    if about:
+        return f"There is no topic {said!r}. These mention it: {', '.join(about)}"
+    return f"There is no topic {said!r}, and no topic mentions it. workbench help lists all."
+
+
+def for_terminal(topic: Topic) -> str:
+    """The text without pictures; a link to another topic names the command that shows it."""
+
+    def link(match: re.Match[str]) -> str:
+        path, _ = topic.link(match[2])
+        to = by_path(path)
+        return match[1] if to is None or to is topic else f"{match[1]} (`workbench help {to.name}`)"
+
+    return _LINK.sub(link, _HIDDEN.sub("", topic.text))

@@ -1,0 +1,66 @@
+"""What a person chose on the page and finds again in the next run, in the user's own folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from workbench.machine.folders import locked, read_private, write_private
+
+FILE = "choices.json"
+MOST_FOLDERS, MOST_POLICIES = 100, 10
+log = logging.getLogger(__name__)
+
+
+class Choices(msgspec.Struct, frozen=True):
+    """The file's content. A field that a later version adds has a default."""
+
+    hints_closed: bool = False
+    """The hints of the first page were closed."""
+    policies: dict[str, list[str]] = {}
+    """Policies that were used, by the folder where the command was started; the newest first."""
+
+
+def kept_choices() -> Choices:
+    """The choices so far; those of a file that cannot be read are none, with a warning."""
+    try:
+        content = read_private(FILE)
+        return Choices() if content is None else msgspec.json.decode(content, type=Choices)
+    except (OSError, msgspec.MsgspecError, RecursionError) as error:
+        log.warning("What was chosen on earlier pages is not known: %s", error)
+        return Choices()
+
+
+def close_hints() -> None:
+    """The hints are not shown again."""
+    _change(lambda kept: msgspec.structs.replace(kept, hints_closed=True))
+
+
+def used_policies(folder: Path) -> tuple[str, ...]:
+    """Policies that were used in this folder, the newest first."""
+    return tuple(kept_choices().policies.get(str(folder), ()))
+
+
+def keep_policy(folder: Path, reference: str) -> None:
+    """Keep a policy that was used in this folder."""
+
+    def change(kept: Choices) -> Choices:
+        known = [one for one in kept.policies.get(str(folder), ()) if one != reference]
+        others = {place: used for place, used in kept.policies.items() if place != str(folder)}
+        newest = dict([*others.items()][-(MOST_FOLDERS - 1) :])
+        policies = {**newest, str(folder): [reference, *known][:MOST_POLICIES]}
+        return msgspec.structs.replace(kept, policies=policies)
+
+    _change(change)
+
+
+def _change(change: Callable[[Choices], Choices]) -> None:
+    try:
+        with locked(FILE):
+            write_private(FILE, msgspec.json.encode(change(kept_choices())))
+    except OSError as error:
+        # The page works without: it is a convenience.
+        log.warning("What is chosen on this page is not kept for the next run: %s", error)
