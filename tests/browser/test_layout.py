@@ -54,15 +54,11 @@ def desk(opened: Desk) -> Desk:
 
 
 def faults(page: Page) -> list[str]:
-    """What is still there when the page has come to rest."""
-    found: list[str] = []
-
-    def rests() -> bool:
-        before, found[:] = list(found), page.evaluate(FAULTS)
-        return not found or before == found
-
-    page.wait_for_timeout(300)
-    until(rests, "a page that stands still", seen=lambda: found)
+    """What is still there after some seconds: panels open and fold within some frames."""
+    for _ in range(15):
+        if not (found := page.evaluate(FAULTS)):
+            break
+        page.wait_for_timeout(300)
     return found
 
 
