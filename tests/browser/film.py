@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -78,7 +79,7 @@ def take_film(desk: Desk, path: Path) -> None:
     film, page = Film(desk), desk.page
     desk.tab("Reward")
     desk.press("Space")
-    time.sleep(6)
+    time.sleep(4)
     film.scene("Sixteen environments run your file", 3.0, 9)
     film.scene("Change the reward and save", 1.5, 2, code=REWARD)
     desk.edit(*REWARD)
@@ -94,13 +95,12 @@ def take_film(desk: Desk, path: Path) -> None:
         elif frame == 1:
             desk.press("e")
         elif frame == 2:
-            desk.press("o", "f")
-        time.sleep(3)
+            desk.press("b", "o", "f")
+        time.sleep(4)
 
     desk.press("b")
     time.sleep(3)
     film.scene("Find the env that failed", 3.5, 5, find)
-    desk.press("b", "o", "f")
     desk.tab("Studio")
     desk.choose("Camera", "base_camera · sensor")
     show = page.get_by_role("button", name="Show the change")
@@ -113,9 +113,9 @@ def take_film(desk: Desk, path: Path) -> None:
 
     film.scene("Place a camera", 2.5, 8, move)
     show.click()
-    page.get_by_role("button", name="Write it").scroll_into_view_if_needed()
+    page.get_by_role("button", name="Save to").evaluate("e => e.scrollIntoView({block: 'end'})")
     time.sleep(2)
-    film.scene("... and write it into the file", 1.5, 2, lambda frame: time.sleep(1))
+    film.scene("... and save it to the file", 1.5, 2, lambda frame: time.sleep(1))
     desk.tab("Episodes")
     desk.press("c", "Space")
     film.scene("Record episodes", 1.5, 5, lambda frame: time.sleep(1.5))
@@ -123,8 +123,15 @@ def take_film(desk: Desk, path: Path) -> None:
     row = page.locator(".wb-library [data-row]").first
     expect(row).to_be_visible(timeout=60_000)
     row.click()
+    time.sleep(2)
+    film.scene("... and review them", 0.8, 1)
     desk.press("Enter")
-    time.sleep(6)
-    desk.press("Space")
-    film.scene("... and review them", 2.5, 8)
+    expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=60_000)
+    time.sleep(4)
+
+    def walk(frame: int) -> None:
+        desk.press("ArrowRight", "ArrowRight")
+        time.sleep(2)
+
+    film.scene("... and review them", 2.2, 7, walk)
     film.save(path)

@@ -118,8 +118,7 @@ def live_page(browser: Browser, *arguments: str, task: str = "") -> Iterator[Des
 def take_policy(desk: Desk) -> None:
     """The policy acts, which is careless in every fifth env."""
     desk.choose("Source", "policy")
-    label = desk.page.locator("div", has=desk.page.get_by_text("Policy", exact=True)).last
-    label.locator("xpath=../../..").locator("input").last.fill(f"{POLICY.name}:act")
+    desk.choose("Known", f"{POLICY.name}:act")
     time.sleep(3)
 
 
