@@ -49,10 +49,10 @@
     "keydown",
     (event) => {
       if ((event.key === "Enter" || event.key === "Escape") && event.target instanceof HTMLInputElement) {
-        // After the field has taken the key. A list that is open and a dialog have their own use for both.
+        // A list that is open and a dialog have their own use for both.
         const field = event.target;
         const own = field.getAttribute("aria-haspopup") === "listbox" || field.closest("[role=dialog]");
-        if (!own && isTypedInto(field)) setTimeout(() => field.blur());
+        if (!own && isTypedInto(field)) field.blur();
       }
       clearTimeout(again); // or a key that comes soon after a click would lose what it has just walked to
       if ((event.key !== " " && event.key !== "Enter") || !(event.target instanceof Element)) return;

@@ -14,7 +14,7 @@ from workbench.machine.files import new_file
 from workbench.recording.episode.episode import Episode
 from workbench.recording.films import Eye, default_eye
 from workbench.session.review.view import outcome_text
-from workbench.ui.scene.bodies import SceneView
+from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.server.gated_server import ServerOptions, open_server
 from workbench.ui.widgets.templates import counted, render
@@ -94,7 +94,7 @@ def _recorded(
     batch[env] = poses[0]
     scene = SceneView(server)
     layout = lay_out(geometry, batch)
-    scene.build(geometry, layout, batch, env, TRIANGLES)
+    scene.build(geometry, layout, batch, env, Looks(TRIANGLES))
     recording = server.get_scene_serializer()
     for state, now in enumerate(poses):
         batch[env] = now
