@@ -3,6 +3,7 @@
 // viser's keys are heard on the document, but never while the focus is in an <input>, which a ticked checkbox and a
 // dropdown are too; and a tab or a button that was clicked takes the arrows and the space for itself. So once the
 // pointer is up, the focus stays only where somebody types: in a text or number field, or in a dropdown that is open.
+// A click on the view, out of such a field, gives the keys back and no more: it selects no env. So do Enter and Escape.
 // Whoever walks through the controls with the Tab key presses no pointer, and keeps the focus, also when they press
 // Enter; and there Space and Enter are that control's, as everywhere else: else Space would play instead of pressing it.
 "use strict";
@@ -26,12 +27,33 @@
   }
 
   let again = 0;
+  let givesKeys = false; // the last press on the view was out of a field
+
+  window.addEventListener(
+    "pointerdown",
+    ({ target }) => {
+      givesKeys = target instanceof HTMLCanvasElement && !!document.activeElement && isTypedInto(document.activeElement);
+    },
+    true,
+  );
+
+  const postMessage = Worker.prototype.postMessage;
+  Worker.prototype.postMessage = function (message, ...rest) {
+    if (givesKeys && message?.type === "send" && message.message?.type === "ScenePointerMessage") return;
+    return postMessage.call(this, message, ...rest);
+  };
 
   const PRESSED_BY_KEY = "button, summary, a[href], input[type=checkbox], input[type=radio]";
 
   window.addEventListener(
     "keydown",
     (event) => {
+      if ((event.key === "Enter" || event.key === "Escape") && event.target instanceof HTMLInputElement) {
+        // After the field has taken the key. A list that is open and a dialog have their own use for both.
+        const field = event.target;
+        const own = field.getAttribute("aria-haspopup") === "listbox" || field.closest("[role=dialog]");
+        if (!own && isTypedInto(field)) setTimeout(() => field.blur());
+      }
       clearTimeout(again); // or a key that comes soon after a click would lose what it has just walked to
       if ((event.key !== " " && event.key !== "Enter") || !(event.target instanceof Element)) return;
       // The browser presses it all the same; our own HTML has no such control and hears its keys itself.

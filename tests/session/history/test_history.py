@@ -197,6 +197,20 @@ def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to() -> Non
     assert [of[np.isfinite(of)].tolist() for of in rewards] == [[1, 2, 6], [1, 2, 3, 4, 6], []]
 
 
+def test_a_step_of_the_curves_is_the_moment_after_it_or_the_nearest_that_is_kept() -> None:
+    history = filled(4)
+    history.add(stepped(0, jumped=(0,)))
+    history.add(stepped(1))
+    assert [history.at(history.serial_of_tick(tick)).tick for tick in (1, 2, 3, 4)] == [1, 2, 3, 4]
+    assert history.serial_of_tick(3) == 3, "the step, and not the reset after it"
+    assert (history.serial_of_tick(-5), history.serial_of_tick(99)) == (0, history.last)
+    short = filled(500, 60_000)
+    assert short.serial_of_tick(1) == short.first
+    assert short.serial_of_tick(short.at(short.last - 2).tick) == short.last - 2
+    empty = History(table(), 10**9)
+    assert empty.serial_of_tick(3) == empty.last
+
+
 def test_serials_go_on_from_the_history_before() -> None:
     history = History(table(), 10**9, first_serial=70)
     assert (history.first, history.last, len(history)) == (70, 69, 0)

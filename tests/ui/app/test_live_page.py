@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,10 +16,12 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
 from workbench.jobs.task import TaskOptions
+from workbench.machine.kept_choices import kept_choices
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.app.live_page import Page
 from workbench.ui.live.run_panel import RESET_ALL
+from workbench.ui.widgets.hotkeys import add_hints
 
 
 @pytest.fixture(scope="module")
@@ -164,3 +167,50 @@ def test_broken_file_is_said_and_the_scene_stays(opened: Opened, task_file: Path
     assert not opened.banner()
     # The same shapes are not sent again.
     assert all(new is old for new, old in zip(opened.panels.bodies(""), shown, strict=True))
+
+
+def test_hints_are_on_the_first_page_until_they_are_closed_for_good(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    run = opened.panels.part("Run")
+    assert run.html("wb-hints").count("<li>") == 4
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    run.press("close the hints")
+    assert not run.html("wb-hints") and kept_choices().hints_closed
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        add_hints(server)
+        assert not Panels(server).html("wb-hints")
+    finally:
+        server.stop()
+
+
+def test_inspect_shows_joints_and_studio_a_sensor_camera_as_soon_as_they_are_opened(opened: Opened) -> None:
+    opened.load()
+    inspect, studio = opened.panels.part("Inspect"), opened.panels.part("Studio")
+    assert inspect.control("Show").value == "joints" and opened.session.view().inspection is None
+    inspect.press("unfolded")
+    opened.draw()
+    view = wait_until(opened.session, lambda view: view.inspection is not None, "the joints")
+    opened.draw()
+    assert view.inspection.joints and "panda_joint1" in inspect.html("wb-inspect")
+    assert opened.session.view().studio.selected is None
+    studio.press("unfolded")
+    chosen = opened.session.view().studio.selected
+    assert chosen is not None and chosen[0] == "sensor"
+    opened.session.studio.select(None)
+    studio.press("unfolded")
+    assert opened.session.view().studio.selected is None, "a person chose none"
+
+
+def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None:
+    told = opened.panels.html("wb-all-keys")
+    for button, key in (
+        ("Play", "Space"),
+        ("Reset this env", "Shift R"),
+        ("‹ event", "Shift ←"),
+        ("now", "End"),
+    ):
+        escaped = json.dumps({button: key})[1:-1].replace('"', "&#34;")
+        assert escaped in told, (button, key)
+    assert told.count("<kbd>") > 30 and "<kbd>?</kbd>" in told

@@ -14,23 +14,23 @@ from workbench.session.live.view import SessionView
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.cameras.studio import StudioPanel
-from workbench.ui.live.banners import Banner, BusyBanner
+from workbench.ui.live.banners import INTERRUPT, NEW_WORKER, RELOAD, RESTART, Banner, BusyBanner
 from workbench.ui.live.env_panel import EnvPanel
-from workbench.ui.live.episodes_panel import RecordPanel
+from workbench.ui.live.episodes_panel import RECORD, SAVE, STOP, RecordPanel
 from workbench.ui.live.inspect_panel import ForceArrows, InspectPanel
 from workbench.ui.live.log_panel import LogPanel
 from workbench.ui.live.rescored import PastRescorePanel, RescoredAbove
 from workbench.ui.live.reward import CurvesPanel, NumbersPanel
-from workbench.ui.live.run_panel import RunPanel
+from workbench.ui.live.run_panel import NEXT, PREVIOUS, RESET_ALL, RESET_THIS, STEP, RunPanel
 from workbench.ui.live.status_line import RulesMark, StatusLine
+from workbench.ui.live.timeline import GO_ON, NOW, UNDO, TimelinePanel
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
-from workbench.ui.live.timeline import TimelinePanel
-from workbench.ui.live.version_panel import VersionPanel
+from workbench.ui.live.version_panel import AS_NEEDED, VersionPanel
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
 from workbench.ui.widgets.editor import editor_link
-from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.widgets.hotkeys import Command, add_hints, register
 from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
@@ -112,6 +112,7 @@ class Page:
         tabs = server.gui.add_tab_group()
         run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
         with run_tab:
+            add_hints(server)
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server, dark)
             version = VersionPanel(server, session, self._link)
@@ -275,16 +276,18 @@ class Page:
         session, run, timeline = self._session, self._run, self._timeline
         rescored = self._rescored
         return [
-            Command("Review recordings", self._on_review, "V"),
-            Command("Play or pause", run.toggle_play, "space"),
-            Command("One step", session.step, "S"),
-            Command("Reset all envs", session.reset, "R"),
-            Command("Reset the selected env", run.reset_this, "R", "shift"),
-            Command("Undo the last reset or rewind", session.past.undo, "U"),
+            Command("Review recordings", self._on_review, "V", buttons=("Review recordings",)),
+            Command("Play or pause", run.toggle_play, "space", buttons=("Play", "Pause")),
+            Command("One step", session.step, "S", buttons=(STEP,)),
+            Command("Reset all envs", session.reset, "R", buttons=(RESET_ALL,)),
+            Command("Reset the selected env", run.reset_this, "R", "shift", (RESET_THIS,)),
+            Command("Undo the last reset or rewind", session.past.undo, "U", buttons=(UNDO,)),
             *timeline.commands(),
             Command("Go to the first moment", timeline.go_to_the_first, "home"),
-            Command("Go to live", timeline.go_live, "end"),
-            Command("Continue from here, in the selected env", timeline.continue_from_shown, "G"),
+            Command("Go to live", timeline.go_live, "end", buttons=(NOW,)),
+            Command(
+                "Continue from here, in the selected env", timeline.continue_from_shown, "G", buttons=(GO_ON,)
+            ),
             Command("Next episode with a different result", lambda: rescored.go_to_difference(1), "J"),
             Command(
                 "Previous episode with a different result",
@@ -292,19 +295,21 @@ class Page:
                 "J",
                 "shift",
             ),
-            Command("Next env", lambda: run.select_neighbour(1), "N"),
-            Command("Previous env", lambda: run.select_neighbour(-1), "P"),
+            Command("Next env", lambda: run.select_neighbour(1), "N", buttons=(NEXT,)),
+            Command("Previous env", lambda: run.select_neighbour(-1), "P", buttons=(PREVIOUS,)),
             Command("Open or close the table of envs", self._toggle_envs, "B"),
             Command("Next env whose last episode failed", lambda: self._envs.select_next("failed"), "E"),
             Command("Next flagged env", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame the scene", lambda: self.frame(session.view()), "F"),
-            Command("Start or stop recording", self._record.toggle, "C"),
-            Command("Save what I just saw", self._record.save, "C", "shift"),
+            Command("Start or stop recording", self._record.toggle, "C", buttons=(RECORD, STOP)),
+            Command("Save what I just saw", self._record.save, "C", "shift", (SAVE,)),
             Command("Open or close the list of broken rules", self._rules.toggle, "W"),
-            Command("Reload the file", session.versions.reload, "L"),
-            Command("Interrupt the task", session.interrupt, "I"),
-            Command("Restart the worker", session.versions.restart_worker, "L", "shift"),
+            Command("Reload the file", session.versions.reload, "L", buttons=(AS_NEEDED, RELOAD)),
+            Command("Interrupt the task", session.interrupt, "I", buttons=(INTERRUPT,)),
+            Command(
+                "Restart the worker", session.versions.restart_worker, "L", "shift", (RESTART, NEW_WORKER)
+            ),
             Command("Switch between dark and light", self._view_panel.toggle_dark, "D"),
             *self._studio.commands(),
         ]

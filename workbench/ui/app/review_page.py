@@ -30,7 +30,7 @@ from workbench.ui.live.timeline import (
 )
 from workbench.ui.review.compare import ReviewComparePanel
 from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
-from workbench.ui.review.panel import ReviewPanel
+from workbench.ui.review.panel import GO_LIVE, ReviewPanel
 from workbench.ui.review.rescore import RescorePanel
 from workbench.ui.review.scene import ReviewIn3D, shown_together
 from workbench.ui.scene.viewpoint import ViewPanel
@@ -198,6 +198,7 @@ class ReviewPage:
         """Draw the panels, all from one view; while it plays, less often than the 3-D view."""
         if not self._told.is_due(object(), urgent=None if view.playing else object()):
             return
+        self._open_the_newest(view)
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
         self._status.content = render(
@@ -216,6 +217,19 @@ class ReviewPage:
         cameras = () if chosen is None else self._reader.cameras(chosen.episode)
         pictures = self._pictures if self._cameras.show_frustums else {}
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
+
+    def _open_the_newest(self, view: ReviewView) -> None:
+        """Begin with a recording, once; the library stays as it is, also on a small screen."""
+        place = self._place
+        listed = place.shelf.library.view()
+        if place.newest_opened or (not view.opened and (listed.reading is not None or not listed.rows)):
+            return
+        place.newest_opened = True
+        whole = [row for row in listed.rows if row.problem is None]
+        if whole and not view.opened:
+            newest = max(whole, key=lambda row: row.written or 0.0)
+            self._had_opened = (newest.id,)
+            self._review.open((newest.id,))
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
@@ -316,10 +330,10 @@ class ReviewPage:
     def _commands(self) -> Sequence[Command]:
         review, timeline = self._review, self._timeline
         commands = [
-            Command("Play or pause", review.toggle_play, "space"),
+            Command("Play or pause", review.toggle_play, "space", buttons=("Play", "Pause", PLAY, PAUSE)),
             *timeline.commands(),
-            Command("Go to the first moment", review.to_first, "home"),
-            Command("Go to the last moment", review.to_last, "end"),
+            Command("Go to the first moment", review.to_first, "home", buttons=(FIRST,)),
+            Command("Go to the last moment", review.to_last, "end", buttons=(LAST,)),
             Command("Next recording", lambda: self._panel.select_neighbour(1), "N"),
             Command("Previous recording", lambda: self._panel.select_neighbour(-1), "P"),
             Command("Overlaid or side by side", self._panel.toggle_arrangement, "O"),
@@ -327,10 +341,10 @@ class ReviewPage:
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Switch between dark and light", self._view_panel.toggle_dark, "D"),
             Command("Rescore the selected recordings, or the open ones", self._rescore_chosen, "J"),
-            Command("Continue live from here", self._panel.enter_recording, "G"),
+            Command("Continue live from here", self._panel.enter_recording, "G", buttons=(GO_LIVE,)),
         ]
         if self._place.session is not None:
-            commands.append(Command(BACK, self._go_back, "V"))
+            commands.append(Command(BACK, self._go_back, "V", buttons=(BACK,)))
         return commands
 
     def _rescore_chosen(self) -> None:

@@ -84,6 +84,8 @@ class Workplace:
         """In the palette of both pages; set before the first page is shown."""
         self.session = session
         """Shown by the live page when it is next built."""
+        self.newest_opened = False
+        """The review has begun with the newest recording; it does so once."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
         self.go_live = GoLive(self, make_session, clearances, base)

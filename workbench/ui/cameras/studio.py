@@ -103,6 +103,8 @@ class StudioPanel(PagePart[SessionView]):
         self._suggest = CameraSuggest(server, session)
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
+        self._presses.when_unfolded(self._choose_first)
+        self._was_opened = False
         with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
         self._gizmo = CameraGizmo(
@@ -112,6 +114,16 @@ class StudioPanel(PagePart[SessionView]):
             own_axes=lambda: self._own_axes,
             look_at=lambda: self._look_at,
         )
+
+    def _choose_first(self) -> None:
+        """The tab was opened: choose its first sensor camera, once. A person may then choose none."""
+        view = self._session.view()
+        if self._was_opened or view.task is None:
+            return
+        self._was_opened = True
+        cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
+        if cameras and view.studio.selected is None:
+            self._session.studio.select(cameras[0].key)
 
     @property
     def shows(self) -> str:

@@ -16,6 +16,7 @@ WIDEST, BUSY_WIDEST = 520, 460
 """Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
 version is still used."""
 
+RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Start a new worker"
 SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
@@ -65,7 +66,7 @@ class Banner(PagePart[SessionView]):
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
-            self._reload = server.gui.add_button("Reload the file", icon=viser.Icon.REFRESH, color="gray")
+            self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
             self._restart = server.gui.add_button(
                 "Restart the worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
@@ -142,8 +143,8 @@ class BusyBanner(PagePart[SessionView]):
         with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
-            self._interrupt = server.gui.add_button("Interrupt", icon=viser.Icon.HAND_STOP)
-            self._restart = server.gui.add_button("Restart", icon=viser.Icon.POWER, color="gray")
+            self._interrupt = server.gui.add_button(INTERRUPT, icon=viser.Icon.HAND_STOP)
+            self._restart = server.gui.add_button(RESTART, icon=viser.Icon.POWER, color="gray")
         self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
         self._interrupt.on_click(lambda _: interrupt())
         self._restart.on_click(lambda _: restart())

@@ -17,6 +17,7 @@ from workbench.machine.text import number_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.scene.env_grid import InView
+from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
 from workbench.ui.widgets.templates import render
 
@@ -131,10 +132,10 @@ READ_EVERY = 0.2
 """Seconds."""
 PATIENCE = 2.0
 """Seconds without an answer after which the question is sent again: the worker may be another by then."""
-NOTHING, POSES = "nothing", "poses"
+NOTHING, JOINTS, POSES = "nothing", "joints", "poses"
 CHOICES: dict[str, Section | None] = {
     NOTHING: None,
-    "joints": "joints",
+    JOINTS: "joints",
     "contacts": "contacts",
     POSES: None,
     "observation": "observation",
@@ -145,7 +146,7 @@ CHOICES: dict[str, Section | None] = {
 class InspectPanel(PagePart[SessionView]):
     """Reads what is chosen, of the selected env, from the worker.
 
-    viser does not tell which tab is open, so nothing is read until a person chooses. The next reading is asked for when
+    Nothing is read until a page has opened the tab: reading takes the worker's time. The next reading is asked for when
     the last has come, at most five times a second: a busy worker gets no queue of questions.
     """
 
@@ -154,7 +155,7 @@ class InspectPanel(PagePart[SessionView]):
         self._show = server.gui.add_dropdown(
             "Show",
             tuple(CHOICES),
-            initial_value=NOTHING,
+            initial_value=JOINTS,
             hint="Read from the selected env, five times a second.",
         )
         self._forces = server.gui.add_checkbox(
@@ -163,6 +164,9 @@ class InspectPanel(PagePart[SessionView]):
             hint="Draw the contact forces of the selected env as arrows in the 3D view.",
         )
         self._handle = server.gui.add_html("")
+        self._opened = False
+        Presses(server).when_unfolded(self._open)
+        self._show.on_update(lambda _: self._open())
         self._asked: tuple[object, ...] | None = None
         self._asked_at = -math.inf
         self._had: Inspection | None = None
@@ -189,6 +193,9 @@ class InspectPanel(PagePart[SessionView]):
         shown = self._forces.value and here and known
         return self._now if shown else None
 
+    def _open(self) -> None:
+        self._opened = True
+
     def _no_step_yet(self, view: SessionView) -> bool:
         """Whether the selected env has made no step since it was built, reset or put back. PhysX finds contacts while
         it steps: until then its list is empty or outdated."""
@@ -199,7 +206,7 @@ class InspectPanel(PagePart[SessionView]):
 
     def _ask(self, view: SessionView, choice: str) -> None:
         chosen: tuple[Section | None, ...] = (
-            CHOICES[choice],
+            CHOICES[choice] if self._opened else None,
             "contacts" if self._forces.value else None,
         )
         sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in chosen)

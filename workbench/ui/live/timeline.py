@@ -101,10 +101,10 @@ class TimeBar(PagePart[View]):
     def commands(self) -> list[Command]:
         """Commands of the arrow keys."""
         return [
-            Command("One step back", lambda: self._step_by(-1), "arrowleft"),
-            Command("One step forward", lambda: self._step_by(1), "arrowright"),
-            Command("Previous event", lambda: self._to_event(-1), "arrowleft", "shift"),
-            Command("Next event", lambda: self._to_event(1), "arrowright", "shift"),
+            Command("One step back", lambda: self._step_by(-1), "arrowleft", buttons=(LAST_STEP,)),
+            Command("One step forward", lambda: self._step_by(1), "arrowright", buttons=(NEXT_STEP,)),
+            Command("Previous event", lambda: self._to_event(-1), "arrowleft", "shift", (LAST_EVENT,)),
+            Command("Next event", lambda: self._to_event(1), "arrowright", "shift", (NEXT_EVENT,)),
         ]
 
     def _step_by(self, steps: int) -> None:

@@ -43,6 +43,7 @@ SCRIPTS = (
     "envs_width.js",
     "unfolded.js",
     "typed_numbers.js",
+    "key_help.js",
     "steady_resolution.js",
     "tab_title.js",
     "help.js",

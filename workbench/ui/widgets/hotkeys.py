@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,8 +10,12 @@ from typing import Any
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
 
-from workbench.ui.widgets.click_targets import in_turn
+from workbench.machine.kept_choices import close_hints, kept_choices
+from workbench.ui.widgets.click_targets import Presses, in_turn
+from workbench.ui.widgets.templates import render
 
+_LAST = 2e6
+"""viser's order of elements: after all others of the panel."""
 _NAMES = {
     "space": "Space",
     "arrowleft": "←",
@@ -39,6 +44,8 @@ class Command:
     run: Callable[[], None]
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
+    buttons: tuple[str, ...] = ()
+    """Labels, or their first words, of the buttons that do the same: their tooltips name the key (``key_help.js``)."""
     registered: Callable[[viser.CommandHandle], None] | None = None
     """Called with its handle, which can disable the command."""
 
@@ -58,7 +65,10 @@ class Command:
 
 
 def register(server: viser.ViserServer, commands: Sequence[Command]) -> None:
-    """Put the commands into the palette of every page."""
+    """Put the commands into the palette of every page, and their keys where ``key_help.js`` finds them. Call it in no
+    container."""
+    names = {button: command.key_name for command in commands if command.key for button in command.buttons}
+    server.gui.add_html(render("all_keys", commands=commands, buttons=json.dumps(names)), order=_LAST)
     for command in commands:
         handle = server.gui.add_command(
             command.label,
@@ -68,6 +78,19 @@ def register(server: viser.ViserServer, commands: Sequence[Command]) -> None:
         handle.on_trigger(_triggered(command.run))
         if command.registered is not None:
             command.registered(handle)
+
+
+def add_hints(server: viser.ViserServer) -> None:
+    """Four hints in the present container, until a person closes them for good."""
+    if kept_choices().hints_closed:
+        return
+    hints = server.gui.add_html("")
+
+    def close() -> None:
+        hints.visible = False
+        close_hints()
+
+    hints.content = render("hints", close=Presses(server).id_of("close the hints", lambda _: close()))
 
 
 def _triggered(run: Callable[[], None]) -> Callable[[viser.CommandEvent], Coroutine[Any, Any, None]]:

@@ -1,0 +1,68 @@
+"""What is kept of a person's choices between runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from workbench.machine.folders import read_private, user_folder, write_private
+from workbench.machine.kept_choices import (
+    FILE,
+    MOST_FOLDERS,
+    MOST_POLICIES,
+    close_hints,
+    keep_policy,
+    kept_choices,
+    used_policies,
+)
+
+
+@pytest.fixture(autouse=True)
+def own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+
+
+def test_policies_are_kept_by_folder_the_newest_first() -> None:
+    here, there = Path("/home/me/lab"), Path("/home/me/other")
+    for reference in ("a.py:act", "b.py:act", "a.py:act"):
+        keep_policy(here, reference)
+    keep_policy(there, "c.py:act")
+    assert used_policies(here) == ("a.py:act", "b.py:act")
+    assert used_policies(there) == ("c.py:act",) and used_policies(Path("/")) == ()
+
+
+def test_what_is_kept_is_bounded() -> None:
+    for number in range(MOST_FOLDERS + 5):
+        keep_policy(Path(f"/{number}"), "a.py:act")
+    for number in range(MOST_POLICIES + 5):
+        keep_policy(Path("/last"), f"{number}.py:act")
+    kept = kept_choices().policies
+    assert len(kept) == MOST_FOLDERS and "/0" not in kept
+    assert len(kept["/last"]) == MOST_POLICIES and kept["/last"][0] == f"{MOST_POLICIES + 4}.py:act"
+
+
+def test_closed_hints_stay_closed_and_policies_stay() -> None:
+    keep_policy(Path("/lab"), "a.py:act")
+    assert not kept_choices().hints_closed
+    close_hints()
+    assert kept_choices().hints_closed and used_policies(Path("/lab")) == ("a.py:act",)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"hints_closed": 3}', b"\xff", b"[" * 100_000])
+def test_a_broken_file_is_no_choice_and_is_told(content: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    write_private(FILE, content)
+    assert not kept_choices().hints_closed
+    assert "What was chosen on earlier pages is not known" in caplog.text
+    close_hints()
+    assert kept_choices().hints_closed
+
+
+def test_where_nothing_can_be_kept_the_page_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+    close_hints()
+    user_folder().chmod(0o777)
+    before = (user_folder() / FILE).read_bytes()
+    keep_policy(Path("/lab"), "a.py:act")
+    assert "is not kept for the next run" in caplog.text
+    user_folder().chmod(0o700)
+    assert read_private(FILE) == before
