@@ -23,7 +23,7 @@ from workbench.ui.live.rescored import PastRescorePanel, RescoredAbove
 from workbench.ui.live.reward import CurvesPanel, NumbersPanel
 from workbench.ui.live.run_panel import NEXT, PREVIOUS, RESET_ALL, RESET_THIS, STEP, RunPanel
 from workbench.ui.live.status_line import RulesMark, StatusLine
-from workbench.ui.live.timeline import GO_ON, NOW, UNDO, TimelinePanel
+from workbench.ui.live.timeline import GO_ON, LIVE, UNDO, TimelinePanel
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.live.version_panel import AS_NEEDED, VersionPanel
 from workbench.ui.scene.bodies import Looks
@@ -284,7 +284,7 @@ class Page:
             Command("Undo the last reset or rewind", session.past.undo, "U", buttons=(UNDO,)),
             *timeline.commands(),
             Command("Go to the first moment", timeline.go_to_the_first, "home"),
-            Command("Go to live", timeline.go_live, "end", buttons=(NOW,)),
+            Command("Go to live", timeline.go_live, "end", buttons=(LIVE,)),
             Command(
                 "Continue from here, in the selected env", timeline.continue_from_shown, "G", buttons=(GO_ON,)
             ),
