@@ -6,6 +6,7 @@ and ``demo.webp``, which moves (`film.py`). Names choose among `SHOTS`; without 
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -86,6 +87,8 @@ class Desk:
         """Write the picture of this name, dark and light."""
         for theme in THEMES:
             self.wear(theme)
+            # Away from what would show a tooltip.
+            self.page.mouse.move(400, 10)
             time.sleep(FRAME)
             image = picture_of(self.page) if take is None else take(self.page)
             path = OUT / theme / f"{name}.jpg"
@@ -111,6 +114,9 @@ def live_page(browser: Browser, *arguments: str, task: str = "") -> Iterator[Des
             page.goto(opened.url)
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
             close_notice(page)
+            hints = page.get_by_text("close for good", exact=True)
+            if hints.is_visible():
+                hints.click()
             yield Desk(page, file)
             page.close()
 
@@ -353,6 +359,8 @@ def main(names: list[str]) -> None:
     unknown = set(names) - {*SHOTS, "demo"}
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(SHOTS)} and demo")
+    # Neither what this person trusts and has used is shown, nor does it get what is pressed here.
+    os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-pictures-")
     for name, shot in SHOTS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:
