@@ -293,11 +293,11 @@ def shoot_busy(browser: Browser) -> None:
 
 
 def record(file: Path, folder: Path, *arguments: str) -> None:
-    """Episodes of the policy."""
-    command = [sys.executable, "-m", "workbench.cli.main", "record", str(file)]
-    subprocess.run(
-        [*command, "--actions", f"{POLICY}:act", "--out", str(folder), *CONTROL, *arguments], check=True
-    )
+    """Episodes of the policy, whose name a recording keeps as it is given here."""
+    shutil.copy(POLICY, file.parent)
+    command = [sys.executable, "-m", "workbench.cli.main", "record", file.name]
+    command += ["--actions", f"{POLICY.name}:act", "--out", str(folder), *CONTROL, *arguments]
+    subprocess.run(command, check=True, cwd=file.parent)
 
 
 def shoot_review(browser: Browser) -> None:
@@ -312,13 +312,18 @@ def shoot_review(browser: Browser) -> None:
             page, _ = new_page(browser)
             page.goto(opened.url)
             rows = page.locator(".wb-library").get_by_text(re.compile("seed0000"))
-            expect(rows).to_have_count(2, timeout=120_000)
+            expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)
             desk = Desk(page, file)
+            # The newest one has been opened, and the library folded.
+            desk.press("b")
+            expect(rows).to_have_count(2)
             rows.last.click()
             desk.shoot("library")
             desk.press("Enter")
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=60_000)
+            if rows.first.is_visible():
+                desk.press("b")
             for _ in range(2):
                 desk.press("Shift+ArrowRight")
                 time.sleep(1.0)
