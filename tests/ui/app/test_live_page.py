@@ -198,13 +198,6 @@ def test_inspect_shows_joints_as_soon_as_it_is_opened(opened: Opened) -> None:
         and view.inspection.joints
         and "panda_joint1" in inspect.html("wb-inspect")
     )
-    assert opened.session.view().studio.selected is None
-    studio.press("unfolded")
-    chosen = opened.session.view().studio.selected
-    assert chosen is not None and chosen[0] == "sensor"
-    opened.session.studio.select(None)
-    studio.press("unfolded")
-    assert opened.session.view().studio.selected is None, "a person chose none"
 
 
 def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None:
