@@ -161,9 +161,11 @@ def test_a_patch_keeps_the_step_and_says_so_and_a_rebuild_can_be_asked_for(calm:
     until(lambda: abs(float(calm.row("reward")[1]) - before - 1) < 0.01, "the reward of the same step")
     assert calm.elapsed() == 1
     calm.tab("Run")
-    expect(calm.page.get_by_text("only compute_dense_reward changed").last).to_be_visible()
+    expect(
+        calm.page.get_by_text("only compute_dense_reward changed").locator("visible=true").first
+    ).to_be_visible()
     calm.button("Rebuild").click()
-    expect(calm.page.get_by_text("rebuilt was requested").last).to_be_visible()
+    expect(calm.page.get_by_text("rebuilt was requested").locator("visible=true").first).to_be_visible()
     calm.tab("Reward")
     assert calm.elapsed() == 1
     calm.file.write_text(good)
@@ -175,7 +177,7 @@ def test_a_broken_edit_shows_a_banner_and_the_last_good_version_stays_usable(cal
     place = next(i for i, line in enumerate(lines) if '"cube_to_goal"' in line)
     lines[place] = lines[place].replace('"cube_to_goal"', '"cube_to_goal_" + 1')
     calm.file.write_text("\n".join(lines))
-    banner = calm.page.get_by_text(re.compile(rf"push_cube\.py:{place + 1}\b"))
+    banner = calm.page.locator(".wb-banner").get_by_text(re.compile(rf"push_cube\.py:{place + 1}\b"))
     expect(banner.first).to_be_visible()
     expect(calm.page.get_by_text("TypeError").first).to_be_visible()
     expect(calm.page.get_by_text("last good version").first).to_be_visible()

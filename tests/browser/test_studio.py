@@ -184,11 +184,11 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "Eye") == [0.6, 0, 0.6], "the eye")
     until(lambda: numbers(page, "Degrees")[1] == 49.09, "the angle")
-    assert numbers(page, "Looks at") == [0.08, 0, 0]
+    assert numbers(page, "Target") == [0.08, 0, 0]
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Alt+ArrowLeft")
     until(lambda: numbers(page, "Eye") == [0.6, -0.01, 0.6], "the nudge")
-    assert numbers(page, "Looks at") == [0.08, 0, 0]
+    assert numbers(page, "Target") == [0.08, 0, 0]
     for _ in range(2):
         page.keyboard.press("Control+z")
     until(lambda: numbers(page, "Eye") == [0.45, 0, 0.6], "both undone")
