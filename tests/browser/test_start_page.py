@@ -64,8 +64,9 @@ def marked(page: Page) -> Locator:
 def runs(page: Page, title: str, envs: str = "2 envs") -> None:
     status = page.locator(".wb-status")
     expect(status).to_have_attribute("data-title", re.compile(title), timeout=PATIENT)
+    # In this order: "building 2 envs" is said while it loads.
+    expect(status).to_contain_text(f"{envs} on cpu", timeout=PATIENT)
     expect(status).to_contain_text("paused", timeout=PATIENT)
-    expect(status).to_contain_text(envs, timeout=PATIENT)
 
 
 def open_list(page: Page) -> None:

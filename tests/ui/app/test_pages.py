@@ -93,7 +93,10 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
     place = Workplace(gated_server, tmp_path, no_session, TaskOptions())
     place.pages.start("review")
     try:
-        until(lambda: "can be seen again" in " ".join(place.shelf.review.view().problems), "the word for it")
+        until(
+            lambda: "is back in the library" in " ".join(place.shelf.review.view().problems),
+            "the word for it",
+        )
         until(lambda: [row.seed for row in place.shelf.library.view().rows] == [8], "its row")
     finally:
         place.close()

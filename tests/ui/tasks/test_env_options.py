@@ -132,6 +132,16 @@ def test_what_is_typed_survives_a_save_and_goes_with_discard(form: Form) -> None
     assert not form.panels.shows("Discard", "button")
 
 
+def test_a_number_that_is_typed_while_the_task_loads_stays(form: Form) -> None:
+    loaded = form.view
+    form.view = replace(loaded, task=None, options=TaskOptions(5))
+    form.draw()
+    form.set("Envs", 7)
+    form.view = replace(loaded, options=TaskOptions(5))
+    form.draw()
+    assert form.panels.control("Envs").value == 7 and form.panels.control("size").value == 0.02
+
+
 def test_refused_options_stay_in_the_form_and_discard_takes_the_problem_away(form: Form) -> None:
     form.set("Envs", 4000)
     form.press("Apply")

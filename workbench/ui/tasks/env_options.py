@@ -76,9 +76,13 @@ class EnvOptionsPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         made = (HowMade() if view.task is None else view.task.made), replace(view.options, seed=0)
-        if made != self._made:
+        before = self._made
+        if made != before:
             self._made = made
-            self._build(*made)
+            self._build(made[0])
+            # What was typed while the first version was loading stays.
+            if before is None or before[1] != made[1]:
+                self._num_envs.value = made[1].num_envs
         changed = self._is_changed(view)
         self._apply.disabled = not changed or view.state == "stopped"
         self._discard.visible = changed or view.options_refused is not None
@@ -86,7 +90,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
 
     # --- the form --------------------------------------------------------------------------------
 
-    def _build(self, made: HowMade, options: TaskOptions) -> None:
+    def _build(self, made: HowMade) -> None:
         keywords = (*made.modes, *made.own)
         kinds = [(one.name, one.kind, one.choices, one.optional, one.fixed) for one in keywords]
         before = [field.keyword for field in self._fields]
@@ -99,11 +103,10 @@ class EnvOptionsPanel(PagePart[SessionView]):
             self._fields = [
                 replace(field, keyword=keyword) for field, keyword in zip(self._fields, keywords, strict=True)
             ]
-        self._show(options)
+        self._show_keywords()
 
-    def _show(self, options: TaskOptions) -> None:
-        """Write what is in effect into the form."""
-        self._num_envs.value = options.num_envs
+    def _show_keywords(self) -> None:
+        """Write what is in effect into the fields of the keywords."""
         for field in self._fields:
             if not field.keyword.fixed:
                 field.show(field.keyword.value)
@@ -117,7 +120,8 @@ class EnvOptionsPanel(PagePart[SessionView]):
 
     def _discard_form(self) -> None:
         view = self._session.view()
-        self._show(view.options)
+        self._num_envs.value = view.options.num_envs
+        self._show_keywords()
         if view.options_refused is not None:
             # The task works with what is in effect: loading it takes the problem off the page.
             self._session.versions.apply_options(view.options)
