@@ -48,12 +48,6 @@
   window.addEventListener(
     "keydown",
     (event) => {
-      if ((event.key === "Enter" || event.key === "Escape") && event.target instanceof HTMLInputElement) {
-        // After the field has taken the key. A list that is open and a dialog have their own use for both.
-        const field = event.target;
-        const own = field.getAttribute("aria-haspopup") === "listbox" || field.closest("[role=dialog]");
-        if (!own && isTypedInto(field)) setTimeout(() => field.blur());
-      }
       clearTimeout(again); // or a key that comes soon after a click would lose what it has just walked to
       if ((event.key !== " " && event.key !== "Enter") || !(event.target instanceof Element)) return;
       // The browser presses it all the same; our own HTML has no such control and hears its keys itself.
@@ -61,6 +55,12 @@
     },
     true,
   );
+
+  // Last, when the field has taken the key (typed_numbers.js). A list and a dialog have their own use for both keys.
+  window.addEventListener("keydown", ({ key, target }) => {
+    if ((key !== "Enter" && key !== "Escape") || !(target instanceof HTMLInputElement) || !isTypedInto(target)) return;
+    if (target.getAttribute("aria-haspopup") !== "listbox" && !target.closest("[role=dialog]")) target.blur();
+  });
 
   // On the window and first: what is pressed may keep the event from going further.
   for (const kind of ["pointerup", "click"]) {

@@ -39,7 +39,9 @@ def address(folder: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def desk(address: str, browser: Browser) -> Iterator[tuple[Page, list[str]]]:
     with page_at(browser, address) as (page, errors):
-        expect(page.get_by_text("No recording is open")).to_be_visible()
+        # The newest, and the library beside it.
+        expect(page.locator(".wb-status")).to_contain_text("seed0002")
+        expect(page.locator(".wb-library")).to_be_visible()
         yield page, errors
 
 
@@ -230,7 +232,7 @@ def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Br
         expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
-        expect(page.get_by_text("No recording is open")).to_be_visible()
+        expect(page.locator(".wb-status")).to_contain_text("seed0002")
         close_notice(page)
         page.get_by_role("button", name="Back to the live env").click()
         expect(page.get_by_role("tab", name="Run")).to_be_visible()

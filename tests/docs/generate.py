@@ -79,8 +79,8 @@ def keys_page(commands: Commands) -> str:
         [
             "# Keys",
             "",
-            "Ctrl+K opens a list of all commands by name, those without a key too. Keys do not work while you type in a text or number",
-            "field. This page is made from the code.",
+            "`?` on the page shows its keys. Ctrl+K opens a list of all commands by name, including those without a key. Keys do not",
+            "work while you type in a text or number field. This page is made from the code.",
             "",
             "## Live page",
             "",

@@ -185,22 +185,19 @@ def test_hints_are_on_the_first_page_until_they_are_closed_for_good(
         server.stop()
 
 
-def test_inspect_shows_joints_and_studio_a_sensor_camera_as_soon_as_they_are_opened(opened: Opened) -> None:
+def test_inspect_shows_joints_as_soon_as_it_is_opened(opened: Opened) -> None:
     opened.load()
-    inspect, studio = opened.panels.part("Inspect"), opened.panels.part("Studio")
+    inspect = opened.panels.part("Inspect")
     assert inspect.control("Show").value == "joints" and opened.session.view().inspection is None
     inspect.press("unfolded")
     opened.draw()
     view = wait_until(opened.session, lambda view: view.inspection is not None, "the joints")
     opened.draw()
-    assert view.inspection.joints and "panda_joint1" in inspect.html("wb-inspect")
-    assert opened.session.view().studio.selected is None
-    studio.press("unfolded")
-    chosen = opened.session.view().studio.selected
-    assert chosen is not None and chosen[0] == "sensor"
-    opened.session.studio.select(None)
-    studio.press("unfolded")
-    assert opened.session.view().studio.selected is None, "a person chose none"
+    assert (
+        view.inspection is not None
+        and view.inspection.joints
+        and "panda_joint1" in inspect.html("wb-inspect")
+    )
 
 
 def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None:

@@ -112,6 +112,8 @@ def _kept(view: SessionView) -> str:
     """Which version still runs, in a sentence."""
     if view.state == "stopped":
         return "The worker process is gone. Restart the worker to continue."
+    if view.task is None and not (view.problem is not None and view.problem.file):
+        return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
     if view.task is None:
         return "No version has loaded yet. Fix the file and save it, and the page will show it."
     if view.problem is not None and view.problem.stage == "worker":

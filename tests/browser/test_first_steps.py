@@ -1,0 +1,175 @@
+"""What a newcomer meets in a real Chromium: hints, keys, curves that can be clicked, tabs that show something."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Locator, expect
+
+from tests.browser.conftest import At
+from tests.drive.desk import Desk
+from tests.drive.page import TASK
+from tests.drive.waiting import until
+from workbench.ui.live.reward import CHOICE
+from workbench.ui.live.version_panel import LAST_LOADS
+
+pytestmark = pytest.mark.browser
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def opened(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
+    with example_without_pictures(browser) as desk:
+        (desk.file.parent / "pusher.py").write_text(
+            "def careful(obs):\n    return obs.new_zeros((len(obs), 8))\n"
+        )
+        yield desk
+        assert desk.errors == []
+
+
+@pytest.fixture
+def desk(opened: Desk) -> Desk:
+    """On the Run tab, at the first step of an episode."""
+    opened.leave_inputs()
+    opened.tab("Run")
+    opened.press("End", "r")
+    opened.timeline_says("step 0 /")
+    return opened
+
+
+def charts(desk: Desk) -> Locator:
+    """Where curves are drawn, the reward's first."""
+    return desk.page.locator(".u-over:visible")
+
+
+def test_the_first_page_has_hints_that_are_closed_for_good(desk: Desk) -> None:
+    hints = desk.page.locator(".wb-hints")
+    expect(hints.locator("li")).to_have_count(4)
+    hints.get_by_text("close for good").click()
+    expect(hints).to_have_count(0)
+    desk.page.reload()
+    expect(desk.button("Play")).to_be_visible()
+    expect(hints).to_have_count(0)
+
+
+def test_a_question_mark_lists_the_keys_which_rest_meanwhile(desk: Desk) -> None:
+    listed = desk.page.locator(".wb-key-list")
+    desk.press("?")
+    expect(listed.get_by_text("Play or pause")).to_be_visible()
+    desk.press("s", "Escape")
+    expect(listed).to_have_count(0)
+    desk.press("?", "?")
+    expect(listed).to_have_count(0)
+    desk.timeline_says("step 0 /")
+    desk.press("s")
+    desk.timeline_says("step 1 /")
+
+
+def test_the_tooltip_of_a_button_names_its_key(desk: Desk) -> None:
+    for name, key in (("Play", "Space"), ("Reset this env", "Shift R"), ("‹ step", "←")):
+        desk.button(name).hover()
+        expect(desk.button(name)).to_have_attribute("title", f"{name} ({key})")
+
+
+def test_a_field_gives_the_keys_back_and_a_click_on_the_view_out_of_it_selects_no_env(desk: Desk) -> None:
+    def selected() -> str:
+        found = re.search(r"env \d", desk.page.locator(".wb-timeline").inner_text())
+        return "" if found is None else found[0]
+
+    view = desk.box("canvas[data-engine]")
+    seed = desk.page.get_by_label("Seed")
+    seed.click()
+    desk.press("Enter", "s")
+    desk.timeline_says("step 1 /")
+    # Where another env lies, as clicks without a field show.
+    places = [(view["x"] + view["width"] * x / 8, view["y"] + view["height"] * 0.35) for x in range(1, 8)]
+    desk.page.keyboard.press("f")
+    for place in places:
+        desk.page.mouse.click(*place)
+        desk.page.wait_for_timeout(300)
+        if selected() != "env 0":
+            break
+    else:
+        raise AssertionError("no click selects another env")
+    desk.select_the_first_env()
+    seed.click()
+    desk.page.mouse.click(*place)
+    desk.press("s")
+    desk.timeline_says("step 2 /")
+    assert selected() == "env 0"
+    desk.page.mouse.click(*place)
+    until(lambda: selected() != "env 0", "the env of the next click")
+    desk.select_the_first_env()
+
+
+def test_a_click_on_a_curve_shows_its_step_and_hovering_its_numbers(desk: Desk) -> None:
+    for step in range(1, STEPS + 1):
+        desk.press("s")
+        desk.timeline_says(f"step {step} /")
+    desk.tab("Reward")
+    over = charts(desk).first
+    over.hover()
+    legend = desk.page.locator(".u-legend:visible").first
+    expect(legend).to_contain_text(re.compile(r"step:?\s*\d+"))
+    found = re.search(r"step:?\s*(\d+)", legend.inner_text())
+    assert found is not None
+    box = over.bounding_box()
+    assert box is not None
+    desk.page.mouse.click(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.5)
+    expect(desk.page.get_by_text(re.compile("past, [1-9]")).first).to_be_visible()
+    shown = desk.elapsed()
+    assert 0 < shown < STEPS
+    desk.press("End")
+    desk.comes_to(STEPS)
+
+
+def test_entries_and_joints_are_chosen_for_a_curve(desk: Desk) -> None:
+    desk.press("s", "s")
+    desk.timeline_says("step 2 /")
+    desk.tab("Reward")
+    expect(charts(desk)).to_have_count(3)  # reward, success, reward terms
+    desk.page.get_by_text(CHOICE, exact=True).click()
+    for name in ("cube_height", "panda_joint1"):
+        desk.page.locator(".wb-curve-choice").get_by_text(name, exact=True).click()
+    expect(charts(desk)).to_have_count(5)
+    expect(desk.page.get_by_text("joints, env 0", exact=True)).to_be_visible()
+    wide = "() => [...document.querySelectorAll('.wb-curve-choice .wb-pill')].every(p => p.getBoundingClientRect().right < innerWidth)"
+    assert desk.page.evaluate(wide), "no pill is cut"
+    desk.page.get_by_text(CHOICE, exact=True).click()
+
+
+def test_inspect_opens_with_the_joints(desk: Desk) -> None:
+    desk.tab("Inspect")
+    expect(desk.page.locator(".wb-inspect")).to_contain_text("panda_joint1")
+
+
+def test_a_policy_is_chosen_from_those_in_the_folder(desk: Desk) -> None:
+    desk.page.get_by_label("Source").click()
+    desk.page.get_by_role("option", name="policy").click()
+    desk.page.get_by_label("Known").click()
+    desk.page.get_by_role("option", name="pusher.py:careful").click()
+    expect(desk.page.get_by_label("Known")).to_have_value("pusher.py:careful")
+    desk.leave_inputs()
+    desk.press("s")
+    desk.timeline_says("step 1 /")
+    desk.page.get_by_label("Source").click()
+    desk.page.get_by_role("option", name="random").click()
+
+
+def test_a_line_of_the_file_opens_the_editor_and_the_reloads_are_listed(desk: Desk) -> None:
+    place = next(i for i, line in enumerate(TASK.read_text().splitlines(), 1) if '"cube_to_goal"' in line)
+    desk.edit('"cube_to_goal"', '"cube_to_goal_" + 1')
+    link = desk.page.locator(".wb-banner a")
+    expect(link).to_have_attribute("href", f"vscode://file{desk.file}:{place}")
+    expect(desk.page.locator(".wb-banner [data-copy]")).to_have_attribute("data-copy", f"{desk.file}:{place}")
+    desk.edit("return reward\n", "return reward + 1\n")
+    expect(link).to_have_count(0)
+    desk.page.get_by_text(LAST_LOADS, exact=True).click()
+    loads = desk.page.locator(".wb-load")
+    expect(loads.first).to_contain_text("patched")
+    expect(loads.nth(1)).to_contain_text("refused")
+    expect(loads.nth(1)).to_contain_text(f"push_cube.py:{place}")
+    desk.file.write_text(TASK.read_text())
+    expect(loads.first).to_contain_text("only compute_dense_reward changed")
