@@ -45,6 +45,10 @@ def opened(example: At, browser: Browser) -> Iterator[Desk]:
         desk.comes_to(2)
         yield desk
         assert not desk.errors
+        # As the next file begins.
+        desk.tab("Reward")
+        desk.press("r")
+        desk.comes_to(0)
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from workbench.ui.widgets.hotkeys import Command
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"
 RULES_PAGE = DOCS / "batched_env.md"
-COMMANDS = ("open", "review", "record", "rescore", "share", "export", "view", "doctor", "help")
+COMMANDS = ("start", "open", "review", "record", "rescore", "share", "export", "view", "doctor", "help")
 """In the order in which a reader meets them; `test_generated.py` compares them with those that there are."""
 
 
