@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 os.environ["RERUN_STRICT"] = "1"
 # For this process and all that it starts: what tests trust and seal must not get into the developer's own folder.
 os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-")
+# Nor what they opened last.
+os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["XDG_CONFIG_HOME"], "state")
 
 import psutil
 import pytest

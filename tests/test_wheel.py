@@ -70,6 +70,8 @@ def test_the_installed_command_is_not_the_clone(installed: Path, tmp_path: Path)
     assert str(installed.parent) in _run([str(installed / "python"), "-c", where], tmp_path)
     said = _run([str(installed / "workbench"), "--help"], tmp_path)
     assert all(command in said for command in ("open", "record", "doctor"))
+    # README is no part of the package in a clone.
+    assert "The first ten minutes" in _run([str(installed / "workbench"), "help", "overview"], tmp_path)
 
 
 def test_a_file_elsewhere_opens_is_served_and_ends_with_ctrl_c(installed: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ and ``demo.webp``, which moves (`film.py`). Names choose among `SHOTS`; without 
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -86,6 +87,8 @@ class Desk:
         """Write the picture of this name, dark and light."""
         for theme in THEMES:
             self.wear(theme)
+            # Away from what would show a tooltip.
+            self.page.mouse.move(400, 10)
             time.sleep(FRAME)
             image = picture_of(self.page) if take is None else take(self.page)
             path = OUT / theme / f"{name}.jpg"
@@ -111,6 +114,9 @@ def live_page(browser: Browser, *arguments: str, task: str = "") -> Iterator[Des
             page.goto(opened.url)
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
             close_notice(page)
+            hints = page.get_by_text("close for good", exact=True)
+            if hints.is_visible():
+                hints.click()
             yield Desk(page, file)
             page.close()
 
@@ -287,11 +293,11 @@ def shoot_busy(browser: Browser) -> None:
 
 
 def record(file: Path, folder: Path, *arguments: str) -> None:
-    """Episodes of the policy."""
-    command = [sys.executable, "-m", "workbench.cli.main", "record", str(file)]
-    subprocess.run(
-        [*command, "--actions", f"{POLICY}:act", "--out", str(folder), *CONTROL, *arguments], check=True
-    )
+    """Episodes of the policy, whose name a recording keeps as it is given here."""
+    shutil.copy(POLICY, file.parent)
+    command = [sys.executable, "-m", "workbench.cli.main", "record", file.name]
+    command += ["--actions", f"{POLICY.name}:act", "--out", str(folder), *CONTROL, *arguments]
+    subprocess.run(command, check=True, cwd=file.parent)
 
 
 def shoot_review(browser: Browser) -> None:
@@ -306,13 +312,20 @@ def shoot_review(browser: Browser) -> None:
             page, _ = new_page(browser)
             page.goto(opened.url)
             rows = page.locator(".wb-library").get_by_text(re.compile("seed0000"))
-            expect(rows).to_have_count(2, timeout=120_000)
+            expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)
             desk = Desk(page, file)
+            # The newest one has been opened, and the library folded where there is little room.
+            time.sleep(FRAME)
+            if not rows.first.is_visible():
+                desk.press("b")
+            expect(rows).to_have_count(2)
             rows.last.click()
             desk.shoot("library")
             desk.press("Enter")
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=60_000)
+            if rows.first.is_visible():
+                desk.press("b")
             for _ in range(2):
                 desk.press("Shift+ArrowRight")
                 time.sleep(1.0)
@@ -353,6 +366,8 @@ def main(names: list[str]) -> None:
     unknown = set(names) - {*SHOTS, "demo"}
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(SHOTS)} and demo")
+    # Neither what this person trusts and has used is shown, nor does it get what is pressed here.
+    os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-pictures-")
     for name, shot in SHOTS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:

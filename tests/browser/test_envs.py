@@ -28,7 +28,7 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
     with page_on(task_file, *arguments, browser=browser) as (page, errors, _):
         assert envs(page) == []
         page.get_by_role("tab", name="Inspect").click()
-        assert page.locator(".wb-inspect").inner_text().startswith("Choose what to read")
+        expect(page.get_by_text("panda_joint7", exact=True)).to_be_visible()
         page.keyboard.press("b")
         until(lambda: envs(page) == list(range(ENVS)), "the rows")
         play_until_step(page, 6)

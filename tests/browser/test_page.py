@@ -161,9 +161,11 @@ def test_a_patch_keeps_the_step_and_says_so_and_a_rebuild_can_be_asked_for(calm:
     until(lambda: abs(float(calm.row("reward")[1]) - before - 1) < 0.01, "the reward of the same step")
     assert calm.elapsed() == 1
     calm.tab("Run")
-    expect(calm.page.get_by_text("only compute_dense_reward changed").locator("visible=true").last).to_be_visible()
+    expect(
+        calm.page.get_by_text("only compute_dense_reward changed").locator("visible=true").first
+    ).to_be_visible()
     calm.button("Rebuild").click()
-    expect(calm.page.get_by_text("rebuilt was requested").locator("visible=true").last).to_be_visible()
+    expect(calm.page.get_by_text("rebuilt was requested").locator("visible=true").first).to_be_visible()
     calm.tab("Reward")
     assert calm.elapsed() == 1
     calm.file.write_text(good)

@@ -56,7 +56,7 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     calm(desk.file)
     desk.button("Restart").click()
     expect(desk.page.get_by_text(re.compile("is restored where it was"))).to_be_visible()
-    assert desk.opened.wait_for_line("worker failed.*ended by hand in evaluate")
+    assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
 
 
 def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:

@@ -65,7 +65,7 @@ def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
 
 
 def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # As if a name that an older viser lacks were imported.
     monkeypatch.setitem(sys.modules, "workbench.cli.page", None)

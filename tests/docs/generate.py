@@ -30,7 +30,7 @@ from workbench.ui.widgets.hotkeys import Command
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"
 RULES_PAGE = DOCS / "batched_env.md"
-COMMANDS = ("open", "review", "record", "rescore", "share", "export", "view", "doctor", "help")
+COMMANDS = ("start", "open", "review", "record", "rescore", "share", "export", "view", "doctor", "help")
 """In the order in which a reader meets them; `test_generated.py` compares them with those that there are."""
 
 
@@ -79,8 +79,8 @@ def keys_page(commands: Commands) -> str:
         [
             "# Keys",
             "",
-            "Ctrl+K opens a list of all commands by name, those without a key too. Keys do not work while you type in a text or number",
-            "field. This page is made from the code.",
+            "`?` on the page shows its keys. Ctrl+K opens a list of all commands by name, including those without a key. Keys do not",
+            "work while you type in a text or number field. This page is made from the code.",
             "",
             "## Live page",
             "",

@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from tests.drive.waiting import until
 from workbench.machine.apt import AptFailed, apt_install, can_install_packages
@@ -62,7 +63,7 @@ def _found() -> str | None:
 class Firefox:
     """One page of a running Firefox."""
 
-    def __init__(self, socket: ClientConnection) -> None:
+    def __init__(self, socket: Connection) -> None:
         self._socket, self._number = socket, 0
         self.errors: list[str] = []
         """Console errors and uncaught exceptions of the page."""

@@ -25,9 +25,16 @@ from workbench.cli import main
 from workbench.cli.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
-COMMANDS = ("open", "record", "review", "rescore", "share", "export", "view", "doctor", "help")
+COMMANDS = ("start", "open", "record", "review", "rescore", "share", "export", "view", "doctor", "help")
 CALLS = {
-    "workbench": ["", "nonsense", "open --nonsense", "record"],
+    "workbench": ["nonsense", "--nonsense", "open --nonsense", "record"],
+    "start": [
+        "--num-envs 0",
+        "--env control_mode",
+        "--history much",
+        "--memory-limit much",
+        "start --host 0.0.0.0 --no-token",
+    ],
     "open": [
         "open gone.py",
         "open gone.package:Task",

@@ -504,3 +504,67 @@ def _trust_many(process: int) -> None:
     store = TrustStore()
     for number in range(8):
         store.trust(_content(process, number))
+
+
+# --- a file that a person chose from a list -----------------------------------------------------------
+
+
+def listed(tmp_path: Path, text: str = TEXT) -> Path:
+    folder = tmp_path / "elsewhere"
+    folder.mkdir(exist_ok=True)
+    (folder / "push.py").write_text(text)
+    (folder / "helper.py").write_text("A = 1\n")
+    return folder / "push.py"
+
+
+def test_a_listed_file_is_asked_about_once_with_its_text_and_its_modules(tmp_path: Path) -> None:
+    file, person = listed(tmp_path), Person(Consent.ALWAYS)
+    cleared = Clearances(ask=person).clear_file(file, "Push")
+    assert isinstance(cleared, RecordedTask)
+    assert str(cleared) == f"{file}:Push" and cleared.approved == read_content(file).texts
+    (question,) = person.asked
+    assert question.listed and question.followed and not question.recorded_text
+    assert [one.name for one in question.files] == [str(file), "helper.py"] and question.files[0].text == TEXT
+    # In a later run too.
+    Clearances(ask=person).clear_file(file)
+    assert len(person.asked) == 1
+    listed(tmp_path, TEXT + "# another\n")
+    Clearances(ask=person).clear_file(file)
+    assert len(person.asked) == 2 and person.asked[1].files[0].since is Since.CHANGED
+
+
+def test_a_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
+    file, person = listed(tmp_path), Person(Consent.NO)
+    clearances = Clearances(ask=person)
+    with pytest.raises(NotCleared, match="is not trusted"):
+        clearances.clear_file(file)
+    person.answer = Consent.ONCE
+    clearances.clear_file(file)
+    clearances.clear_file(file)
+    assert len(person.asked) == 2
+    person.answer = Consent.NO
+    with pytest.raises(NotCleared):
+        Clearances(ask=person).clear_file(file)
+    with pytest.raises(NotCleared):
+        Clearances().clear_file(listed(tmp_path, TEXT + "#\n"))
+
+
+def test_what_a_person_named_or_trusts_as_a_whole_is_not_asked_about(tmp_path: Path) -> None:
+    file, person = listed(tmp_path), Person()
+    assert Clearances(lambda: [file], person).clear_file(file, "Push") == f"{file}:Push"
+    assert Clearances(ask=person, all_trusted=True).clear_file(file) == str(file)
+    assert person.asked == []
+
+
+def test_a_file_that_changes_under_the_question_or_cannot_be_read_is_not_opened(tmp_path: Path) -> None:
+    file = listed(tmp_path)
+
+    def changes(question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
+        file.write_text(TEXT + "import os\n")
+        return Consent.ONCE
+
+    with pytest.raises(NotCleared, match="was changed while you were asked"):
+        Clearances(ask=changes).clear_file(file)
+    file.unlink()
+    with pytest.raises(NotCleared, match="cannot be read"):
+        Clearances(ask=Person(Consent.ONCE)).clear_file(file)

@@ -38,6 +38,52 @@ app = tyro.extras.SubcommandApp()
 # Commands import what they need when they are chosen, so that ``--help`` and a mistyped option answer at once.
 
 
+@app.command
+def start(
+    *,
+    envs: EnvArguments,
+    page: PageArguments,
+    recordings: Path = Path("recordings"),
+    history: str = "256MB",
+    memory_limit: str = "auto",
+    spare: bool = True,
+    trust: bool = False,
+    editor: str = "vscode",
+) -> int:
+    """Choose a task on a page: recent ones, the files of this folder, ManiSkill's own. This is what workbench without a
+    command does, as in workbench --port 8081.
+
+    Args:
+        recordings: folder for recorded episodes.
+        history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
+        memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
+            sets no limit. A process that uses more is ended and replaced.
+        spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
+            seconds more, and about 0.8 GB of memory less).
+        trust: run task files from other folders, and what recordings from elsewhere name or hold, without asking, in
+            this run; nothing is kept of it.
+        editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} and {line};
+            as of open.
+    """
+    from workbench.cli.page import start_in_terminal
+    from workbench.session.process.memory_limit import parse_memory
+    from workbench.session.process.supervisor import WorkerOptions
+    from workbench.ui.server.gated_server import ServerOptions
+    from workbench.ui.widgets.editor import parse_editor
+
+    try:
+        options = envs.options()
+        past = history_bytes(history)
+        worker = WorkerOptions(parse_memory(memory_limit), spare)
+        at = ServerOptions(**vars(page))
+        address = parse_editor(editor)
+    except ValueError as error:
+        return refuse(str(error))
+    # Recordings can be reviewed without it.
+    _lacks_maniskill("start")
+    return start_in_terminal(options, at, worker, recordings, past, trust, address)
+
+
 @app.command(name="open")
 def open_page(
     task: Task,
@@ -368,11 +414,15 @@ def _lacks_maniskill(command: str) -> bool:
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the ``workbench`` command."""
     guard_terminal()
+    given = list(sys.argv[1:] if args is None else args)
+    if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
+        given = ["start", *given]
     try:
         code: Any = app.cli(
             prog="workbench",
-            description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
-            args=args,
+            description="Workbench: write ManiSkill tasks in front of a live, batched view of them. Without a command it "
+            "opens a page to choose a task from.",
+            args=given,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
         )
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds

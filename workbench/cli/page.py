@@ -1,4 +1,4 @@
-"""Runs ``workbench open`` and ``workbench review``: serves a page until a signal ends it."""
+"""Runs ``workbench``, ``workbench open`` and ``workbench review``: serves a page until a signal ends it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import queue
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -15,12 +16,15 @@ from rich.markup import escape
 import workbench
 from workbench.authoring.loading.reference import TaskName, named_file
 from workbench.cli.terminal import out, print_addresses, print_event, print_line, print_text, refuse, warn
+from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
 from workbench.jobs.task import TaskOptions
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reader.reading import start_reading
-from workbench.session.live.session import HISTORY_BYTES, Session
+from workbench.session.live.session import HISTORY_BYTES, KeptWork, Session
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.protocol.messages import Event, Loaded, LoadFailed, Loading
+from workbench.session.tasks.recents import RecentTasks
+from workbench.ui.app.open_task import Choices
 from workbench.ui.app.workplace import Which, Workplace
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import ServerError
@@ -63,15 +67,39 @@ def open_in_terminal(
                 begun += 1
                 if begun == 2:  # the first step has found that the id exists
                     requests.show_address()
-        if isinstance(event, Loaded):
-            # Not before, since the person waits for the task.
-            start_reading()
 
-    session = _session(task, options, recordings, worker, on_event, history_bytes)
-    make_session = _session_maker(recordings, WorkerOptions(worker.memory_limit))
-    base = TaskOptions(rules=options.rules, imports=options.imports)
-    place = Workplace(gated_server, recordings, make_session, base, session, (), trust, warn, editor)
-    _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", requests, session.close)
+    how = _HowToOpen(recordings, worker, history_bytes, RecentTasks())
+    if waits_for_a_file:
+        how.recents.add(task, options)
+    session = how.open(task, options, on_event=on_event)
+    place = _workplace(gated_server, how, _for_others(options), session, trust, editor=editor)
+    _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", requests)
+
+
+def start_in_terminal(
+    options: TaskOptions,
+    at: ServerOptions,
+    worker: WorkerOptions,
+    recordings: Path,
+    history_bytes: int,
+    trust: bool = False,
+    editor: str = "",
+) -> int:
+    """Serve the page to choose a task from; returns (the exit code) only if the server cannot start.
+
+    Args:
+        options: of the tasks that are opened from there.
+        trust: run code without asking, as `open_in_terminal`.
+        editor: as there.
+    """
+    gated_server = _start_server(at, "Workbench")
+    if isinstance(gated_server, int):
+        return gated_server
+    how = _HowToOpen(recordings, worker, history_bytes, RecentTasks())
+    place = _workplace(gated_server, how, options, None, trust, editor=editor)
+    requests = _PageRequests()
+    requests.show_address()
+    _serve(gated_server, place, "start", f"tasks in {Path.cwd()}", requests)
 
 
 def review_in_terminal(
@@ -93,11 +121,11 @@ def review_in_terminal(
     gated_server = _start_server(at, "Recordings")
     if isinstance(gated_server, int):
         return gated_server
-    make_session = _session_maker(folder, worker)
-    place = Workplace(gated_server, folder, make_session, base, None, tasks, trust, warn, editor)
+    how = _HowToOpen(folder, worker, HISTORY_BYTES, RecentTasks())
+    place = _workplace(gated_server, how, base, None, trust, tasks, editor)
     requests = _PageRequests()
     requests.show_address()
-    _serve(gated_server, place, "review", f"recordings in {folder}", requests, lambda: None)
+    _serve(gated_server, place, "review", f"recordings in {folder}", requests)
 
 
 def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
@@ -113,23 +141,82 @@ def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
     return gated_server
 
 
-def _session(
-    task: TaskName,
+@dataclass(frozen=True)
+class _HowToOpen:
+    """How sessions of this run are made."""
+
+    recordings: Path
+    worker: WorkerOptions
+    history_bytes: int
+    recents: RecentTasks
+
+    def open(
+        self,
+        task: TaskName,
+        options: TaskOptions,
+        kept: KeptWork | None = None,
+        on_event: Callable[[Event], None] = print_event,
+    ) -> Session:
+        """A session of a task that a person chose; it is noted among the recent ones once it runs."""
+        noted: list[TaskOptions] = []
+
+        def on_event_and_note(event: Event) -> None:
+            on_event(event)
+            if isinstance(event, Loaded):
+                # Not before, since the person waits for the task.
+                start_reading()
+                made = replace(event.options or options, seed=0)
+                if noted[-1:] != [made]:
+                    noted.append(made)
+                    self.recents.add(str(task), made)
+
+        return self._session(task, options, self.worker, kept, on_event_and_note)
+
+    def open_for_recording(self, task: TaskName, options: TaskOptions) -> Session:
+        """A session for the task of a recording."""
+        return self._session(task, options, WorkerOptions(self.worker.memory_limit), None, print_event)
+
+    def _session(
+        self,
+        task: TaskName,
+        options: TaskOptions,
+        worker: WorkerOptions,
+        kept: KeptWork | None,
+        on_event: Callable[[Event], None],
+    ) -> Session:
+        callbacks = {"on_event": on_event, "on_line": print_line, "on_notice": warn}
+        given = {"history_bytes": self.history_bytes, "worker": worker, "kept": kept}
+        return Session(task, options, recordings=self.recordings, **given, **callbacks)
+
+
+def _for_others(options: TaskOptions) -> TaskOptions:
+    """Options of one task for another: its own keyword arguments are left out."""
+    kwargs = {name: value for name, value in options.env_kwargs.items() if name in HOW_IT_IS_RUN}
+    return replace(options, env_kwargs=kwargs)
+
+
+def _workplace(
+    gated_server: GatedServer,
+    how: _HowToOpen,
     options: TaskOptions,
-    recordings: Path,
-    worker: WorkerOptions,
-    on_event: Callable[[Event], None],
-    history_bytes: int = HISTORY_BYTES,
-) -> Session:
-    callbacks = {"on_event": on_event, "on_line": print_line, "on_notice": warn}
-    return Session(
-        task, options, recordings=recordings, history_bytes=history_bytes, worker=worker, **callbacks
+    session: Session | None,
+    trust: bool,
+    tasks: tuple[Path, ...] = (),
+    editor: str = "",
+) -> Workplace:
+    base = TaskOptions(rules=options.rules, imports=options.imports)
+    return Workplace(
+        gated_server,
+        how.recordings,
+        how.open_for_recording,
+        base,
+        session,
+        tasks,
+        trust,
+        warn,
+        editor,
+        Choices(how.recents, how.open, options),
     )
-
-
-def _session_maker(recordings: Path, worker: WorkerOptions) -> Callable[[TaskName, TaskOptions], Session]:
-    """A function that opens the task of a recording."""
-    return lambda task, options: _session(task, options, recordings, worker, print_event)
 
 
 def _serve(
@@ -138,7 +225,6 @@ def _serve(
     first: Which,
     what: str,
     requests: _PageRequests,
-    close_session: Callable[[], None],
 ) -> NoReturn:
     if gated_server.options.token:
         place.commands += (Command("Renew the token and close every page", requests.renew),)
@@ -150,7 +236,6 @@ def _serve(
     finally:
         out.print("closing")
         place.close()
-        close_session()
         gated_server.close()
     _exit(requests.code)
 

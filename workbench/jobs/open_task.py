@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mani_skill.envs.sapien_env import BaseEnv
+
 from workbench.authoring.loading.load import (
     LoadedTask,
     import_modules,
@@ -37,6 +39,7 @@ from workbench.core.capture.recorded_run import env_kwargs
 from workbench.core.env import actions
 from workbench.core.env.assets import MissingAssets
 from workbench.core.env.cpu_scene import BatchedCpuMixin, ForgottenInit
+from workbench.core.env.keywords import constructor_arguments, describe_keywords
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.maniskill_private import parse_cameras, version_notice
@@ -188,7 +191,7 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
                 backend=options.backend,
                 rules=_rules(loaded, options),
                 on_finding=opening.on_finding,
-                kwargs=options.env_kwargs,
+                kwargs=constructor_arguments(loaded.cls, options.env_kwargs, BaseEnv),
             ),
             asset_ids=loaded.asset_ids,
             default_kwargs=loaded.default_kwargs,
@@ -276,6 +279,7 @@ def describe(
         objects=objects_to_see(env),
         joints=joint_names(env),
         parse_cameras=parse_cameras.__name__,
+        made=describe_keywords(loaded.cls, env, given, loaded.default_kwargs, BaseEnv),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+import shlex
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, CameraKey, Picture
 from workbench.core.cameras.report import ObjectToSee
+from workbench.core.env.keywords import HowMade
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Degree
 from workbench.core.scene.shapes import SceneGeometry
@@ -32,6 +35,43 @@ class TaskOptions:
     """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
     imports: tuple[str, ...] = ()
     """Modules to import before the task, as they may register its id."""
+
+
+def changed_options(before: TaskOptions, after: TaskOptions) -> list[str]:
+    """Names of the options that differ, keyword arguments by their own names; the seed is none of them."""
+    names = [
+        one.name
+        for one in fields(TaskOptions)
+        if one.name not in ("seed", "env_kwargs") and getattr(before, one.name) != getattr(after, one.name)
+    ]
+    absent = object()
+    given = dict.fromkeys((*before.env_kwargs, *after.env_kwargs))
+    differs = (n for n in given if before.env_kwargs.get(n, absent) != after.env_kwargs.get(n, absent))
+    return [*names, *differs]
+
+
+def command_line(reference: str, options: TaskOptions) -> str:
+    """What to type, in any folder, to open a task with these options."""
+    words = ["workbench", "open", reference]
+    usual = TaskOptions()
+    for name in ("num_envs", "backend", "seed", "rules"):
+        if (value := getattr(options, name)) != getattr(usual, name):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    for module in options.imports:
+        words += ["--import", module]
+    for name, value in options.env_kwargs.items():
+        words += ["--env", f"{name}={_argument_text(value)}"]
+    return shlex.join(words)
+
+
+def _argument_text(value: Any) -> str:
+    """The text that ``--env`` reads as this value: JSON, or a text that is none."""
+    if isinstance(value, str):
+        try:
+            json.loads(value)
+        except ValueError:
+            return value
+    return json.dumps(value)
 
 
 @dataclass(frozen=True)
@@ -92,6 +132,8 @@ class TaskDescription:
     """Notices about a task that works, as sentences."""
     parse_cameras: str = "parse_camera_configs"
     """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
+    made: HowMade = HowMade()
+    """How the envs are made: robot, modes and the task's own keyword arguments."""
 
     def camera(self, key: CameraKey) -> CameraInfo | None:
         return next((camera for camera in self.cameras if camera.key == key), None)

@@ -1,4 +1,4 @@
-"""The user's private folder, the folder of the page's files, and the current folder."""
+"""The user's private folders, the folder of the page's files, and the current folder."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import fcntl
 import os
 import stat
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,13 +27,26 @@ def user_folder() -> Path:
     Raises:
         NoUserFolder: this user has no home folder.
     """
+    return _absolute(platformdirs.user_config_path)
+
+
+def state_folder() -> Path:
+    """Path of the folder for what was done last, such as ``~/.local/state/workbench``; it may not exist.
+
+    Raises:
+        NoUserFolder: this user has no home folder.
+    """
+    return _absolute(platformdirs.user_state_path)
+
+
+def _absolute(found: Callable[..., Path]) -> Path:
     try:
-        folder = platformdirs.user_config_path("workbench", appauthor=False)
+        folder = found("workbench", appauthor=False)
     except RuntimeError as error:
         raise NoUserFolder(f"this user has no home folder ({error})") from error
     if not folder.is_absolute():
         # Earlier versions of platformdirs return a path below the current folder, which may be a downloaded one.
-        raise NoUserFolder(f"the configuration folder has no absolute path ({folder})")
+        raise NoUserFolder(f"the user's folder has no absolute path ({folder})")
     return folder
 
 
@@ -42,14 +55,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "workbench"
 
 
-def read_private(name: str) -> bytes | None:
+def read_private(name: str, folder: Path | None = None) -> bytes | None:
     """The content of a file of the folder; None if it does not exist.
+
+    Args:
+        folder: in place of `user_folder`.
 
     Raises:
         NoUserFolder: the folder or the file belongs to another user, or others may write to it.
         OSError: it cannot be read.
     """
-    path = user_folder() / name
+    path = (folder or user_folder()) / name
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -66,13 +82,16 @@ def read_private(name: str) -> bytes | None:
         os.close(descriptor)
 
 
-def write_private(name: str, content: bytes) -> None:
+def write_private(name: str, content: bytes, folder: Path | None = None) -> None:
     """Write a file of the folder, readable by this user alone; makes the folder if it is missing.
+
+    Args:
+        folder: in place of `user_folder`.
 
     Raises:
         OSError: it cannot be written; the file is unchanged.
     """
-    path = _made() / name
+    path = _made(folder) / name
     with written_beside(path, content, 0o600) as temporary:
         os.replace(temporary, path)
 
@@ -99,13 +118,16 @@ def set_aside(name: str) -> Path:
 
 
 @contextmanager
-def locked(name: str) -> Iterator[None]:
+def locked(name: str, folder: Path | None = None) -> Iterator[None]:
     """Hold a lock of this name against other processes and threads.
+
+    Args:
+        folder: in place of `user_folder`.
 
     Raises:
         OSError: the lock file cannot be made.
     """
-    descriptor = os.open(_made() / f"{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    descriptor = os.open(_made(folder) / f"{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -113,8 +135,8 @@ def locked(name: str) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _made() -> Path:
-    folder = user_folder()
+def _made(folder: Path | None = None) -> Path:
+    folder = folder or user_folder()
     folder.parent.mkdir(parents=True, exist_ok=True)
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_private(folder, folder.stat())
@@ -150,6 +172,15 @@ def web_assets_folder() -> Path:
         f"The page's files are missing: neither {package / '_web_assets'} nor {package.parent / 'web_assets'} "
         "holds refused.html. Install workbench again (pip install --force-reinstall), or check out web_assets/."
     )
+
+
+def example_tasks() -> tuple[Path, ...]:
+    """The example tasks: of the wheel, or of a checkout; none where neither is there."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "_tasks", package.parent / "tasks"):
+        if (folder / "push_cube.py").is_file():
+            return tuple(sorted(folder.glob("*.py")))
+    return ()
 
 
 # --- the current folder, which a task may change by os.chdir ----------------------------------------

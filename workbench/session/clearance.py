@@ -1,4 +1,4 @@
-"""Decides whether code that a recording names or holds may run, and asks a person if need be."""
+"""Decides whether code that a recording names or holds, or a listed file, may run, and asks a person if need be."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class TrustQuestion:
     """A question to a person. Texts from recordings are made printable, not escaped."""
 
     task: str
-    """Of the recording that names the code."""
+    """Of the recording that names the code; empty for a listed file."""
     recorded_text: bool
     """The texts are those that the recording holds, not files on disk."""
     files: tuple[CodeFile, ...]
@@ -81,6 +81,8 @@ class TrustQuestion:
     """These texts may run already; only `followed` is new."""
     more: int = 0
     """Number of questions after this one."""
+    listed: bool = False
+    """A person chose the file from a list; no recording names it."""
 
     @property
     def file(self) -> str:
@@ -204,16 +206,12 @@ class Clearances:
         none_of_them = False
         for place, (hash, (code, undecided)) in enumerate(to_ask.items()):
             question = replace(self._question(code, undecided), more=len(to_ask) - place - 1)
-            answer = (
-                Consent.NO if none_of_them or self._ask is None or stopped() else self._ask(question, stopped)
-            )
+            answer = Consent.NO
+            if not none_of_them:
+                answer = self._answer(question, undecided.content, stopped)
             none_of_them = none_of_them or answer is Consent.NONE
             if answer in (Consent.NO, Consent.NONE):
                 refused[hash] = NotCleared(f"{question_text(question)} is not trusted", question)
-            elif answer is Consent.ALWAYS:
-                self._store.trust(undecided.content, code.followed)
-            else:
-                self._store.trust_once(undecided.content, code.followed)
         cleared: list[TaskName | NotCleared] = []
         for one, decision in zip(codes, decisions):
             if not isinstance(decision, _Undecided):
@@ -221,15 +219,45 @@ class Clearances:
             elif decision.content.hash in refused:
                 cleared.append(refused[decision.content.hash])
             elif not one.recorded_text and not _is_unchanged(decision.content):
-                cleared.append(
-                    NotCleared(
-                        f"the code of {_printable(decision.content.main)} was changed while you were asked about it; "
-                        "try it again"
-                    )
-                )
+                cleared.append(_changed(decision.content))
             else:
                 cleared.append(_approved(one, decision.content))
         return cleared
+
+    def clear_file(
+        self, file: Path, class_name: str | None = None, stopped: Callable[[], bool] = lambda: False
+    ) -> TaskName:
+        """What to open for a file that a person chose from a list, to be followed; asks if need be, as `clear`.
+
+        Raises:
+            NotCleared: it may not run.
+        """
+        name = str(file) if class_name is None else f"{file}:{class_name}"
+        if self._all_trusted or _is_named(str(file), self._named()):
+            return name
+        try:
+            content = read_content(file)
+        except CannotRead as error:
+            raise NotCleared(str(error)) from error
+        if not self._store.follows(content):
+            agreed = self._store.trusts(content)
+            before = None if agreed else self._store.trusted_before(content)
+            question = _question(content, before, followed=True, agreed=agreed, listed=True)
+            if self._answer(question, content, stopped) in (Consent.NO, Consent.NONE):
+                raise NotCleared(f"{question_text(question)} is not trusted", question)
+            if not _is_unchanged(content):
+                raise _changed(content)
+        # These very texts, until the next save: the file may change before it is loaded.
+        return RecordedTask(file.name, content.main, class_name, content.texts)
+
+    def _answer(self, question: TrustQuestion, content: TaskContent, stopped: Callable[[], bool]) -> Consent:
+        """Ask, and keep a yes."""
+        answer = Consent.NO if self._ask is None or stopped() else self._ask(question, stopped)
+        if answer is Consent.ALWAYS:
+            self._store.trust(content, question.followed)
+        elif answer is Consent.ONCE:
+            self._store.trust_once(content, question.followed)
+        return answer
 
     def refused_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
         """Why an env may not get the arguments of this recording, or None: those from elsewhere may name no files."""
@@ -277,17 +305,36 @@ class Clearances:
     def _question(self, code: CodeToRun, undecided: _Undecided) -> TrustQuestion:
         content = undecided.content
         before = None if code.recorded_text or undecided.agreed else self._store.trusted_before(content)
-        return TrustQuestion(
-            _printable(code.info.task),
-            code.recorded_text,
-            code_files(content, before),
-            tuple(map(_printable, content.unseen)),
-            content.computed,
-            before is not None,
-            tuple(_printable(name) for name in before or () if name not in content.file_sums),
-            code.followed,
-            undecided.agreed,
-        )
+        question = _question(content, before, followed=code.followed, agreed=undecided.agreed)
+        return replace(question, task=_printable(code.info.task), recorded_text=code.recorded_text)
+
+
+def _question(
+    content: TaskContent,
+    before: Mapping[str, str] | None,
+    *,
+    followed: bool,
+    agreed: bool,
+    listed: bool = False,
+) -> TrustQuestion:
+    return TrustQuestion(
+        task="",
+        recorded_text=False,
+        files=code_files(content, before),
+        unseen=tuple(map(_printable, content.unseen)),
+        computed=content.computed,
+        trusted_before=before is not None,
+        gone=tuple(_printable(name) for name in before or () if name not in content.file_sums),
+        followed=followed,
+        agreed=agreed,
+        listed=listed,
+    )
+
+
+def _changed(content: TaskContent) -> NotCleared:
+    return NotCleared(
+        f"the code of {_printable(content.main)} was changed while you were asked about it; try it again"
+    )
 
 
 def code_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[CodeFile, ...]:

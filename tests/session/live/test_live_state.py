@@ -289,3 +289,60 @@ def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
     assert not state.knows_file(str(task.parent / "gone.py")) and not state.knows_file("/etc/passwd")
     state.change(action_source="policy", policy=f"{outside}:act")
     assert state.knows_file(str(outside)), "its policy"
+
+
+# --- options of the envs -----------------------------------------------------------------------------
+
+
+def test_options_are_in_effect_when_a_load_has_taken_them() -> None:
+    state = running()
+    more = TaskOptions(N + 1, env_kwargs={"size": 2})
+    state.apply_options(more)
+    assert state.load_request(None).options == more and view(state).options == TaskOptions()
+    # The version that ran is brought back as it ran.
+    assert state.load_request({"push.py": ""}).options == TaskOptions()
+    state.loaded(replace(loaded(num_envs=N + 1), options=more), restored=False, stale=False)
+    assert view(state).options == more and state.load_request(None).options == more
+    assert state.tried_options is None
+
+
+def test_a_load_that_was_under_way_before_does_not_count_for_the_new_options() -> None:
+    state = running()
+    more = TaskOptions(N + 1)
+    state.apply_options(more)
+    state.loaded(replace(loaded(), options=TaskOptions()), restored=False, stale=False)
+    assert view(state).options == TaskOptions() and state.load_request(None).options == more
+
+
+def test_options_with_which_the_task_fails_are_dropped_and_said_and_the_file_is_not_to_blame() -> None:
+    state = running()
+    state.take(Loading("building"))
+    state.apply_options(bad := TaskOptions(N, env_kwargs={"robot_uids": "no such"}))
+    state.take(LoadFailed(problem(), kept=True, options=bad))
+    seen = view(state)
+    assert seen.state == "error" and seen.problem is not None and not seen.stale
+    assert seen.options == TaskOptions() and seen.options_refused == bad
+    assert state.load_request(None).options == TaskOptions(), "the next save does not fail for them"
+    state.apply_options(TaskOptions())
+    assert view(state).options_refused is None
+
+
+def test_options_that_kill_the_worker_are_dropped() -> None:
+    state = running()
+    state.apply_options(bad := TaskOptions(4096))
+    state.died(DEATH, while_loading=True, printed="")
+    assert state.load_request(None).options == TaskOptions() and view(state).options_refused == bad
+
+
+def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last() -> None:
+    state = LiveState("push.py", TaskOptions(), 10**8)
+    state.apply_options(other := TaskOptions(1))
+    state.take(LoadFailed(problem(), kept=False, options=other))
+    assert state.load_request(None).options == other and view(state).options == other
+
+
+def test_a_save_that_fails_leaves_the_options_alone() -> None:
+    state = running()
+    state.take(Loading("importing"))
+    state.take(LoadFailed(problem(), kept=True, options=TaskOptions()))
+    assert view(state).stale and view(state).options_refused is None

@@ -160,7 +160,7 @@ def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back
     calm(risky_file)
     session.versions.restart_worker()
     view = died_and_came_back(session, before)
-    assert "ended by hand in evaluate" in view.problem.message
+    assert "stopped by hand in evaluate" in view.problem.message
     assert view.problem.file == str(risky_file) and view.problem.code
 
 

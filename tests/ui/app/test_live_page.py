@@ -193,7 +193,11 @@ def test_inspect_shows_joints_as_soon_as_it_is_opened(opened: Opened) -> None:
     opened.draw()
     view = wait_until(opened.session, lambda view: view.inspection is not None, "the joints")
     opened.draw()
-    assert view.inspection.joints and "panda_joint1" in inspect.html("wb-inspect")
+    assert (
+        view.inspection is not None
+        and view.inspection.joints
+        and "panda_joint1" in inspect.html("wb-inspect")
+    )
 
 
 def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None:

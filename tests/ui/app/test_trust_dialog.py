@@ -136,7 +136,7 @@ def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
     assert "wb-tag" not in main and ">changed<" in helper and ">new<" in new
     assert "Changes since then are marked; gone since: old.py" in said
     said = question_html(replace(PLAIN, trusted_before=True))
-    assert "Which of them has changed since is not known" in said
+    assert "It is not known which of them has changed" in said
 
 
 def test_what_going_live_means_is_said_before() -> None:

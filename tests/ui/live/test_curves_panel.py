@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,16 +19,14 @@ from workbench.ui.live.reward import CurvesPanel
 JOINTS = ("hinge", "slide")
 
 
-def step(number: int, num_envs: int, success: float | None = 0.0, **entries: object) -> StepResult:
+def step(number: int, num_envs: int, success: float | None = 0.0, **entries: Any) -> StepResult:
     evaluate = {} if success is None else {"success": np.full(num_envs, success, bool)}
     result = step_of(np.zeros((num_envs, 1, 7), np.float32), **evaluate, **entries)
     reward = np.arange(num_envs, dtype=np.float32) + number * num_envs
     return replace(result, reward=reward, qpos=np.full((num_envs, 2), number, np.float32))
 
 
-def curves(
-    length: int, num_envs: int, env: int = 0, success: float | None = 0.0, **entries: object
-) -> Curves:
+def curves(length: int, num_envs: int, env: int = 0, success: float | None = 0.0, **entries: Any) -> Curves:
     """The reward of env k at step t is k + t N."""
     steps = StepCurves(num_envs, JOINTS)
     for number in range(1, length + 1):
@@ -39,7 +38,7 @@ def reward(length: int, num_envs: int, env: int) -> list[float]:
     return [env + number * num_envs for number in range(1, length + 1)]
 
 
-def seen(length: int, num_envs: int, env: int = 0, past: int | None = None, **entries: object) -> SessionView:
+def seen(length: int, num_envs: int, env: int = 0, past: int | None = None, **entries: Any) -> SessionView:
     """A view after so many steps; `past` is the step that is shown, if not the last."""
     view = running(num_envs, curves=curves(length, num_envs, env, **entries), selected_env=env)
     shown = step(length if past is None else past, num_envs)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -119,7 +120,8 @@ def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(
     view.build(geometry, layout, poses, looks=Looks(dark=False))
     new = [handle for handle in view.handles if handle.name not in before]
     assert len(new) == 1 and "ground" in new[0].name and len(view.handles) == len(before)
-    (floor,) = trimesh.load(io.BytesIO(new[0].glb_data), file_type="glb").geometry.values()
+    scene: Any = trimesh.load(io.BytesIO(new[0].glb_data), file_type="glb", force="scene")
+    (floor,) = scene.geometry.values()
     assert floor.visual.material.baseColorFactor[:3].min() > 200
     view.build(geometry, layout, poses)
     assert {handle.glb_data for handle in view.handles} == set(before.values())

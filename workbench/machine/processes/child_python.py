@@ -8,6 +8,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+LOWEST = 19
+"""Niceness of a process that gets only what all others leave over."""
+
 
 def python_command(*arguments: str) -> list[str]:
     """Command line of a child of this interpreter: ``python_command("-m", "workbench.session.worker.start")``.

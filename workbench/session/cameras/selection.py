@@ -54,6 +54,13 @@ class Placements:
         self._done: list[Step] = []
         self._undone: list[Step] = []
 
+    def copy(self) -> Placements:
+        """The same placements and steps, independent of these."""
+        other = Placements()
+        other.in_file, other.placed = dict(self.in_file), dict(self.placed)
+        other._done, other._undone = list(self._done), list(self._undone)
+        return other
+
     def now(self, key: CameraKey) -> CameraSettings | None:
         """A camera's present settings; None if it is missing, or settings cannot describe its config."""
         return self.placed.get(key, self.in_file.get(key))
@@ -219,18 +226,42 @@ def usual_distance(pose: ArrayLike) -> float:
     return distance if NEAREST_TARGET <= distance <= FARTHEST_TARGET else USUAL
 
 
-class StudioCameras:
-    """The cameras, placements and selection that all parts of the studio share. Callers hold `lock`."""
+@dataclass(frozen=True)
+class KeptPlacements:
+    """Placements with their steps of undo, and the selected camera, for a later session of the same task."""
 
-    def __init__(self) -> None:
+    placements: Placements
+    selected: CameraKey | None
+
+
+class StudioCameras:
+    """The cameras, placements and selection that all parts of the studio share. Callers hold `lock`.
+
+    Args:
+        kept: of an earlier session of the task.
+    """
+
+    def __init__(self, kept: KeptPlacements | None = None) -> None:
         self.lock = threading.Lock()
         self.task: TaskDescription | None = None
         self.selected: CameraKey | None = None
-        self.placements = Placements()
+        self.placements = Placements() if kept is None else kept.placements.copy()
+        self._select_when_loaded = None if kept is None else kept.selected
         self.problem = ""
         """Message about the last failure."""
         self.drawn: tuple[StepResult | None, int] = (None, 0)
         """The step and the selected env that were shown last."""
+
+    def kept(self) -> KeptPlacements:
+        """For a later session of this task."""
+        return KeptPlacements(self.placements.copy(), self.selected or self._select_when_loaded)
+
+    def select_again(self) -> None:
+        """After a load: select the camera that was selected in the earlier session; none that is gone."""
+        before, self._select_when_loaded = self._select_when_loaded, None
+        self.selected = self.selected or before
+        if self.selected is not None and self.info(self.selected) is None:
+            self.selected = None
 
     def info(self, key: CameraKey) -> CameraInfo | None:
         return None if self.task is None else self.task.camera(key)

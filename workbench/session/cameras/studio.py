@@ -16,7 +16,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.reports import CameraReports
-from workbench.session.cameras.selection import Step, StudioCameras
+from workbench.session.cameras.selection import KeptPlacements, Step, StudioCameras
 from workbench.session.cameras.view import StudioView
 from workbench.session.history.history import ShownPast
 from workbench.session.process.askers import Asker, Background
@@ -49,6 +49,7 @@ class CameraStudio:
         past: ShownPast,
         load: Callable[[], Load | None],
         open_file: Callable[[Path, str], None],
+        kept: KeptPlacements | None = None,
     ) -> None:
         """
         Args:
@@ -58,10 +59,11 @@ class CameraStudio:
             past: gives the shown moment.
             load: returns the running version for another worker; None while there is none.
             open_file: opens a class of another file.
+            kept: placements of an earlier session of the task.
         """
         self._send, self._on_change = send, on_change
         self._shown = past.shown_moment
-        self._cameras = StudioCameras()
+        self._cameras = StudioCameras(kept)
         self._lock = self._cameras.lock
         self._asker = asker
         self.file = FileEdits(self._cameras, self._notify, open_file, asker, load, self._shown)
@@ -284,8 +286,7 @@ class CameraStudio:
                     f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
                     "it; Undo restores your placement."
                 )
-            if self._cameras.selected is not None and self._cameras.info(self._cameras.selected) is None:
-                self._cameras.selected = None
+            self._cameras.select_again()
             self._serial += 1
             if level not in ("same", "cameras"):
                 self.reports.mark_outdated()
@@ -313,6 +314,11 @@ class CameraStudio:
             return tuple(
                 PlaceCamera(key, settings) for key, settings in self._cameras.placements.placed.items()
             )
+
+    def kept_placements(self) -> KeptPlacements:
+        """For a later session of this task."""
+        with self._lock:
+            return self._cameras.kept()
 
     def placed(self, event: Placed, task: TaskDescription | None) -> None:
         """The worker's answer to a placement.

@@ -22,7 +22,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.policy import NoPolicy, find_policy
-from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions, changed_options
 from workbench.session.history.env_table import EnvTable
 from workbench.session.live.timeline import Timeline
 from workbench.session.live.view import PastLoad, SessionView
@@ -73,10 +73,12 @@ class LiveState:
     """The next step is the first of a new scene: it does not prove that the task runs."""
     clients: int = 0
     """Pages that are open."""
+    tried_options: TaskOptions | None = None
+    """Options that a person applied and that no load has taken or refused yet."""
     wants_play: bool = False
 
     def __post_init__(self) -> None:
-        self.set(seed=self.options.seed)
+        self.set(seed=self.options.seed, options=self.options)
         self.own_file = named_file(self.reference)
         """The named file, even if it never loaded; None for an env id."""
         self.own_folder = followed_folder(self.reference)
@@ -98,6 +100,7 @@ class LiveState:
             stale: the files have changed since.
         """
         task, report, before = event.task, event.reload, self.now.task
+        self._take_options(event.options)
         kept = scene_kept(event)
         if kept and before is not None:
             # The same object, so that the page sees that it need not build the scene again.
@@ -170,13 +173,14 @@ class LiveState:
         elif isinstance(event, LoadFailed):
             self.set_problem(event.problem)
             self.problem_at_run = now.state != "loading"
+            of_options = self._refuse_options(event.options)
             if not self.problem_at_run:
                 self._remember(PastLoad(time.time(), None, event.problem.message, problem=event.problem))
             self.set(
                 state="error",
                 activity="",
                 choices=event.classes or now.choices,
-                stale=now.stale or not self.problem_at_run,
+                stale=now.stale or not (self.problem_at_run or of_options),
             )
         elif isinstance(event, RulesBroken):
             self.set(rules=event if event.rows else None, rules_serial=now.rules_serial + 1)
@@ -229,6 +233,8 @@ class LiveState:
         Returns:
             The problem to show; None if the end was requested.
         """
+        if while_loading:
+            self._refuse_options(self.tried_options)
         problem = None
         if not death.asked or death.stack:
             task = self.now.task
@@ -264,6 +270,34 @@ class LiveState:
     def new_pictures(self, **changes: Any) -> None:
         """The shown pictures change."""
         self.set(pictures_serial=self.now.pictures_serial + 1, **changes)
+
+    # --- options of the envs -----------------------------------------------------------------------
+
+    def apply_options(self, options: TaskOptions) -> None:
+        """Make the envs with these at the next load."""
+        self.tried_options = options if changed_options(self.options, options) else None
+        self.set(options_refused=None)
+
+    def _take_options(self, loaded: TaskOptions | None) -> None:
+        if loaded is None:
+            return
+        self.options = replace(loaded, seed=self.options.seed)
+        self.set(options=self.options)
+        if self.tried_options is not None and not changed_options(self.tried_options, loaded):
+            self.tried_options = None
+
+    def _refuse_options(self, failed: TaskOptions | None) -> bool:
+        """Drop options with which the task failed, so that the next save does not fail for them. False if it was not them."""
+        tried = self.tried_options
+        if tried is None or failed is None or changed_options(tried, failed):
+            return False
+        self.tried_options = None
+        # Without an env there is nothing to keep: the next load tries them again.
+        if self.now.task is None:
+            self.options = replace(tried, seed=self.options.seed)
+            self.set(options=self.options)
+        self.set(options_refused=tried)
+        return True
 
     # --- requests of the page ----------------------------------------------------------------------
 
@@ -306,7 +340,8 @@ class LiveState:
         self, source: dict[str, str] | None, snapshot: bytes | None = None, level: LoadLevel = "auto"
     ) -> Load:
         """See `Load`."""
-        options = replace(self.options, seed=self.now.seed)
+        tried = self.tried_options if source is None else None
+        options = replace(tried or self.options, seed=self.now.seed)
         # The version that ran is brought back even if another class of the file was chosen since.
         reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)

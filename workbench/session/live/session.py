@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -16,6 +16,7 @@ from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import PolicyFile
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.processes.watched_thread import listen, stop_listening
+from workbench.session.cameras.selection import KeptPlacements
 from workbench.session.cameras.studio import CameraStudio
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.live_state import LiveState, SharedState, scene_kept
@@ -39,6 +40,7 @@ from workbench.session.protocol.messages import (
     Request,
     Reset,
     SetCapture,
+    Settings,
     SingleStep,
     WarmUp,
 )
@@ -49,6 +51,16 @@ from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_a
 
 HISTORY_BYTES = 256 * 1024**2
 """Default memory limit of the history."""
+
+
+@dataclass(frozen=True)
+class KeptWork:
+    """What a person did in a session, for a later session of the same task."""
+
+    options: TaskOptions
+    settings: Settings
+    seed: int
+    cameras: KeptPlacements
 
 
 class Session:
@@ -67,6 +79,7 @@ class Session:
         recordings: Path,
         history_bytes: int = HISTORY_BYTES,
         worker: WorkerOptions | None = None,
+        kept: KeptWork | None = None,
         make_worker: Callable[..., Supervisor] = Supervisor,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[PrintedLine], None] = lambda line: None,
@@ -78,14 +91,21 @@ class Session:
             recordings: folder for recorded episodes; made when the first is written.
             history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
+            kept: of an earlier session of this task; its options are used in place of `options`.
             make_worker: makes the supervisor; tests without a worker process give another.
             on_event: called with every event of the worker, and with its death as `LoadFailed`, on the session's thread.
             on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
             on_notice: called, on any thread, with a message for the terminal.
         """
+        self.reference = task
+        """The task as it was opened."""
         self._on_event = on_event
         self._print = on_line
+        if kept is not None:
+            options = replace(kept.options, seed=kept.seed)
         self._state = LiveState(task, options, history_bytes)
+        if kept is not None:
+            self._state.set(settings=replace(kept.settings, sliders=(), cameras=()))
         self._shared = SharedState(self._state)
         self._lock, self._notify = self._shared.lock, self._shared.notify
         self._sending_settings = threading.Lock()
@@ -127,6 +147,7 @@ class Session:
             self.past,
             self.versions.running_load,
             self.versions.open_file,
+            None if kept is None else kept.cameras,
         )
         """The camera studio."""
         listen(self._log)
@@ -155,6 +176,12 @@ class Session:
     def wait(self, seen: int, timeout: float) -> int:
         """Block until the counter of changes differs from `seen`; returns the counter."""
         return self._shared.wait(seen, timeout)
+
+    def kept_work(self) -> KeptWork:
+        """For a later session of this task."""
+        with self._lock:
+            options, now = self._state.options, self._state.now
+        return KeptWork(options, now.settings, now.seed, self.studio.kept_placements())
 
     @property
     def task_folder(self) -> Path | None:

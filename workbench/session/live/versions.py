@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
-from workbench.jobs.task import TaskDescription
+from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.live.live_state import SharedState
 from workbench.session.process.supervisor import Death
 from workbench.session.protocol.messages import Load, LoadFailed, LoadLevel, Play, Request
@@ -164,6 +164,12 @@ class Versions:
             chosen = self._shared.state.choose_class(name)
         if chosen:
             self.reload()
+
+    def apply_options(self, options: TaskOptions) -> None:
+        """Make the envs with other options. If the task fails with them, the present envs and options stay."""
+        with self._shared.lock:
+            self._shared.state.apply_options(options)
+        self.reload()
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Open a task class of another file instead, and watch that file."""

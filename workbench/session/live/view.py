@@ -9,7 +9,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import TaskDescription
+from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioView
 from workbench.session.history.curves import Curves
 from workbench.session.live.timeline import TimelineView
@@ -97,6 +97,10 @@ class SessionView:
     curves: Curves | None = None
     settings: Settings = Settings()
     """Chosen on the page."""
+    options: TaskOptions = TaskOptions()
+    """How the envs are made; the seed is `seed`."""
+    options_refused: TaskOptions | None = None
+    """Options that were applied last and with which the task failed."""
     seed: int = 0
     playing: bool = False
     steps_per_second: float = 0.0

@@ -287,6 +287,8 @@ class Loaded:
     reload: ReloadReport | None = None
     """None for the first version of a task. With ``same``, ``patched`` and ``cameras`` the scene, its episodes and
     `first`'s poses are unchanged, and the geometry's visuals, which are large, are left out."""
+    options: TaskOptions | None = None
+    """Those of the `Load`."""
 
 
 @dataclass(frozen=True)
@@ -298,6 +300,8 @@ class LoadFailed:
     """The previous version still runs."""
     classes: tuple[str, ...] = ()
     """The tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
+    options: TaskOptions | None = None
+    """Those of the `Load` that failed; None if the problem came later."""
 
 
 @dataclass(frozen=True)

@@ -162,7 +162,34 @@ class MakeScene(Question[SceneMade]):
     """As `TaskOptions.imports`."""
 
 
+# --- the list of tasks --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ListTasks(Question[tuple[str, ...]]):
+    """The ids that ManiSkill registers."""
+
+
+@dataclass(frozen=True)
+class TaskPicture:
+    """A picture of a task, or why there is none."""
+
+    pixels: NDArray[np.uint8] | None = None
+    """(H, W, 3)"""
+    why_not: str = ""
+    needs_download: bool = False
+    """The task or its robot lacks files that ManiSkill can download."""
+
+
+@dataclass(frozen=True)
+class DrawTask(Question[TaskPicture]):
+    """A picture of a registered task after a reset, as its human camera sees it, or else its first sensor."""
+
+    env_id: str
+
+
 QUESTIONS = (
-    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), RescoreMoments, CaptureMoment, Rescore, MakeScene
+    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), RescoreMoments, CaptureMoment, Rescore, MakeScene,
+    ListTasks, DrawTask,
 )  # fmt: skip
 """All types that a `Call` may hold."""

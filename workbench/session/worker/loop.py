@@ -63,6 +63,8 @@ from workbench.session.protocol.messages import (
 from workbench.session.protocol.questions import (
     CameraQuestion,
     CaptureMoment,
+    DrawTask,
+    ListTasks,
     MakeScene,
     RescoreMoments,
     RunCameras,
@@ -76,7 +78,7 @@ from workbench.session.worker.go_back import (
     rescore_moments,
 )
 from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
-from workbench.session.worker.make_scene import SceneEnv
+from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
 from workbench.session.worker.pacing import Pacer, Rate, throttled
 from workbench.session.worker.reload import Running, load_version
 from workbench.session.worker.step_events import StepEvents
@@ -190,6 +192,10 @@ class Worker:
             return loaded[0]
         if isinstance(question, MakeScene):
             return self._scene.scene(question, report)
+        if isinstance(question, ListTasks):
+            return registered_ids()
+        if isinstance(question, DrawTask):
+            return draw_task(question.env_id)
         opened = self._task.opened
         if opened is None:
             raise CannotAnswer("no task is loaded")
@@ -225,7 +231,8 @@ class Worker:
             self._load_version(request, self._line.send)
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
-            self._line.send(LoadFailed(error.problem, self._task.opened is not None, error.classes))
+            kept = self._task.opened is not None
+            self._line.send(LoadFailed(error.problem, kept, error.classes, request.options))
 
     def _load_version(self, request: Load, send: Callable[[Loaded], None]) -> None:
         self._cameras.settle()
@@ -267,7 +274,7 @@ class Worker:
             # The server has the meshes: 9 MB for a Panda would add 0.2 s to a reload.
             unchanged = replace(opened.description.geometry, visuals=())
             description = replace(opened.description, geometry=unchanged)
-            send(Loaded(description, opened.first, opened.milliseconds, report))
+            send(Loaded(description, opened.first, opened.milliseconds, report, request.options))
             return
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         if report is None or not report.carried:
@@ -278,7 +285,7 @@ class Worker:
         self._chooser.sliders = ()
         self._cameras.update_watched()
         self._steps.new_scene()
-        send(Loaded(opened.description, opened.first, opened.milliseconds, report))
+        send(Loaded(opened.description, opened.first, opened.milliseconds, report, request.options))
         # The history begins with this reset.
         resumed = report is not None and report.level == "restarted" and bool(report.carried)
         mask = np.ones(opened.env.num_envs, bool)
@@ -504,6 +511,8 @@ _DOING: dict[type, Doing] = {
     EnterRecording: "resetting",
     ReadPolicyAgain: "importing the policy",
     WarmUp: "warming up",
+    ListTasks: "starting",
+    DrawTask: "drawing",
     ListenForDebugger: "starting",
 }
 """Requests and questions that may run the author's code or take long."""

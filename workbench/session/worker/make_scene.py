@@ -1,4 +1,4 @@
-"""Makes the 3-D scenes of recordings that hold none, in a worker; see `recorded_scene`."""
+"""Makes the 3-D scenes of recordings that hold none, and pictures of registered tasks, in a worker without a task."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workbench.session.protocol.messages import CannotAnswer
-from workbench.session.protocol.questions import MakeScene, SceneMade
+from workbench.session.protocol.questions import MakeScene, SceneMade, TaskPicture
 from workbench.session.worker.pacing import throttled
 
 if TYPE_CHECKING:
@@ -120,6 +120,46 @@ def scene_of(env: TaskEnv, request: MakeScene, on_progress: Callable[[int, int, 
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
         poses.append(read_poses(env.env)[0])
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))
+
+
+def registered_ids() -> tuple[str, ...]:
+    """The ids that ManiSkill registers when it is imported."""
+    from workbench.authoring.loading.registry import environment_ids
+
+    return tuple(environment_ids())
+
+
+def draw_task(env_id: str) -> TaskPicture:
+    """The picture of a registered task after a reset."""
+    from workbench.authoring.loading.load import load_task
+    from workbench.authoring.loading.reference import RecordedTask
+    from workbench.authoring.problem import is_ctrl_c
+    from workbench.core.cameras.render import list_cameras, take_pictures
+    from workbench.core.env.assets import MissingAssets
+    from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+
+    env: TaskEnv | None = None
+    try:
+        loaded = load_task(RecordedTask(env_id))  # never a path
+        options = EnvOptions(num_envs=1, backend="cpu", rules="off", kwargs={"obs_mode": "none"})
+        assets, kwargs = loaded.asset_ids, loaded.default_kwargs
+        env = TaskEnv(make_env(loaded.cls, options, asset_ids=assets, default_kwargs=kwargs))
+        env.reset(seed=0)
+        cameras = sorted(list_cameras(env.env), key=lambda camera: camera.kind != "human")
+        seen = [camera for camera in cameras if "rgb" in camera.modalities]
+        if not seen:
+            return TaskPicture(why_not="It has no camera, or nothing here can render.")
+        (picture,) = take_pictures(env.env, 0, [(seen[0].name, seen[0].kind, ("rgb",))])
+        return TaskPicture(picture.rgb, "" if picture.rgb is not None else "Its camera gives no colours.")
+    except MissingAssets as error:
+        return TaskPicture(why_not=" ".join(str(error).split()), needs_download=True)
+    except BaseException as error:  # a constructor may end the program (SystemExit)
+        if is_ctrl_c(error):
+            raise
+        return TaskPicture(why_not=f"{type(error).__name__}: {_line(error)}")
+    finally:
+        if env is not None:
+            env.close()
 
 
 def _line(error: BaseException) -> str:

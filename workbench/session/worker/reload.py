@@ -39,6 +39,7 @@ from workbench.jobs.open_task import (
     returns_check,
     with_advice,
 )
+from workbench.jobs.task import changed_options
 from workbench.session.protocol.messages import Load, ReloadReport
 
 
@@ -161,8 +162,8 @@ def _what_changed(
         return Change("rebuilt", f"{loaded.chosen} is a different task from {before.chosen}")
     if before.env_id != loaded.env_id:
         return Change("rebuilt", _registration_text(before, loaded))
-    if replace(running.request.options, seed=0) != replace(request.options, seed=0):
-        return Change("rebuilt", "the options changed")
+    if changed := changed_options(running.request.options, request.options):
+        return Change("rebuilt", f"{' and '.join(changed)} changed")
     files = {*before.source, *loaded.source}
     inherited = inherited_names(loaded.cls, files)
     texts = {**_earlier_modules(before, request), **loaded.source}
@@ -321,6 +322,8 @@ def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snaps
         return pickle.loads(request.snapshot)
     if running is None or running.opened.loaded.chosen != loaded.chosen:
         return None
+    if changed_options(running.request.options, request.options):
+        return None  # made in another way, envs begin in another way
     return running.opened.env.snapshot()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import os
 import signal
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from workbench.machine.maniskill_installed import lines_if_lacking
-from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.processes.child_python import LOWEST, quick_imports
 from workbench.machine.processes.family import begin_family
 from workbench.machine.versions import untested_text
 
@@ -28,6 +29,10 @@ def main() -> None:
     begin_family(server)
     if niceness:
         os.nice(niceness)
+    if niceness >= LOWEST:
+        # Only what no other process wants. Some containers forbid it.
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     # A server that a script started in the background inherits an ignored SIGINT, and so would we.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _let_kernel_end_us_first()

@@ -1,1 +1,1 @@
-"""The live page, the review page, and switching between them."""
+"""The start page, the live page, the review page, and switching between them."""

@@ -105,7 +105,6 @@ class GoLive:
         base: TaskOptions,
     ) -> None:
         self._place, self._make, self._clearances, self._base = place, make_session, clearances, base
-        self._first = place.session
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
@@ -151,7 +150,7 @@ class GoLive:
                 task = session.view().task
                 if task is None or not why_not_enter(task, info):
                     return session
-            known = self._first if self._first is not session else None
+            known = self._place.home if self._place.home is not session else None
             task = None if known is None else known.view().task
             return known if task is not None and not why_not_enter(task, info) else None
 
@@ -203,15 +202,22 @@ class GoLive:
             self._way = None
 
     def can_go_home(self) -> bool:
-        """Whether the live session is not the one that was opened first."""
-        return self._first is not None and self._place.session is not self._first
+        """Whether the live session is one that was opened here."""
+        home = self._place.home
+        return home is not None and self._place.session is not home
 
     def go_home(self) -> None:
-        """Return to the session that was opened first; the other ends."""
-        if self._first is None:
+        """Return to the session that a person opened; the other ends."""
+        if self._place.home is None:
             return
-        self._place.session = self._first
+        self._place.session = self._place.home
         self._place.pages.show("live")
+        with self._lock:
+            self._let_go()
+
+    def let_go(self) -> None:
+        """Give up a transition, and end a session that was opened here: a person opens another task."""
+        self._give_up()
         with self._lock:
             self._let_go()
 
@@ -230,8 +236,8 @@ class GoLive:
         return NEW_ENVS if self.everywhere else 1
 
     def _open(self, reference: TaskName, options: TaskOptions, folder: Path | None) -> Session:
-        if self._first is not None:
-            self._first.pause()
+        if self._place.home is not None:
+            self._place.home.pause()
         session = self._make(reference, options)
         self._let_go()
         self._own = session, folder

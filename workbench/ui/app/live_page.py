@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable
 from functools import partial
@@ -29,6 +30,8 @@ from workbench.ui.live.version_panel import AS_NEEDED, VersionPanel
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
+from workbench.ui.tasks.env_options import EnvOptionsPanel
+from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
 from workbench.ui.widgets.editor import editor_link
 from workbench.ui.widgets.hotkeys import Command, add_hints, register
 from workbench.ui.widgets.parts import Clock, PagePart, Parts
@@ -55,6 +58,7 @@ class Page:
         commands: Further ones for the palette.
         clock: Of all parts of the page.
         editor: Address of a line in the author's editor, as `parse_editor` gives it.
+        chooser: Opens another task; None for a page that keeps its own.
     """
 
     def __init__(
@@ -67,6 +71,7 @@ class Page:
         commands: tuple[Command, ...] = (),
         clock: Clock = time.monotonic,
         editor: str = "",
+        chooser: Chooser | None = None,
     ) -> None:
         self._server = server
         self._session = session
@@ -89,13 +94,20 @@ class Page:
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
         )
         self._rules = RulesMark(server, self._link)
+        self._opening = None if chooser is None else OpenDialog(server, chooser, clock=clock)
+        if self._opening is not None:
+            self._opening.add_button()
+        # For `tab_stays.js`: not the path itself, which may be long.
+        which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
+        server.gui.add_html(render("which", which=which))
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
         banner = Banner(server, session.versions.reload, session.versions.restart_worker, self._link)
         busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
-        self._parts = Parts((status, self._rules, *in_tabs, *floating), clock)
+        opening = () if self._opening is None else (self._opening,)
+        self._parts = Parts((status, self._rules, *in_tabs, *floating, *opening), clock)
 
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
@@ -116,6 +128,7 @@ class Page:
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server, dark)
             version = VersionPanel(server, session, self._link)
+            options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(
                 server,
@@ -140,7 +153,7 @@ class Page:
             review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
-        on_run = self._run, self._view_panel, version
+        on_run = self._run, self._view_panel, version, options
         return run_tab, [*on_run, self._studio, *reward, self._rescored, self._inspect, self._record, log]
 
     def _add_table_of_envs(self) -> None:
@@ -275,7 +288,11 @@ class Page:
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
         rescored = self._rescored
+        opening = (
+            [] if self._opening is None else [Command(OPEN, self._opening.open, "O", "cmd/ctrl", (OPEN,))]
+        )
         return [
+            *opening,
             Command("Review recordings", self._on_review, "V", buttons=("Review recordings",)),
             Command("Play or pause", run.toggle_play, "space", buttons=("Play", "Pause")),
             Command("One step", session.step, "S", buttons=(STEP,)),

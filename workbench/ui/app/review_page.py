@@ -34,6 +34,7 @@ from workbench.ui.review.panel import GO_LIVE, ReviewPanel
 from workbench.ui.review.rescore import RescorePanel
 from workbench.ui.review.scene import ReviewIn3D, shown_together
 from workbench.ui.scene.viewpoint import ViewPanel
+from workbench.ui.tasks.task_list import OPEN, OpenDialog
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.hotkeys import Command, register
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
@@ -86,11 +87,16 @@ class ReviewPage:
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Recordings")
         self._status = server.gui.add_html("")
+        self._opening = OpenDialog(
+            server, place.open_task, lambda asking: self._library.leave_keys(asking), clock
+        )
+        self._opening.add_button()
+        server.gui.add_html(render("which", which="review"))
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review, clock)
         self._in_3d = ReviewIn3D(server, review, place.stage)
-        self._parts = Parts((self._panel, self._timeline, *in_tabs), clock)
+        self._parts = Parts((self._panel, self._timeline, *in_tabs, self._opening), clock)
         commands = [*self._commands(), *place.commands, *self._library.commands()]
         register(server, commands)
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
@@ -330,6 +336,7 @@ class ReviewPage:
     def _commands(self) -> Sequence[Command]:
         review, timeline = self._review, self._timeline
         commands = [
+            Command(OPEN, self._opening.open, "O", "cmd/ctrl", (OPEN,)),
             Command("Play or pause", review.toggle_play, "space", buttons=("Play", "Pause", PLAY, PAUSE)),
             *timeline.commands(),
             Command("Go to the first moment", review.to_first, "home", buttons=(FIRST,)),

@@ -1,4 +1,4 @@
-"""Owns the two pages and what they share: recordings, dialogs, rescoring, downloads and the live session."""
+"""Owns the three pages and what they share: the list of tasks, recordings, dialogs, rescoring and the live session."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import psutil
 import viser
 
 from workbench.jobs.task import TaskOptions
@@ -20,14 +21,20 @@ from workbench.session.live.session import Session
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.recorded_scene import SceneProcess
 from workbench.session.review.review import Review
+from workbench.session.tasks.catalogue import Catalogue
+from workbench.session.tasks.recents import RecentTasks
+from workbench.session.tasks.registered import RegisteredTasks
 from workbench.ui.app import help_pages
 from workbench.ui.app.go_live import GoLive, MakeSession
+from workbench.ui.app.open_task import Choices, OpenTask
 from workbench.ui.app.review_page import ReviewPage
+from workbench.ui.app.start_page import StartPage
 from workbench.ui.app.trust_dialog import TrustDialog
 from workbench.ui.review.rescore import RescoreChoices
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.panel import Sharing
+from workbench.ui.tasks.task_list import PICTURES, picture_route
 from workbench.ui.widgets.hotkeys import Command
 
 if TYPE_CHECKING:
@@ -35,7 +42,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Which = Literal["live", "review"]
+ENOUGH_MEMORY = 4 << 30
+"""Bytes that must be free for pictures of tasks to be drawn beside an open one."""
+
+Which = Literal["start", "live", "review"]
 HELP = Command("Help", lambda: None)
 """The browser itself opens the page (``web_assets/help.js``)."""
 
@@ -49,7 +59,7 @@ class Shelf:
 
 
 class Workplace:
-    """Both pages on one server, and what outlives them. Used by ``workbench open`` and ``workbench review``.
+    """All pages on one server, and what outlives them. Used by ``workbench``, ``open`` and ``review``.
 
     Args:
         gated_server: The server of the pages.
@@ -61,6 +71,7 @@ class Workplace:
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
         editor: Address of a line in the author's editor, as `parse_editor` gives it.
+        choices: What the list of tasks offers, and how a chosen one is opened; None for no recent ones and `make_session`.
     """
 
     def __init__(
@@ -74,6 +85,7 @@ class Workplace:
         trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
         editor: str = "",
+        choices: Choices | None = None,
     ) -> None:
         self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
         self._imports, self._on_notice, self._editor = base.imports, on_notice, editor
@@ -84,6 +96,9 @@ class Workplace:
         """In the palette of both pages; set before the first page is shown."""
         self.session = session
         """Shown by the live page when it is next built."""
+        self.home = session
+        """The session that a person opened, by command or from the list. `session` is another one while a recording of
+        another task is continued."""
         self.newest_opened = False
         """The review has begun with the newest recording; it does so once."""
         self.dialog = TrustDialog(self.server)
@@ -94,6 +109,13 @@ class Workplace:
         gated_server.add_route(help_pages.ADDRESS, help_pages.reply, help_pages.HEADERS)
         self.stage = Stage(self.server)
         self.pages = Pages(self.server, self.stage, self._page)
+        if choices is None:
+            open_session = lambda task, options, kept: make_session(task, options)  # noqa: E731
+            choices = Choices(RecentTasks(), open_session, base)
+        registered = RegisteredTasks(self.is_idle)
+        catalogue = Catalogue(Path.cwd(), recordings, choices.recents, registered, choices.options)
+        gated_server.add_route(PICTURES, picture_route(catalogue), {"Cache-Control": "private, max-age=3600"})
+        self.open_task = OpenTask(self, choices.open_session, catalogue, clearances)
 
     @property
     def shelf(self) -> Shelf:
@@ -132,9 +154,19 @@ class Workplace:
         live = () if task is None or task.file is None else (Path(task.file),)
         return tuple(file.absolute() for file in (*live, *self._tasks))
 
+    def is_idle(self) -> bool:
+        """Whether the machine may be used for something else than an open task."""
+        session = self.session
+        if session is None:
+            return True
+        view = session.view()
+        free = psutil.virtual_memory().available
+        return view.state in ("paused", "error", "stopped") and view.busy is None and free > ENOUGH_MEMORY
+
     def close(self) -> None:
-        """Stop the pages and their readers. The caller closes the first session and the server."""
+        """Stop the pages and their readers, and close the open session. The caller closes the server."""
         self.pages.stop()
+        self.open_task.close()
         with self._lock:
             if self._shelf is not None:
                 if self._recovering is not None:
@@ -143,8 +175,12 @@ class Workplace:
                 self._shelf.library.close()
         for part in (self.sharing, self.dialog, self.rescorer.rescoring, self.go_live):
             part.close()
+        if self.home is not None:
+            self.home.close()
 
-    def _page(self, which: Which, dark: bool) -> Page | ReviewPage:
+    def _page(self, which: Which, dark: bool) -> Page | ReviewPage | StartPage:
+        if which == "start":
+            return StartPage(self, dark)
         if which == "review":
             self.shelf.library.request_scan()
             return ReviewPage(self, dark)
@@ -160,14 +196,15 @@ class Workplace:
             self.stage,
             self.commands,
             editor=self._editor,
+            chooser=self.open_task,
         )
 
 
-# --- Which page is on the server: live or review ------------------------------------------------
+# --- Which page is on the server: start, live or review -----------------------------------------
 
 
 class Pages:
-    """Replaces one page by the other on the same server.
+    """Replaces one page by another on the same server.
 
     viser has one page a server, so a page is removed whole and the other is built in its place; every open browser
     follows. The session and the review live on meanwhile, the bodies in the 3-D view stay (`Stage`), and nothing is
@@ -181,13 +218,18 @@ class Pages:
     """
 
     def __init__(
-        self, server: viser.ViserServer, stage: Stage, make: Callable[[Which, bool], Page | ReviewPage]
+        self,
+        server: viser.ViserServer,
+        stage: Stage,
+        make: Callable[[Which, bool], Page | ReviewPage | StartPage],
     ) -> None:
         self._server, self._stage, self._make = server, stage, make
         self._wake = threading.Condition()
         self._wish: Which | None = None
         self._shown: Which | None = None
-        self._page: Page | ReviewPage | None = None
+        self._anew = False
+        self._page: Page | ReviewPage | StartPage | None = None
+        self._building = False
         self._ending = False
         self._thread = watched_thread("pages", self._serve)
 
@@ -196,16 +238,26 @@ class Pages:
         self._show(which)
         self._thread.start()
 
-    def show(self, which: Which) -> None:
-        """Request a page. Returns at once, so that a button of the present page may call it."""
+    def show(self, which: Which, anew: bool = False) -> None:
+        """Request a page. Returns at once, so that a button of the present page may call it.
+
+        Args:
+            anew: build it also if it is shown: it has another session.
+        """
         with self._wake:
-            self._wish = which
+            # Until it is built, a page that has to be made anew has to be.
+            self._wish, self._anew = which, anew or (self._anew and self._wish == which)
             self._wake.notify_all()
 
     def wait_for(self, which: Which, timeout: float) -> bool:
         """Sleep until that page is shown; False after `timeout` seconds."""
         with self._wake:
             return self._wake.wait_for(lambda: self._shown == which, timeout)
+
+    def wait_until_shown(self, timeout: float) -> bool:
+        """Sleep until no page is requested or being built; False after `timeout` seconds."""
+        with self._wake:
+            return self._wake.wait_for(lambda: self._wish is None and not self._building, timeout)
 
     def stop(self) -> None:
         """Stop redrawing the present page; it stays as it is until the server closes."""
@@ -224,13 +276,18 @@ class Pages:
                 if self._ending:
                     return
                 wish, self._wish = self._wish, None
-            if wish is None or wish == self._shown:
-                continue
+                anew, self._anew = self._anew, False
+                self._building = True
             try:
-                self._show(wish)
+                if wish is not None and (anew or wish != self._shown):
+                    self._show(wish)
             except Exception:
                 # The thread must survive, or no button could show a page again.
                 log.exception("The page could not be built.")
+            finally:
+                with self._wake:
+                    self._building = False
+                    self._wake.notify_all()
 
     def _show(self, which: Which) -> None:
         dark = self._page.dark if self._page is not None else True

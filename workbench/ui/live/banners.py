@@ -16,7 +16,7 @@ WIDEST, BUSY_WIDEST = 520, 460
 """Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
 version is still used."""
 
-RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Start a new worker"
+RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
 SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
@@ -112,6 +112,8 @@ def _kept(view: SessionView) -> str:
     """Which version still runs, in a sentence."""
     if view.state == "stopped":
         return "The worker process is gone. Restart the worker to continue."
+    if view.task is None and not (view.problem is not None and view.problem.file):
+        return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
     if view.task is None:
         return "No version has loaded yet. Fix the file and save it, and the page will show it."
     if view.problem is not None and view.problem.stage == "worker":

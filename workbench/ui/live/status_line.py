@@ -10,6 +10,7 @@ import numpy as np
 import viser
 
 from workbench.core.rules import RULES
+from workbench.jobs.task import TaskDescription
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
@@ -20,7 +21,7 @@ from workbench.ui.live.version_panel import took
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import Clock, PagePart
-from workbench.ui.widgets.templates import place, render
+from workbench.ui.widgets.templates import counted, place, render
 
 NEWS = 6.0
 """Seconds for which a new version is announced."""
@@ -129,7 +130,19 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
         "moving": moving,
         "behind": moving and slow,
         "marked": marked,
+        "robot": "" if task is None else robot_text(task),
     }
+
+
+def robot_text(task: TaskDescription) -> str:
+    """Robot, control mode and width of the action of one env."""
+    count = len(task.actions)
+    parts = (
+        task.made.robot or "no robot",
+        task.control_mode or "",
+        counted(count, "action") if count else "",
+    )
+    return " · ".join(part for part in parts if part)
 
 
 def _state(view: SessionView, busy: Busy | None) -> str:

@@ -46,6 +46,8 @@ SCRIPTS = (
     "key_help.js",
     "steady_resolution.js",
     "tab_title.js",
+    "task_list.js",
+    "tab_stays.js",
     "help.js",
 )
 """Of ``web_assets/``, run by the page."""

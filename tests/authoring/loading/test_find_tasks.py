@@ -1,0 +1,103 @@
+"""Task files are found by their text, in bounded time, and nothing of them runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from workbench.authoring.loading import find_tasks
+from workbench.authoring.loading.find_tasks import find_task_files, is_below, read_task_file
+
+REGISTERED = (
+    'open({mark!r}, "w")\n@register_env("Push-v1", max_episode_steps=50)\nclass PushEnv(BaseEnv):\n    pass\n'
+)
+
+
+def task(path: Path, text: str = "class Task(BaseEnv): pass\n") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def names(folder: Path) -> list[str]:
+    root = folder.resolve()
+    return [str(one.path.relative_to(root)) for one in find_task_files(folder).files]
+
+
+def test_a_task_is_found_by_its_decorator_or_its_base_class_and_does_not_run(tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    task(tmp_path / "push.py", REGISTERED.format(mark=str(mark)))
+    task(tmp_path / "sub/pull.py", "class A(sapien_env.BaseEnv[int]): pass\nclass B(A): pass\n")
+    task(tmp_path / "sub/other.py", "@register_env(uid='Other-v1')\nclass Other(PickCubeEnv): pass\n")
+    task(tmp_path / "tools.py", "from mani_skill.envs.sapien_env import BaseEnv\ndef f(e: BaseEnv): pass\n")
+    found = {one.path.name: one for one in find_task_files(tmp_path).files}
+    assert list(found) == ["push.py", "other.py", "pull.py"], "nearest first"
+    assert (found["push.py"].ids, found["push.py"].classes) == (("Push-v1",), ("PushEnv",))
+    assert (found["pull.py"].ids, found["pull.py"].classes) == ((), ("A", "B"))
+    assert (found["other.py"].ids, found["other.py"].classes) == (("Other-v1",), ("Other",))
+    assert not mark.exists()
+
+
+def test_hidden_folders_environments_packages_and_links_are_left_out(tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    for folder in (".git", "env/lib", "lib/site-packages/p", "node_modules", "__pycache__", "conda"):
+        task(work / folder / "task.py")
+    (work / "env/pyvenv.cfg").touch()
+    (work / "conda/conda-meta").mkdir()
+    task(work / ".hidden.py")
+    outside = task(tmp_path / "outside/secret.py")
+    (work / "link.py").symlink_to(outside)
+    (work / "linked").symlink_to(outside.parent)
+    (work / "circle").symlink_to(work)
+    assert names(work) == []
+    mine = task(work / "mine.py")
+    assert names(work) == ["mine.py"]
+    assert is_below(mine, work) and not is_below(work / "link.py", work)
+
+
+def test_a_search_is_bounded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(6):
+        task(tmp_path / f"t{number}.py")
+    task(tmp_path / "/".join("abcdefgh") / "deep.py")
+    task(tmp_path / "a/large.py", "class T(BaseEnv): pass\n" + "#" * find_tasks.LARGEST)
+    assert len(names(tmp_path)) == 6 and find_task_files(tmp_path).left_out == ""
+    monkeypatch.setattr(find_tasks, "MOST_FOUND", 4)
+    cut = find_task_files(tmp_path)
+    assert len(cut.files) == 4 and "first 4 task files" in cut.left_out
+    monkeypatch.setattr(find_tasks, "MOST_LOOKED_AT", 2)
+    assert "first 2 Python files" in find_task_files(tmp_path).left_out
+    stopped = find_task_files(tmp_path, lambda: True)
+    assert stopped.files == () and "ended" in stopped.left_out
+    monkeypatch.setattr(find_tasks, "LONGEST", -1.0)
+    assert find_task_files(tmp_path).left_out
+
+
+def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_writing(
+    tmp_path: Path,
+) -> None:
+    task(tmp_path / "broken.py", "class Push(BaseEnv):\n    def evaluate(self:\n")
+    task(tmp_path / "noise.py", "BaseEnv ((((")
+    assert names(tmp_path) == ["broken.py"]
+    assert names(tmp_path / "gone") == []
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.binary(max_size=300) | st.text(max_size=200).map(lambda text: text.encode("utf-8", "replace")))
+def test_no_text_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, raw: bytes) -> None:
+    file = tmp_path_factory.getbasetemp() / "any.py"
+    file.write_bytes(b"# BaseEnv register_env\n" + raw)
+    found = read_task_file(file)
+    assert found is None or found.path == file
+    file.write_bytes(b"class Task(BaseEnv): pass\nx = '''" + raw)
+    read_task_file(file)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(1, 4000))
+def test_no_depth_of_nesting_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, depth: int) -> None:
+    file = tmp_path_factory.getbasetemp() / "deep.py"
+    file.write_text(f"class Task(BaseEnv): pass\nx = {'(' * depth}1{')' * depth}\ny = {'-' * depth}1\n")
+    assert read_task_file(file) is not None

@@ -1,0 +1,188 @@
+"""The start page and *Open...* in a real Chromium, as a person uses them: one server for all."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from tests.drive.page import TASK, Opened, open_workbench, page_at
+from workbench.session.tasks.registered import LIST_FILE
+from workbench.ui.app.trust_dialog import ONCE
+
+# The first begins at the start page, which is gone once a task is open.
+pytestmark = [pytest.mark.browser, pytest.mark.random_order(disabled=True)]
+PATIENT = 120_000
+NOT_FOUND = "NoSuchTask-v1"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working folder with two tasks, another folder with one, and a cache in which nothing is left to draw."""
+    folder = tmp_path_factory.mktemp("start")
+    for name in ("work/push.py", "work/sub/small.py", "elsewhere/other.py"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(TASK.parent / "minimal.py" if "small" in name else TASK, folder / name)
+    cache = folder / f"cache/workbench/tasks/mani_skill-{importlib.metadata.version('mani_skill')}"
+    cache.mkdir(parents=True)
+    ids = ["PickCube-v1", NOT_FOUND]
+    tried = {one: {"text": "Not here.", "tries": 9, "last": time.time()} for one in ids}
+    (cache / LIST_FILE).write_bytes(msgspec.json.encode({"ids": ids, "not_drawn": tried}))
+    state = folder / "state/workbench"
+    state.mkdir(parents=True, mode=0o700)
+    rows = [{"reference": str(folder / "elsewhere/other.py"), "num_envs": 3}]
+    (state / "recent_tasks.json").write_bytes(msgspec.json.encode({"tasks": rows}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def started(folder: Path) -> Iterator[Opened]:
+    env = {name: str(folder / what) for name, what in HOMES.items()}
+    arguments = ("--num-envs", "2", "--no-spare", "--env", "render_backend=none")
+    with open_workbench(*arguments, cwd=folder / "work", what="start", env=env) as opened:
+        yield opened
+
+
+HOMES = {"XDG_CACHE_HOME": "cache", "XDG_STATE_HOME": "state", "XDG_CONFIG_HOME": "config"}
+
+
+def row(page: Page, name: str) -> Locator:
+    return page.locator(".wb-tasks [data-row]").filter(has=page.get_by_text(name, exact=True)).first
+
+
+def marked(page: Page) -> Locator:
+    return page.locator(".wb-tasks .wb-marked-task")
+
+
+def runs(page: Page, title: str, envs: str = "2 envs") -> None:
+    status = page.locator(".wb-status")
+    expect(status).to_have_attribute("data-title", re.compile(title), timeout=PATIENT)
+    expect(status).to_contain_text("paused", timeout=PATIENT)
+    expect(status).to_contain_text(envs, timeout=PATIENT)
+
+
+def open_list(page: Page) -> None:
+    """The dialog; where no task is open yet, the list is there already."""
+    expect(page.locator(".wb-status, .wb-start").first).to_be_visible(timeout=PATIENT)
+    if page.locator(".wb-status").count():
+        page.keyboard.press("Control+o")
+        expect(page.get_by_role("dialog").locator(".wb-tasks")).to_be_visible()
+
+
+def test_from_the_start_page_to_a_task_to_another_and_back(
+    started: Opened, folder: Path, browser: Browser
+) -> None:
+    with page_at(browser, started.url) as (page, errors), page_at(browser, started.url) as (other, _):
+        # The list is there, the search has the focus, and the first row is marked.
+        expect(row(page, "push.py")).to_be_visible(timeout=PATIENT)
+        for name in ("sub/small.py", "minimal.py", "PickCube-v1", "recordings/", "other.py"):
+            expect(row(page, name)).to_be_attached()
+        expect(page.get_by_role("textbox").first).to_be_focused()
+        expect(marked(page)).to_have_count(1)
+        page.keyboard.press("ArrowDown")
+        expect(marked(page)).to_contain_text("push.py")
+        page.keyboard.press("ArrowUp")
+        expect(marked(page)).to_contain_text("other.py")
+        # Words and Enter, pressed at once: Enter waits for the list of these words.
+        page.keyboard.type("push.py", delay=0)
+        page.keyboard.press("Enter")
+        runs(page, "WorkbenchPushCube-v1")
+        runs(other, "WorkbenchPushCube-v1")
+        expect(page.locator(".wb-status")).to_contain_text("panda")
+        expect(page.locator(".wb-status")).to_contain_text("8 actions")
+
+        # Another task in place of it, from another tab of the page, with the other browser following.
+        page.get_by_role("tab", name="Reward").click()
+        page.keyboard.press("n")
+        expect(page.locator(".wb-timeline")).to_contain_text("env 1")
+        open_list(page)
+        row(page, "sub/small.py").click()
+        runs(page, "WorkbenchMinimal-v1")
+        runs(other, "WorkbenchMinimal-v1")
+        expect(page.locator(".wb-timeline")).to_contain_text("env 0")
+        expect(page.get_by_role("tab", name="Run")).to_have_attribute("aria-selected", "true")
+
+        # And back: the tab and the selected env are as they were.
+        open_list(page)
+        page.keyboard.type("push")
+        page.keyboard.press("Enter")
+        runs(page, "WorkbenchPushCube-v1")
+        expect(page.locator(".wb-timeline")).to_contain_text("env 1")
+        expect(page.get_by_role("tab", name="Reward")).to_have_attribute("aria-selected", "true")
+
+        # A task that cannot be made: the page says so, and the way back is the same list.
+        open_list(page)
+        row(page, NOT_FOUND).click()
+        banner = page.locator(".wb-banner")
+        expect(banner).to_contain_text(NOT_FOUND, timeout=PATIENT)
+        expect(banner).to_contain_text("Open another task")
+        # A file from elsewhere asks first.
+        open_list(page)
+        row(page, "other.py").click()
+        question = page.get_by_role("dialog")
+        expect(question).to_contain_text("outside of the folder", timeout=PATIENT)
+        expect(question).to_contain_text(str(folder / "elsewhere/other.py"))
+        question.get_by_role("button", name=ONCE).click()
+        runs(page, "WorkbenchPushCube-v1", "3 envs")
+        assert errors == []
+
+
+def test_options_are_applied_on_the_page_and_bad_ones_leave_the_envs(
+    started: Opened, browser: Browser
+) -> None:
+    with page_at(browser, started.url, 1280, 900) as (page, errors):
+        open_list(page)
+        page.keyboard.type("push.py")
+        row(page, "push.py").click()
+        runs(page, "WorkbenchPushCube-v1")
+        page.get_by_text("How the envs are made").click()
+        form = page.locator(".wb-env-options")
+        expect(form).to_contain_text("--num-envs 2 --env render_backend=none")
+        envs = page.get_by_role("textbox", name="Envs", exact=True)
+        envs.click()
+        page.keyboard.press("Control+a")
+        page.keyboard.type("3")
+        page.keyboard.press("Tab")
+        expect(envs).to_have_value("3")
+        page.get_by_role("combobox", name="Control").click()
+        page.get_by_role("option", name="pd_joint_pos", exact=True).click()
+        page.get_by_role("button", name="Apply").click()
+        runs(page, "WorkbenchPushCube-v1", "3 envs")
+        expect(page.locator(".wb-status")).to_contain_text("pd_joint_pos")
+        expect(form).to_contain_text("--num-envs 3")
+        expect(form).to_contain_text("--env control_mode=pd_joint_pos")
+        page.get_by_role("combobox", name="Observation").click()
+        page.get_by_role("option", name="rgb", exact=True).click()
+        page.get_by_role("button", name="Apply").click()
+        # Nothing renders here, so no picture can be observed.
+        expect(form).to_contain_text("Not taken: obs_mode", timeout=PATIENT)
+        expect(page.locator(".wb-banner")).to_be_visible()
+        expect(page.locator(".wb-status")).to_contain_text("3 envs")
+        page.get_by_role("button", name="Discard").click()
+        expect(page.locator(".wb-banner")).to_be_hidden(timeout=PATIENT)
+        runs(page, "WorkbenchPushCube-v1", "3 envs")
+        assert errors == []
+
+
+@pytest.mark.slow
+def test_the_list_is_in_the_review_too(started: Opened, browser: Browser) -> None:
+    with page_at(browser, started.url) as (page, errors):
+        open_list(page)
+        page.keyboard.type("recordings/")
+        page.keyboard.press("Enter")
+        expect(page.locator(".wb-library-tools, .wb-note").first).to_be_visible(timeout=PATIENT)
+        expect(page.get_by_role("tab", name="Library")).to_be_visible(timeout=PATIENT)
+        open_list(page)
+        page.keyboard.press("Escape")
+        expect(page.get_by_role("dialog")).to_be_hidden()
+        open_list(page)
+        row(page, "sub/small.py").click()
+        runs(page, "WorkbenchMinimal-v1")
+        assert errors == []

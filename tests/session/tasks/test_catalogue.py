@@ -1,0 +1,186 @@
+"""The list of tasks: what is in it, what is refused, and what comes of ManiSkill's cached pictures."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.drive.waiting import until
+from workbench.jobs.task import TaskOptions
+from workbench.session.tasks import registered as registered_module
+from workbench.session.tasks.catalogue import Catalogue, Entry, Section
+from workbench.session.tasks.recents import RecentTasks
+from workbench.session.tasks.registered import LIST_FILE, RegisteredTasks
+
+TASK = "class Task(BaseEnv): pass\n"
+
+
+def cached(folder: Path, ids: list[str], **more: object) -> Path:
+    """A cache in which nothing is left to draw."""
+    folder.mkdir(parents=True, exist_ok=True)
+    gone = {
+        one: {"text": "needs ycb", "needs_download": True, "tries": 9, "last": time.time()} for one in ids
+    }
+    (folder / LIST_FILE).write_bytes(msgspec.json.encode({"ids": ids, "not_drawn": gone, **more}))
+    return folder
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Iterator[Callable[..., Catalogue]]:
+    """Makes catalogues of the folder ``work``."""
+    found: list[Catalogue] = []
+
+    def make(ids: list[str] | None = None) -> Catalogue:
+        pictures = RegisteredTasks(folder=cached(tmp_path / "cache", ["PickCube-v1"] if ids is None else ids))
+        work = tmp_path / "work"
+        work.mkdir(exist_ok=True)
+        recents = RecentTasks(lambda: tmp_path / "state")
+        found.append(Catalogue(work, tmp_path / "recordings", recents, pictures, TaskOptions(3)))
+        return found[-1]
+
+    yield make
+    for one in found:
+        one.close()
+
+
+def listed(catalogue: Catalogue) -> dict[Section, list[Entry]]:
+    catalogue.refresh()
+    until(lambda: not catalogue.view().searching and not catalogue.registered.view.doing, "the list")
+    until(lambda: catalogue.registered.view.ids or catalogue.registered.view.problem, "the ids")
+    rows = catalogue.view().entries
+    return {section: [one for one in rows if one.section is section] for section in Section}
+
+
+def test_all_sections_are_there_and_say_what_is_opened(
+    made: Callable[..., Catalogue], tmp_path: Path
+) -> None:
+    catalogue = made()
+    (tmp_path / "work/sub").mkdir()
+    (tmp_path / "work/sub/push.py").write_text(f"@register_env('Push-v1')\n{TASK}")
+    catalogue.recents.add(str(tmp_path / "work/sub/push.py"), TaskOptions(8, env_kwargs={"size": 2}))
+    catalogue.recents.add(str(tmp_path / "gone.py:Task"), TaskOptions())
+    rows = listed(catalogue)
+    gone, recent = rows[Section.RECENT]
+    assert gone.gone and gone.name == "gone.py:Task" and not recent.gone
+    assert "sub/" in recent.about and "8 envs" in recent.about and "size=2" in recent.about
+    assert recent.options == TaskOptions(8, env_kwargs={"size": 2})
+    (in_folder,) = rows[Section.FOLDER]
+    assert (in_folder.name, in_folder.about) == ("sub/push.py", "Push-v1") and in_folder.options is None
+    assert {"minimal.py", "push_cube.py"} <= {one.name for one in rows[Section.EXAMPLES]}
+    assert [one.reference for one in rows[Section.RECORDINGS]] == [""]
+    (pick,) = rows[Section.REGISTERED]
+    assert (pick.reference, pick.file, pick.blank) == ("PickCube-v1", None, "needs a download")
+
+
+def test_only_a_listed_number_is_an_entry_and_it_is_never_anothers(
+    made: Callable[..., Catalogue], tmp_path: Path
+) -> None:
+    catalogue = made()
+    file = tmp_path / "work/push.py"
+    file.write_text(TASK)
+    (entry,) = listed(catalogue)[Section.FOLDER]
+    assert catalogue.entry(entry.number) == entry
+    for number in (0, -1, 10**9, entry.number + 1000):
+        assert catalogue.entry(number) is None
+    file.unlink()
+    (tmp_path / "work/other.py").write_text(TASK)
+    (other,) = listed(catalogue)[Section.FOLDER]
+    assert other.number != entry.number and catalogue.entry(entry.number) is None
+    file.write_text(TASK)
+    again = {one.name: one.number for one in listed(catalogue)[Section.FOLDER]}
+    assert again == {"push.py": entry.number, "other.py": other.number}
+
+
+def test_a_cached_list_names_no_file_and_no_module(made: Callable[..., Catalogue]) -> None:
+    wrong = ["/tmp/evil.py", "evil.py", "os:system", "../x", "a b", "", "~/x", "x" * 500, "\u202ePick-v1"]
+    rows = listed(made([*wrong, "PickCube-v1"]))
+    assert [one.reference for one in rows[Section.REGISTERED]] == ["PickCube-v1"]
+
+
+def test_a_row_is_found_by_all_of_its_words(made: Callable[..., Catalogue], tmp_path: Path) -> None:
+    (tmp_path / "work/push.py").parent.mkdir(exist_ok=True)
+    (tmp_path / "work/push.py").write_text(f"@register_env('Shove-v1')\n{TASK}")
+    (entry,) = listed(made())[Section.FOLDER]
+    assert entry.matches([]) and entry.matches(["push", "shove"]) and not entry.matches(["push", "pull"])
+
+
+def jpeg() -> bytes:
+    written = io.BytesIO()
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(written, "JPEG")
+    return written.getvalue()
+
+
+def test_a_cached_picture_is_shown_and_what_is_none_is_not(
+    made: Callable[..., Catalogue], tmp_path: Path
+) -> None:
+    catalogue = made(["Good-v1", "Bad-v1", "Large-v1"])
+    (tmp_path / "cache/Good-v1.jpg").write_bytes(jpeg())
+    (tmp_path / "cache/Bad-v1.jpg").write_bytes(b"<svg onload=alert(1)>")
+    (tmp_path / "cache/Large-v1.jpg").write_bytes(jpeg() + b"x" * registered_module.LARGEST_PICTURE)
+    (tmp_path / "cache/Secret-v1.jpg").write_bytes(jpeg())
+    listed(catalogue)
+    assert catalogue.registered.view.pictures == {"Good-v1"}
+    assert catalogue.registered.picture("Good-v1") == jpeg()
+    for name in ("Bad-v1", "Secret-v1", "../cache/Good-v1", "Good-v1.jpg", ""):
+        assert catalogue.registered.picture(name) is None
+
+
+def test_a_broken_cache_is_made_anew(tmp_path: Path) -> None:
+    (tmp_path / LIST_FILE).write_text("{")
+    assert registered_module._read_list(tmp_path).ids == []
+
+
+@pytest.mark.slow
+def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_path: Path) -> None:
+    first = RegisteredTasks(folder=tmp_path)
+    first.start()
+    first.start()
+    # Those that come first lack a download on most machines; they are told apart from what is broken.
+    until(lambda: first.view.pictures or first.view.problem, "a picture", 280, lambda: first.view)
+    view = first.view
+    first.close()
+    assert "PickCube-v1" in view.ids and not view.problem
+    drawn = next(iter(view.pictures))
+    picture = Image.open(io.BytesIO(first.picture(drawn) or b""))
+    assert picture.size == (registered_module.WIDTH, registered_module.HEIGHT)
+    assert np.asarray(picture).std() > 5, "something is to be seen on it"
+    again = RegisteredTasks(lambda: False, folder=tmp_path)
+    again.start()
+    until(lambda: again.view.pictures, "the cached one")
+    again.close()
+    assert again.view.ids == view.ids and again.view.why_not.keys() >= view.why_not.keys()
+
+
+def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    class Process:
+        def __init__(self, niceness: int) -> None:
+            assert niceness == 19
+
+        def start(self) -> None: ...
+
+        def end(self) -> None: ...
+
+        def ask(self, check: object, question: registered_module.DrawTask) -> object:
+            asked.append(question.env_id)
+            raise registered_module.JobFailed("it crashed")
+
+    monkeypatch.setattr(registered_module, "Background", Process)
+    cached(tmp_path, ["A-v1"], not_drawn={})
+    for _ in range(4):
+        tasks = RegisteredTasks(folder=tmp_path)
+        tasks.start()
+        until(lambda tasks=tasks: tasks._thread is not None and not tasks._thread.is_alive(), "its end")
+        tasks.close()
+        assert tasks.view.why_not["A-v1"].text == "it crashed"
+    assert asked == ["A-v1"] * registered_module.MOST_TRIES

@@ -1,0 +1,209 @@
+"""A listed task in place of the open one, with scripted workers and without a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.drive.panels import Panels
+from tests.drive.scripted import scripted
+from tests.drive.session import wait_until
+from tests.drive.waiting import until
+from tests.ui.scenes import camera as camera_info
+from workbench.authoring.loading.reference import TaskName
+from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import KeptWork, Session
+from workbench.session.tasks.catalogue import Entry, Section
+from workbench.session.tasks.recents import RecentTasks
+from workbench.session.tasks.registered import RegisteredTasks
+from workbench.ui.app import workplace
+from workbench.ui.app.open_task import Choices
+from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE
+from workbench.ui.app.workplace import Workplace
+from workbench.ui.server.gated_server import GatedServer
+
+TASK = "@register_env('Push-v1')\nclass Push(BaseEnv): pass\n"
+CAMERA: CameraKey = ("sensor", "base_camera")
+LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+
+
+class Desk:
+    """A workbench that was started in ``work``, with a task file there, and one elsewhere that was opened before."""
+
+    def __init__(self, place: Workplace, opened: list[tuple[TaskName, TaskOptions]], folder: Path) -> None:
+        self.place, self.opened, self.folder = place, opened, folder
+        self.panels = Panels(place.server)
+        self.catalogue = place.open_task.catalogue
+        self.catalogue.refresh()
+        until(lambda: self.rows(Section.FOLDER), "the files of the folder")
+
+    def rows(self, section: Section) -> list[Entry]:
+        return [one for one in self.catalogue.view().entries if one.section is section]
+
+    def row(self, name: str) -> Entry:
+        return next(one for one in self.catalogue.view().entries if one.name == name)
+
+    def choose(self, name: str) -> None:
+        self.place.open_task.choose(self.row(name).number)
+
+    def session_of(self, name: str) -> Session:
+        """The open session, once it is that of this file."""
+        until(
+            lambda: self.place.home is not None and str(self.place.home.reference).endswith(name),
+            f"the session of {name}",
+            seen=lambda: self.opened,
+        )
+        session = self.place.home
+        assert session is not None and session is self.place.session
+        wait_until(session, lambda view: view.task is not None, "the task")
+        return session
+
+    def idle(self) -> None:
+        until(lambda: not self.place.open_task.doing(), "the end of the opening")
+
+
+@pytest.fixture
+def desk(tmp_path: Path, gated_server: GatedServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
+    for name in ("work/push.py", "work/pull.py", "elsewhere/other.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(TASK)
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setattr(RegisteredTasks, "start", lambda self: None)  # else a process lists ManiSkill's
+    recents = RecentTasks(lambda: tmp_path / "state")
+    recents.add(str(tmp_path / "elsewhere/other.py"), TaskOptions(3, env_kwargs={"size": 2}))
+    recents.add(str(tmp_path / "elsewhere/gone.py"), TaskOptions())
+    opened: list[tuple[TaskName, TaskOptions]] = []
+
+    def make(task: TaskName, options: TaskOptions, kept: KeptWork | None = None) -> Session:
+        opened.append((task, options if kept is None else kept.options))
+        worker = scripted(2, info=replace(camera_info(), settings=LENS))
+        return Session(task, options, recordings=tmp_path / "kept", make_worker=worker, kept=kept)
+
+    place = Workplace(
+        gated_server,
+        tmp_path / "recordings",
+        make,
+        TaskOptions(),
+        choices=Choices(recents, make, TaskOptions(5)),
+    )
+    place.pages.start("start")
+    yield Desk(place, opened, tmp_path)
+    place.close()
+
+
+def test_a_file_of_the_folder_opens_unasked_with_the_options_of_the_run(desk: Desk) -> None:
+    desk.choose("push.py")
+    session = desk.session_of("push.py")
+    assert desk.opened == [(str(desk.folder / "work/push.py"), TaskOptions(5))]
+    assert desk.place.pages.wait_for("live", 60)
+    desk.choose("push.py")
+    desk.idle()
+    assert desk.place.home is session, "what is open is not opened again"
+
+
+@pytest.mark.parametrize("number", [0, -1, 10**7, 2**40])
+def test_a_number_that_is_not_listed_opens_nothing(desk: Desk, number: int) -> None:
+    desk.place.open_task.choose(number)
+    desk.choose("push.py")
+    desk.session_of("push.py")
+    assert len(desk.opened) == 1
+
+
+def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
+    desk.choose("push.py")
+    first = desk.session_of("push.py")
+    desk.place.pages.wait_for("live", 60)
+    first.change(selected_env=1, speed=2.0)
+    now = next(one for one in first.studio.view(None, 0).cameras if one.key == CAMERA).now
+    assert now is not None
+    placed = replace(now, position=(1.0, 2.0, 3.0))
+    first.studio.place(CAMERA, placed)
+    first.studio.select(CAMERA)
+    desk.choose("pull.py")
+    second = desk.session_of("pull.py")
+    assert second.studio.placed_cameras() == () and second.view().selected_env == 0
+    until(lambda: first._shared._closing, "the end of the first session")
+    desk.choose("push.py")
+    again = desk.session_of("push.py")
+    assert again is not first
+    (camera,) = again.studio.placed_cameras()
+    assert camera.key == CAMERA and camera.settings is not None
+    assert camera.settings.position == (1.0, 2.0, 3.0)
+    view = again.view()
+    assert (view.selected_env, view.settings.speed, view.studio.selected) == (1, 2.0, CAMERA)
+    again.studio.undo()
+    assert again.studio.placed_cameras() == (), "the way back is kept too"
+
+
+def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk) -> None:
+    desk.choose("push.py")
+    first = desk.session_of("push.py")
+    desk.place.pages.wait_for("live", 60)
+    desk.choose("other.py")
+    asked = until(lambda: desk.panels.html("wb-trust"), "the question")
+    assert TASK.splitlines()[1] in asked and "outside of the folder" in asked
+    desk.panels.press(DO_NOT)
+    desk.idle()
+    assert desk.place.home is first and len(desk.opened) == 1
+    desk.choose("other.py")
+    until(lambda: desk.panels.shows(ONCE), "the question again")
+    desk.panels.press(ONCE)
+    desk.session_of("other.py")
+    assert desk.opened[-1][1] == TaskOptions(3, env_kwargs={"size": 2}), "as it was opened last"
+    desk.choose("push.py")
+    desk.session_of("push.py")
+    desk.choose("other.py")
+    desk.session_of("other.py")
+
+
+def test_another_choice_withdraws_the_question_and_the_last_of_several_counts(desk: Desk) -> None:
+    desk.choose("other.py")
+    until(lambda: desk.panels.shows(ALWAYS), "the question")
+    desk.choose("push.py")
+    desk.choose("pull.py")
+    desk.session_of("pull.py")
+    until(lambda: not desk.panels.shows(ALWAYS), "the end of the question")
+    assert [str(task) for task, _ in desk.opened if str(task).endswith("other.py")] == []
+
+
+def test_what_is_gone_is_said_and_nothing_is_opened(desk: Desk) -> None:
+    assert desk.row("gone.py").gone
+    desk.choose("gone.py")
+    file = desk.folder / "work/push.py"
+    row = desk.row("push.py")
+    file.unlink()
+    desk.place.open_task.choose(row.number)
+    desk.idle()
+    until(lambda: [one.name for one in desk.rows(Section.FOLDER)] == ["pull.py"], "the list without it")
+    assert desk.opened == [] and desk.place.session is None
+
+
+def test_the_recordings_are_a_row_and_a_task_is_opened_from_there_too(
+    child_process: None, desk: Desk
+) -> None:
+    desk.place.open_task.choose(desk.rows(Section.RECORDINGS)[0].number)
+    assert desk.place.pages.wait_for("review", 60)
+    desk.choose("push.py")
+    desk.session_of("push.py")
+    assert desk.place.pages.wait_for("live", 60)
+
+
+def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workplace, "ENOUGH_MEMORY", 0)
+    assert desk.place.is_idle()
+    desk.choose("push.py")
+    session = desk.session_of("push.py")
+    until(desk.place.is_idle, "a paused task")
+    session.play()
+    until(lambda: not desk.place.is_idle(), "a task that plays")
+    session.pause()
+    until(desk.place.is_idle, "a paused task")
+    monkeypatch.setattr(workplace, "ENOUGH_MEMORY", 1 << 60)
+    assert not desk.place.is_idle()

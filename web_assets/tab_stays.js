@@ -1,0 +1,45 @@
+// Who comes back to a task, or to the review, finds the tab that was open there.
+//
+// Which tab is open is the browser's own matter, and a page that is built again begins with its first. The page says in
+// `data-which` what it shows (which.html); what was chosen there is kept for as long as the browser's tab lives.
+"use strict";
+{
+  const KEEPS = "workbench tab of ";
+  const LOOK = 100; // milliseconds
+  const LOOKS = 50;
+  let which = "";
+  let looking = 0;
+
+  const marker = () => document.querySelector("[data-which]");
+  const nameOf = (tab) => tab.textContent.trim();
+  const tabsOf = (mark) => {
+    const panel = mark?.closest(".mantine-Paper-root");
+    return panel ? [...panel.querySelectorAll("[role=tab]")] : [];
+  };
+
+  window.addEventListener("click", (event) => {
+    const tab = event.isTrusted && event.target instanceof Element && event.target.closest("[role=tab]");
+    const mark = marker();
+    if (!tab || !mark || !tabsOf(mark).includes(tab)) return;
+    clearTimeout(looking);
+    sessionStorage.setItem(KEEPS + mark.dataset.which, nameOf(tab));
+  });
+
+  // The tabs come one by one, a moment after the mark, and until all are there viser opens the first again.
+  function openAgain(kept, looks) {
+    const tab = tabsOf(marker()).find((one) => nameOf(one) === kept);
+    // viser's tabs hear a key and a pointer that goes down and up, and no click.
+    const enter = { key: "Enter", code: "Enter", bubbles: true };
+    if (tab && tab.getAttribute("aria-selected") !== "true") tab.dispatchEvent(new KeyboardEvent("keydown", enter));
+    if (looks > 0) looking = setTimeout(() => openAgain(kept, tab ? Math.min(looks, 10) - 1 : looks - 1), LOOK);
+  }
+
+  new MutationObserver(() => {
+    const now = marker()?.dataset.which ?? "";
+    if (now === which) return;
+    which = now;
+    clearTimeout(looking);
+    const kept = sessionStorage.getItem(KEEPS + now);
+    if (now && kept) openAgain(kept, LOOKS);
+  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-which"] });
+}

@@ -1,0 +1,179 @@
+"""Finds the task files below a folder by reading them; runs and imports none of them."""
+
+from __future__ import annotations
+
+import ast
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.authoring.loading.library_names import LIBRARY_FOLDERS
+from workbench.machine.files import read_regular_file
+
+DEEPEST = 6
+"""Folders below the first that are searched."""
+MOST_LOOKED_AT = 5_000
+"""Python files that are opened."""
+MOST_FOUND = 200
+LARGEST = 512 * 1024
+"""Bytes of a file that is read; the largest task of ManiSkill has 60 kB."""
+LONGEST = 5.0
+"""Seconds of one search."""
+LONGEST_NAME = 120
+"""Characters of an id or a class that are kept."""
+_NO_TASKS_IN = LIBRARY_FOLDERS | {"node_modules", "__pycache__", "build", "dist"}
+_ENVIRONMENT_HAS = ("pyvenv.cfg", "conda-meta")
+"""Files and folders that only the root of a Python environment has."""
+
+
+@dataclass(frozen=True)
+class TaskFile:
+    """A Python file that has a task, as its text says."""
+
+    path: Path
+    """Absolute, without links."""
+    ids: tuple[str, ...]
+    """Ids that it registers, as far as they are written as plain text."""
+    classes: tuple[str, ...]
+    """Its task classes, in the order of the file."""
+
+
+@dataclass(frozen=True)
+class FoundTasks:
+    """The result of a search."""
+
+    files: tuple[TaskFile, ...] = ()
+    """Sorted: those of the folder itself first, then by path."""
+    left_out: str = ""
+    """Why it may have missed files, as a sentence; empty if it has seen all."""
+
+
+def find_task_files(folder: Path, stopped: Callable[[], bool] = lambda: False) -> FoundTasks:
+    """The task files in and below a folder.
+
+    Hidden folders, Python environments, installed packages and links are left out. The search ends early, and says so, in
+    a folder that has too many files or takes too long.
+
+    Args:
+        stopped: asked often; True ends the search.
+    """
+    root = Path(os.path.realpath(folder))
+    ends_at = time.monotonic() + LONGEST
+    found: list[TaskFile] = []
+    left_out = ""
+    for number, path in enumerate(_python_files(root)):
+        if number >= MOST_LOOKED_AT:
+            left_out = f"Only the first {MOST_LOOKED_AT} Python files were searched."
+        elif len(found) >= MOST_FOUND:
+            left_out = f"Only the first {MOST_FOUND} task files are listed."
+        elif time.monotonic() > ends_at or stopped():
+            left_out = f"The search ended after {LONGEST:.0f} s."
+        if left_out:
+            break
+        if (task := read_task_file(path)) is not None:
+            found.append(task)
+    found.sort(key=lambda task: (len(task.path.relative_to(root).parts), str(task.path)))
+    return FoundTasks(tuple(found), left_out)
+
+
+def read_task_file(path: Path) -> TaskFile | None:
+    """What the text of a file says about its tasks; None if it has none, or cannot be read."""
+    try:
+        raw = read_regular_file(path, LARGEST)
+    except (OSError, ValueError):
+        return None
+    # Before parsing, which takes 20 ms for a large file.
+    if b"BaseEnv" not in raw and b"register_env" not in raw:
+        return None
+    try:
+        with warnings.catch_warnings():
+            # A text with "\d" would warn in the terminal.
+            warnings.simplefilter("ignore")
+            tree = ast.parse(raw)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        # A broken file that names BaseEnv most likely is a task that somebody is writing.
+        return TaskFile(path, (), ()) if b"(BaseEnv)" in raw else None
+    ids, classes = _tasks_of(tree)
+    return TaskFile(path, ids, classes) if classes else None
+
+
+def _python_files(root: Path) -> Iterator[Path]:
+    """Breadth first, so that a deep folder cannot hide the files next to where one looks."""
+    waiting = [(root, 0)]
+    while waiting:
+        folder, depth = waiting.pop(0)
+        try:
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError:
+            continue  # no right to read it, or gone
+        if depth and any(entry.name in _ENVIRONMENT_HAS for entry in entries):
+            continue
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            # Not through links: they make circles, and lead out of the folder.
+            if _is(entry.is_dir):
+                if depth < DEEPEST and entry.name not in _NO_TASKS_IN:
+                    waiting.append((Path(entry.path), depth + 1))
+            elif entry.name.endswith(".py") and _is(entry.is_file):
+                yield Path(entry.path)
+
+
+def _is(kind: Callable[..., bool]) -> bool:
+    try:
+        return kind(follow_symlinks=False)
+    except OSError:
+        return False
+
+
+def is_below(path: Path, folder: Path) -> bool:
+    """Whether a path, with all links followed, is in or below a folder."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+def _tasks_of(tree: ast.Module) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Ids and class names."""
+    ids: list[str] = []
+    tasks: list[str] = []
+    for node in _top_level(tree):
+        if not isinstance(node, ast.ClassDef) or node.name == "BaseEnv":
+            continue
+        registrations = [call for call in node.decorator_list if _name(call) == "register_env"]
+        if registrations or any(_name(base) in ("BaseEnv", *tasks) for base in node.bases):
+            tasks.append(node.name[:LONGEST_NAME])
+        ids += filter(None, map(_registered_id, registrations))
+    return tuple(dict.fromkeys(ids)), tuple(dict.fromkeys(tasks))
+
+
+def _top_level(tree: ast.Module) -> Iterator[ast.stmt]:
+    """The statements of a module, and those within its ``if`` and ``try``."""
+    waiting: list[ast.stmt] = list(reversed(tree.body))
+    while waiting:
+        node = waiting.pop()
+        yield node
+        if isinstance(node, (ast.If, ast.Try, ast.With)):
+            inner = [*node.body, *getattr(node, "orelse", ())]
+            waiting += reversed(inner)
+
+
+def _name(node: ast.expr) -> str:
+    """``BaseEnv`` of ``BaseEnv``, ``sapien_env.BaseEnv``, ``BaseEnv(...)`` and ``BaseEnv[...]``; empty for another form."""
+    if isinstance(node, ast.Call):
+        node = node.func
+    if isinstance(node, ast.Subscript):
+        node = node.value
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _registered_id(call: ast.expr) -> str:
+    """The id in ``@register_env("Push-v1")``; empty where it is computed."""
+    if not isinstance(call, ast.Call):
+        return ""
+    given = [*call.args[:1], *(word.value for word in call.keywords if word.arg == "uid")]
+    texts = [one.value for one in given if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+    return texts[0][:LONGEST_NAME] if texts else ""

@@ -1,0 +1,293 @@
+"""The keyword arguments that make an env: described in the worker, and read from text in the server. Imports no torch."""
+
+from __future__ import annotations
+
+import enum
+import inspect
+import json
+import math
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+KeywordKind = Literal["bool", "int", "float", "str", "choice", "json"]
+LONGEST_TEXT = 2000
+"""Characters of a value's text."""
+MOST_CHOICES = 200
+MOST_KEYWORDS = 40
+MODES = ("robot_uids", "control_mode", "obs_mode", "reward_mode")
+"""Keywords that every task of ManiSkill has and that a person chooses."""
+_NOT_ITS_OWN = frozenset(
+    {
+        *MODES, "num_envs", "render_mode", "shader_dir", "enable_shadow", "sensor_configs", "sim_config", "sim_backend",
+        "human_render_camera_configs", "viewer_camera_configs", "reconfiguration_freq", "render_backend",
+        "render_device", "parallel_in_single_scene", "enhanced_determinism", "backend", "device",
+    }
+)  # fmt: skip
+"""Parameters that tasks hand on to `BaseEnv`."""
+_ABSENT: Any = object()
+_ANY_TEXTURES = "any_textures"
+"""ManiSkill's word for every combination of pictures."""
+
+
+@dataclass(frozen=True)
+class Keyword:
+    """One keyword argument of the task class."""
+
+    name: str
+    kind: KeywordKind
+    value: str
+    """What is in effect, in JSON; of one that JSON cannot hold, its ``repr``."""
+    default: str = ""
+    """The class's own value, in the same form; empty if it has none, or it is not known."""
+    choices: tuple[str, ...] = ()
+    """Of kind ``choice``: what it may be, in JSON."""
+    optional: bool = False
+    """``null`` is a value too."""
+    fixed: str = ""
+    """Why it cannot be changed here; empty if it can."""
+
+
+@dataclass(frozen=True)
+class HowMade:
+    """How the envs of a task are made."""
+
+    robot: str = ""
+    """Names of the robots; empty without one."""
+    modes: tuple[Keyword, ...] = ()
+    """Those of `MODES` that the task has."""
+    own: tuple[Keyword, ...] = ()
+    """The task's own keyword arguments."""
+
+
+def describe_keywords(
+    cls: type, env: Any, given: Mapping[str, Any], registered: Mapping[str, Any], stop: type
+) -> HowMade:
+    """How `env` was made, and what else it could be made with.
+
+    Args:
+        cls: the author's class.
+        given: keywords that a person gave.
+        registered: keywords of the registration.
+        stop: `BaseEnv`, whose parameters are no keywords of the task itself.
+    """
+    parameters = dict(_own_parameters(cls, stop))
+    effective = {**registered, **given}
+    own = [
+        _describe(name, parameter, effective.get(name, _ABSENT), registered.get(name, _ABSENT))
+        for name, parameter in list(parameters.items())[:MOST_KEYWORDS]
+        if name not in _NOT_ITS_OWN
+    ]
+    robots = [str(getattr(agent, "uid", type(agent).__name__)) for agent in _agents_of(env)]
+    return HowMade(", ".join(robots), tuple(_modes(cls, env)), tuple(own))
+
+
+def _agents_of(env: Any) -> Sequence[Any]:
+    agent = getattr(env, "agent", None)
+    if agent is None:
+        return ()
+    return tuple(getattr(agent, "agents", None) or (agent,))
+
+
+def _modes(cls: Any, env: Any) -> Iterator[Keyword]:
+    supported = getattr(cls, "SUPPORTED_ROBOTS", None) or ()
+    robot = getattr(env, "robot_uids", None)
+    yield _choice("robot_uids", robot, supported)
+    agents = _agents_of(env)
+    if len(agents) == 1 and isinstance(mode := getattr(env, "control_mode", None), str):
+        yield _choice("control_mode", mode, getattr(agents[0], "supported_control_modes", ()))
+    obs_modes = list(cls.SUPPORTED_OBS_MODES)
+    if _ANY_TEXTURES in obs_modes:
+        obs_modes.remove(_ANY_TEXTURES)
+        obs_modes += ["rgb", "depth", "rgb+depth", "rgb+depth+segmentation", "rgb+depth+state"]
+    yield _choice("obs_mode", env.obs_mode, obs_modes)
+    yield _choice("reward_mode", env.reward_mode, cls.SUPPORTED_REWARD_MODES)
+
+
+def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
+    """A keyword with the present value among its choices, whether the class lists it or not."""
+    now = as_json(value)
+    texts = dict.fromkeys(text for one in choices if (text := as_json(one)) is not None)
+    if now is None:
+        return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
+    return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MOST_CHOICES])
+
+
+def _own_parameters(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
+    """Named parameters of the class's ``__init__``, and of its base classes' as long as each hands keywords on."""
+    seen: set[str] = set()
+    for owner in cls.__mro__:
+        if owner is stop or owner is object:
+            return
+        init = vars(owner).get("__init__")
+        if init is None:
+            continue
+        try:
+            signature = inspect.signature(init)
+        except (TypeError, ValueError):
+            return
+        parameters = list(signature.parameters.values())[1:]
+        for parameter in parameters:
+            if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+                if parameter.name not in seen:
+                    seen.add(parameter.name)
+                    yield parameter.name, parameter.replace(annotation=_annotation(parameter, init))
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return
+
+
+def _annotation(parameter: inspect.Parameter, init: Any) -> Any:
+    """The type; one of a module with ``from __future__ import annotations`` is a text, which may name what is not there."""
+    if not isinstance(parameter.annotation, str):
+        return parameter.annotation
+    names = getattr(inspect.unwrap(init), "__globals__", {})
+    try:
+        return eval(parameter.annotation, names)
+    except Exception:  # any: evaluating it runs the author's code
+        return parameter.empty
+
+
+def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: Any) -> Keyword:
+    own = parameter.default if registered is _ABSENT else registered
+    default = None if own is parameter.empty else own
+    value = default if given is _ABSENT else given
+    kind, choices, optional = _kind_of(parameter.annotation, default)
+    optional = optional or default is None
+    text, usual = as_json(_plain(value)), as_json(_plain(default))
+    if text is None:
+        return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
+    if choices and text not in choices and text != "null":
+        choices = (*choices, text)
+    return Keyword(name, kind, text, usual or "", choices[:MOST_CHOICES], optional)
+
+
+def _plain(value: Any) -> Any:
+    """The name of a member of an Enum, as it is written on a command line."""
+    return value.value if isinstance(value, enum.Enum) else value
+
+
+def _kind_of(annotation: Any, default: Any) -> tuple[KeywordKind, tuple[str, ...], bool]:
+    """Kind, choices, and whether None is a value; by the annotation, else by the type of the default."""
+    optional = False
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        parts = [one for one in typing.get_args(annotation) if one is not type(None)]
+        optional = len(parts) < len(typing.get_args(annotation))
+        annotation = parts[0] if len(parts) == 1 else None
+    if typing.get_origin(annotation) is Literal:
+        values = typing.get_args(annotation)
+        texts = tuple(text for one in values if (text := as_json(one)) is not None and one is not None)
+        return "choice", texts, optional or None in values
+    if isinstance(annotation, type) and issubclass(annotation, enum.Enum):
+        values = (as_json(member.value) for member in annotation)
+        if texts := tuple(text for text in values if text is not None):
+            return "choice", texts, optional
+    by_type: dict[Any, KeywordKind] = {bool: "bool", int: "int", float: "float", str: "str"}
+    known = by_type.get(annotation)
+    if known is None and annotation in (inspect.Parameter.empty, Any, None):
+        known = by_type.get(type(default))
+    return known or "json", (), optional
+
+
+def as_json(value: Any) -> str | None:
+    """The value in JSON; None if JSON cannot hold it, or only something else that equals it not."""
+    try:
+        text = json.dumps(value, allow_nan=False)
+        back = json.loads(text)
+    except (TypeError, ValueError, RecursionError):
+        return None
+    same = back == value or (isinstance(value, tuple) and back == list(value))
+    return text if same and len(text) <= LONGEST_TEXT else None
+
+
+def _in_words(value: Any) -> str:
+    try:
+        return _short(repr(value))
+    except Exception:  # of the author's class
+        return type(value).__name__
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 200 else f"{text[:199]}…"
+
+
+def constructor_arguments(cls: type, given: Mapping[str, Any], stop: type) -> dict[str, Any]:
+    """What was given in JSON, as the class takes it: several robots as a tuple, members of an Enum.
+
+    Args:
+        stop: as in `describe_keywords`.
+    """
+    taken = dict(given)
+    if isinstance(robots := taken.get("robot_uids"), list):
+        taken["robot_uids"] = tuple(robots)  # a list would be the name of one robot
+    for name, parameter in _own_parameters(cls, stop):
+        kind = parameter.annotation
+        if name in taken and isinstance(kind, type) and issubclass(kind, enum.Enum):
+            taken[name] = next((one for one in kind if one.value == taken[name]), taken[name])
+    return taken
+
+
+# --- what a person typed, in the server ----------------------------------------------------------------
+
+
+def shown(text: str) -> str:
+    """A value for a person: ``panda`` for ``"panda"``, ``panda, panda`` for a list of texts, JSON for the rest."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return text
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list) and value and all(isinstance(one, str) for one in value):
+        return ", ".join(value)
+    return text
+
+
+def read_value(keyword: Keyword, text: str) -> Any:
+    """The value that a person wrote for a keyword.
+
+    Raises:
+        ValueError: it is none of this kind; the message names the keyword and says what it takes.
+    """
+    text = text.strip()
+    if len(text) > LONGEST_TEXT:
+        raise ValueError(f"{keyword.name} takes at most {LONGEST_TEXT} characters.")
+    if keyword.optional and text in ("", "null", "None"):
+        return None
+    if keyword.kind == "str":
+        return text
+    try:
+        value = json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{keyword.name} takes {_TAKES[keyword.kind]}; got {_short(text)!r}.") from None
+    if not _fits(keyword, value):
+        raise ValueError(f"{keyword.name} takes {_TAKES[keyword.kind]}; got {_short(text)!r}.")
+    return float(value) if keyword.kind == "float" else value
+
+
+_TAKES: dict[KeywordKind, str] = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "choice": "one of its choices",
+    "json": 'a value in JSON, such as 0.5, [1, 2] or "text"',
+}
+LARGEST_INT = 2**63
+
+
+def _fits(keyword: Keyword, value: Any) -> bool:
+    if keyword.kind == "bool":
+        return isinstance(value, bool)
+    if keyword.kind == "int":
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < LARGEST_INT
+    if keyword.kind == "float":
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if keyword.kind == "choice":
+        return json.dumps(value) in keyword.choices
+    return True
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(name)

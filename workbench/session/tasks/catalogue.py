@@ -1,0 +1,245 @@
+"""The list of tasks that a person may choose from; only what is in it can be opened from a page."""
+
+from __future__ import annotations
+
+import ast
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cache
+from pathlib import Path
+
+from workbench.authoring.loading.find_tasks import FoundTasks, TaskFile, find_task_files
+from workbench.jobs.task import TaskOptions
+from workbench.machine.folders import example_tasks
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.text import short_line
+from workbench.session.tasks.recents import MOST_ENVS, RecentTask, RecentTasks
+from workbench.session.tasks.registered import RegisteredTasks, RegisteredView
+
+LONGEST_SHOWN = 300
+
+
+class Section(Enum):
+    """Part of the list, in the order of the page; the value is its heading."""
+
+    RECENT = "Recent"
+    FOLDER = "In this folder"
+    EXAMPLES = "Examples"
+    RECORDINGS = "Recordings"
+    REGISTERED = "ManiSkill's tasks"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of the list. Its texts are printable, not escaped."""
+
+    number: int
+    """What a page sends to choose it; never given to another row while the program runs."""
+    section: Section
+    name: str
+    about: str
+    reference: str
+    """What is opened; empty for the recordings."""
+    file: Path | None = None
+    """Of the task; None for a registered id and for the recordings."""
+    gone: bool = False
+    """The file is not there any more."""
+    options: TaskOptions | None = None
+    """How it was opened last; None for the options of this run."""
+    env_id: str = ""
+    """The id whose picture it has; empty for none."""
+    blank: str = ""
+    """Stands where the picture would."""
+
+    def matches(self, words: list[str]) -> bool:
+        """Whether it has all of these words, in lower case."""
+        text = f"{self.name} {self.about} {self.section.value}".lower()
+        return all(word in text for word in words)
+
+
+@dataclass(frozen=True)
+class CatalogueView:
+    """The list at a moment."""
+
+    entries: tuple[Entry, ...] = ()
+    """In the order of the sections."""
+    folder: str = ""
+    searching: bool = False
+    left_out: str = ""
+    """Why the search may have missed files."""
+    registered: RegisteredView = RegisteredView()
+    serial: int = 0
+
+
+class Catalogue:
+    """Lists recent tasks, task files of a folder, examples, recordings and registered ids. Thread-safe.
+
+    A page chooses by number, so that it cannot name a path: `entry` knows only what was listed.
+
+    Args:
+        folder: searched for task files.
+        recordings: folder of recordings.
+        recents: what was opened before.
+        registered: ManiSkill's tasks.
+        options: for tasks without options of their own.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recordings: Path,
+        recents: RecentTasks,
+        registered: RegisteredTasks,
+        options: TaskOptions,
+    ) -> None:
+        self.folder = Path(os.path.realpath(folder))
+        self.recents, self.registered, self.options = recents, registered, options
+        self._recordings = recordings
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._searching: threading.Thread | None = None
+        self._numbers: dict[tuple[Section, str], int] = {}
+        self._found = FoundTasks()
+        self._seen: tuple[int, int] | None = None
+        self._changes = 0
+        self._view = CatalogueView(folder=_shown(str(self.folder)))
+
+    def refresh(self) -> None:
+        """Look at the folder and at the recent tasks again. Returns at once."""
+        self.registered.start()
+        with self._lock:
+            if self._closing.is_set() or (self._searching is not None and self._searching.is_alive()):
+                return
+            self._changes += 1
+            self._searching = threading.Thread(target=self._search, name="find-tasks", daemon=True)
+            self._searching.start()
+
+    def view(self) -> CatalogueView:
+        """The list; cheap while nothing changes."""
+        registered = self.registered.view
+        with self._lock:
+            now = self._changes, registered.serial
+            if now != self._seen:
+                self._seen = now
+                searching = self._searching is not None and self._searching.is_alive()
+                self._view = CatalogueView(
+                    tuple(self._entries(registered)),
+                    self._view.folder,
+                    searching,
+                    self._found.left_out,
+                    registered,
+                    self._view.serial + 1,
+                )
+            return self._view
+
+    def entry(self, number: int) -> Entry | None:
+        """The listed row of this number; None if there is none."""
+        return next((entry for entry in self.view().entries if entry.number == number), None)
+
+    def close(self) -> None:
+        """End the search and the process of the pictures."""
+        self._closing.set()
+        self.registered.close()
+        with self._lock:
+            searching = self._searching
+        if searching is not None:
+            searching.join()
+
+    def _search(self) -> None:
+        found = FoundTasks()
+        try:
+            found = find_task_files(self.folder, self._closing.is_set)
+        except Exception as error:
+            report_failure("The folder could not be searched for tasks", error)
+        with self._lock:
+            self._found, self._searching = found, None
+            self._changes += 1
+
+    # --- entries -------------------------------------------------------------------------------------
+
+    def _entries(self, registered: RegisteredView) -> Iterator[Entry]:
+        yield from map(self._recent, self.recents.list())
+        yield from map(self._of_folder, self._found.files)
+        for task in example_tasks():
+            yield self._entry(Section.EXAMPLES, str(task), task.name, _first_line(task), file=task)
+        yield self._entry(
+            Section.RECORDINGS,
+            "",
+            f"{self._recordings.name or self._recordings}/",
+            "Look through recorded episodes: play, compare, share"
+            if self._recordings.is_dir()
+            else "No episode was recorded yet; look for other folders with workbench review FOLDER",
+        )
+        why_not = registered.why_not
+        # Those that cannot be opened before something is downloaded come last.
+        for env_id in sorted(registered.ids, key=why_not.__contains__):
+            why = why_not.get(env_id)
+            entry = self._entry(
+                Section.REGISTERED, env_id, env_id, "" if why is None else why.text, env_id=env_id
+            )
+            blank = (
+                "" if why is None else "needs a download" if why.needs_download else "cannot be drawn here"
+            )
+            yield replace(entry, blank=blank)
+
+    def _recent(self, task: RecentTask) -> Entry:
+        file = task.file
+        num_envs = min(task.num_envs, MOST_ENVS)
+        options = replace(self.options, num_envs=num_envs, env_kwargs=dict(task.env_kwargs))
+        kwargs = "".join(f", {name}={value}" for name, value in task.env_kwargs.items())
+        how = f"{num_envs} {'env' if num_envs == 1 else 'envs'}{kwargs}"
+        if file is None:
+            return self._entry(
+                Section.RECENT, task.reference, task.reference, how, options=options, env_id=task.reference
+            )
+        name = task.reference.rpartition("/")[2]
+        about = f"{self._place(file)} · {how}"
+        return self._entry(
+            Section.RECENT, task.reference, name, about, file=file, gone=not file.is_file(), options=options
+        )
+
+    def _of_folder(self, task: TaskFile) -> Entry:
+        names = task.ids or task.classes
+        about = ", ".join((*names[:3], *(("…",) if len(names) > 3 else ())))
+        return self._entry(
+            Section.FOLDER, str(task.path), str(task.path.relative_to(self.folder)), about, file=task.path
+        )
+
+    def _place(self, file: Path) -> str:
+        """The folder of a file, as a person would write it."""
+        folder = file.parent
+        if folder.is_relative_to(self.folder):
+            inside = folder.relative_to(self.folder)
+            return "this folder" if inside == Path() else f"{inside}/"
+        home = Path.home()
+        return f"~/{folder.relative_to(home)}" if folder.is_relative_to(home) else str(folder)
+
+    def _entry(
+        self,
+        section: Section,
+        reference: str,
+        name: str,
+        about: str,
+        file: Path | None = None,
+        gone: bool = False,
+        options: TaskOptions | None = None,
+        env_id: str = "",
+    ) -> Entry:
+        number = self._numbers.setdefault((section, reference), len(self._numbers) + 1)
+        return Entry(number, section, _shown(name), _shown(about), reference, file, gone, options, env_id)
+
+
+def _shown(text: str) -> str:
+    return short_line(os.fsencode(text).decode(errors="replace"), LONGEST_SHOWN)
+
+
+@cache
+def _first_line(file: Path) -> str:
+    """The first line of the docstring of an example."""
+    try:
+        return (ast.get_docstring(ast.parse(file.read_bytes())) or "").partition("\n")[0]
+    except (OSError, SyntaxError, ValueError):
+        return ""
