@@ -46,6 +46,8 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Page]:
         _,
     ):
         page.get_by_role("tab", name="Studio").click()
+        # It does not open empty: the first sensor camera is chosen.
+        expect(page.get_by_label("Camera", exact=True)).to_have_value("base_camera · sensor")
         yield page
         assert not errors
 
