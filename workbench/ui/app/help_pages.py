@@ -133,6 +133,9 @@ def html_of(topic: Topic) -> str:
             token.attrSet("href", _address(topic, str(token.attrGet("href"))))
         elif token.type == "image":
             token.attrSet("src", _address(topic, str(token.attrGet("src"))))
+        elif token.attrGet("style") == "text-align:right":
+            # A style in a tag is refused by the policy.
+            token.attrs = {"class": "number"}
         elif token.type == "html_block":
             token.content = re.sub(
                 r'(src|srcset)="([^"]+)"', lambda m: f'{m[1]}="{_address(topic, m[2])}"', token.content
