@@ -21,7 +21,7 @@ import pytest
 from packaging.version import Version
 
 from tests.golden.make import GOLDEN
-from workbench.cli import main
+from workbench.cli import main, terminal
 from workbench.cli.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
@@ -175,7 +175,12 @@ def test_every_command_is_held(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("child_process", "renderer")
 @pytest.mark.parametrize("command", CALLS)
-def test_how_calls_end(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_how_calls_end(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Or what COLUMNS was when the consoles were made would count.
+    for console in (terminal.out, terminal.err):
+        monkeypatch.setattr(console, "width", 80)
     ends = []
     for call in CALLS[command]:
         code, said = run(capsys, call)

@@ -113,7 +113,7 @@ def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
 ) -> None:
     run = recorded.run(1)
     step, replay_result = replay_to(task, replace(run, action=run.action[:, :5]), 25, [1])
-    assert replay_result.way == "put there" and "5 numbers" in replay_result.missed["the way there"]
+    assert replay_result.way == "put there" and "5 dimensions" in replay_result.missed["the way there"]
     assert replay_result.metres is not None and replay_result.metres < 1e-6
     assert step.elapsed_steps[1] == 25
     robot = task.env.env.agent.robot

@@ -104,7 +104,7 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     assert ("human", "side") in moved(session.view())
     assert camera(session, ("human", "other")).now.position == away.position
     studio.file.plan(EditRequest("rename", ("human", "side"), name="front"))
-    assert written(session).message == f"side is front in {task_file.name} now."
+    assert written(session).message == f"side: renamed to front in {task_file.name} and verified."
     assert names(session) == ["render_camera", "front", "other"]
     assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
     for name in ("front", "other"):

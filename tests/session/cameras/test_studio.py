@@ -223,7 +223,9 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     assert task_file.read_bytes() == view.studio.edit_state.edit.new_text.encode()
     studio.file.undo_write()
     view = wait_until(
-        session, said(lambda s: "as it was before." in s.edit_state.message), "the file of before"
+        session,
+        said(lambda s: "Edit reverted in" in s.edit_state.message and s.edit_state.stage == "undone"),
+        "the file of before",
     )
     assert task_file.read_bytes() == before
     task_file.write_bytes(saved)
@@ -286,7 +288,11 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio.file.write()
     wait_until(session, said(lambda s: s.edit_state.stage == "checked"), "the version without it")
     studio.file.undo_write()
-    wait_until(session, said(lambda s: "as it was before." in s.edit_state.message), "the file of before")
+    wait_until(
+        session,
+        said(lambda s: "Edit reverted in" in s.edit_state.message and s.edit_state.stage == "undone"),
+        "the file of before",
+    )
     assert task_file.read_text() == before
     assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
     wait_until(session, seen_from(BASE, there), "the camera where it was placed")

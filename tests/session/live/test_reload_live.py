@@ -192,7 +192,7 @@ def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
     task_file.write_text(good + SECOND_TASK)
     view = arrived(session, good + SECOND_TASK)
     assert (view.task.class_name, view.task.others) == ("PushTheOtherEnv", ("PushCubeEnv",))
-    assert view.reload.level == "rebuilt" and "another task" in view.reload.reason
+    assert view.reload.level == "rebuilt" and "a different task" in view.reload.reason
     session.versions.choose_class("NobodysEnv")
     session.versions.choose_class("PushCubeEnv")
     view = wait_until(session, lambda v: v.task.class_name == "PushCubeEnv", "the other task")

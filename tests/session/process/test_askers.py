@@ -143,7 +143,7 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
             with pytest.raises(Stopped):
                 asked.result(timeout=30)
     else:
-        with pytest.raises(JobFailed, match="the process in the background sent what cannot be read"):
+        with pytest.raises(JobFailed, match="the process in the background sent unreadable data"):
             ensure()
     assert background.pid is None and not any(pid is not None and psutil.pid_exists(pid) for pid in pids)
     calm(file)

@@ -140,7 +140,7 @@ def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded
     ]
     told = {verdict.of.name: verdict for verdict in rescore(task, files, use_env_states=True, read=Held.read)}
     task.env.close()
-    assert "3 numbers" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
+    assert "3 dimensions" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
     assert told["no states"].why_not == "it holds no env states"
     assert told["fine"].why_not == "" and not told["fine"].differs
 

@@ -295,7 +295,7 @@ def test_a_level_that_is_asked_for_is_taken(desk: Desk, level: LoadLevel) -> Non
     desk.step(2)
     env = desk.task.env
     report = desk.save(desk.good, level)
-    assert report.level == level and "asked for" in report.reason
+    assert report.level == level and "requested" in report.reason
     assert (desk.task.env is env) == (level != "rebuilt")
     report = desk.edit("return reward\n", "return reward + 1\n", level)
     assert report.level == level

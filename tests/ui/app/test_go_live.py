@@ -103,7 +103,7 @@ def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
     desk.draw()
-    assert desk.go_live.going() == "putting Push-v1 into step 2 …" and desk.place.pages._wish is None
+    assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.place.pages._wish is None
     desk.live._handle(LoadFailed(problem(), kept=True))
     desk.draw()
     assert desk.go_live.going() == "" and desk.place.pages._wish == "live"
@@ -112,7 +112,7 @@ def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason
 def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
-    assert desk.go_live.going() == "waiting for permission to run the code of Pull-v1 may run"
+    assert desk.go_live.going() == "waiting for permission to run the code of Pull-v1"
     assert desk.place.session is desk.live and desk.opened == []
     desk.person.says_yes.set()
     until(lambda: desk.place.session is desk.other, "the other session")

@@ -202,7 +202,7 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
     said = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
     assert said == [
         ([], "|seed 7||reward by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
-        (["wb-same"], "|seed 5||as it was||10|"),
+        (["wb-same"], "|seed 5||unchanged||10|"),
         (["wb-same"], "|seed 6||not rescored: it has no step|||"),
     ]
     assert verdict_text.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
