@@ -270,7 +270,7 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
     message = written(session, "mismatch").message
     assert (
         "base_camera is not what was written (fov: 0.8, not 0.7)" in message
-        and "Take the change back" in message
+        and "Revert the change" in message
     )
     assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
     studio.file.undo_write()
@@ -321,7 +321,7 @@ def test_what_the_constructor_sets_is_edited_there_and_the_batch_stands_as_it_st
     session.studio.file.plan(EditRequest("edit", BASE))
     planned(session)
     assert session.view().step is step, "asking moved the batch"
-    assert written(session).message.startswith("base_camera is written")
+    assert written(session).message.startswith("base_camera: saved to")
     assert "self.eye = [0.45, 0.1, 0.7]" in task_file.read_text()
     assert there(session, BASE).position == pytest.approx((0.45, 0.1, 0.7), abs=1e-6)
     session.studio.file.drop_plan()
@@ -339,7 +339,7 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     planned(session)
     studio.file.write()
     view = wait_until(session, said(lambda s: "does not load" in s.edit_state.message), "the failure")
-    assert "take it back if that is the reason" in view.studio.edit_state.message
+    assert "revert it if that is the reason" in view.studio.edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
     studio.file.undo_write()

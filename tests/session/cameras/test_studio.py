@@ -224,7 +224,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio.file.undo_write()
     view = wait_until(
         session,
-        said(lambda s: "Edit reverted in" in s.edit_state.message and s.edit_state.stage == "undone"),
+        said(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
         "the file of before",
     )
     assert task_file.read_bytes() == before
@@ -290,7 +290,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio.file.undo_write()
     wait_until(
         session,
-        said(lambda s: "Edit reverted in" in s.edit_state.message and s.edit_state.stage == "undone"),
+        said(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
         "the file of before",
     )
     assert task_file.read_text() == before
