@@ -73,6 +73,15 @@ class CameraChange:
         name = "" if edit_state.edit is None else edit_state.edit.names
         self._drop.label = LEAVE if stage == "planned" else CLOSE
         self._write.label = f"Save to {name}" if name else "Save"
+        drawn = None if self._drawn is None else self._drawn[0]
+        if (
+            drawn is not None
+            and drawn.stage == stage
+            and drawn.picture is None
+            and edit_state.picture is not None
+        ):
+            # The picture of a plan comes later, and pushes the buttons out of sight.
+            self.arrival.asked(drawn)
         new = self.arrival.just_came(edit_state if stage != "none" else None)
         if self._drawn is None or self._drawn[0] is not edit_state or self._drawn[1:] != (stale, new):
             self._drawn = edit_state, stale, new
