@@ -102,7 +102,10 @@ def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(
 
 
 def test_each_part_of_the_reward_has_a_line_of_the_selected_env(panels: Panels, panel: CurvesPanel) -> None:
-    terms = {"reward_terms/reach": np.array([1.0, 2, 3]), "reward_terms/<b>": np.array([-1.0, -2, -3])}
+    terms: dict[str, Any] = {
+        "reward_terms/reach": np.array([1.0, 2, 3]),
+        "reward_terms/<b>": np.array([-1.0, -2, -3]),
+    }
     view = seen(4, 3, env=1, **terms)
     assert view.curves is not None
     panel.draw(replace(view, curves=replace(view.curves, no_curve=("sum",))))
