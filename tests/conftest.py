@@ -120,6 +120,13 @@ def configuration_folder_is_removed() -> Iterator[None]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def nothing_was_chosen_on_a_page_before() -> Iterator[None]:
+    """A file of tests that presses every button closes the hints too, for whichever file the process runs next."""
+    yield
+    Path(os.environ["XDG_CONFIG_HOME"], "workbench", "choices.json").unlink(missing_ok=True)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_process_left_behind() -> Iterator[None]:
     """Workers and browsers that tests started must be gone when the tests are."""
