@@ -20,7 +20,7 @@ from typing import Any, Literal
 import mani_skill
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.rules import Degree, Finding
+from workbench.core.rules import Degree, Finding, reason_of_silence
 
 MOST_ROWS = 64
 """Places that are kept; breaches at further places are only counted."""
@@ -131,6 +131,8 @@ class BrokenRules:
         if frames is not None:
             frames = frames or frames_of_the_task()
             place = place_of(frames)
+        if _is_silenced(place, rule):
+            return
         if degree == "stop":
             raise broken_at(BrokenRule(message, rule, place), frames or ())
         self._note(rule, message, place, subject, exact=frames is not None)
@@ -144,10 +146,11 @@ class BrokenRules:
 
     def returned(self, rule: str, hook: str, problem: str, place: Place | None) -> None:
         """As `report_breach`, for the return value of a hook."""
+        if self._degrees[rule] == "off" or _is_silenced(place, rule):
+            return
         if self._degrees[rule] == "stop":
             raise WrongReturn(problem, hook, rule, place)
-        if self._degrees[rule] == "warn":
-            self._note(rule, f"{hook}() {problem}.", place, hook, exact=False)
+        self._note(rule, f"{hook}() {problem}.", place, hook, exact=False)
 
     def _note(self, rule: str, message: str, place: Place | None, subject: Hashable, exact: bool) -> None:
         self.serial += 1
@@ -211,6 +214,10 @@ class BrokenRules:
             there = (*place, was.function)
             key = rule, there if subject == (was.file, was.line, was.function) else subject
             self._rows[key] = replace(row, finding=_at(was, there), confirmed=False)
+
+
+def _is_silenced(place: Place | None, rule: str) -> bool:
+    return place is not None and reason_of_silence(place[0], place[1], rule) is not None
 
 
 def _at(row: Finding, place: Place) -> Finding:

@@ -1,9 +1,14 @@
-"""The rules of GPU simulation, each with an id and a degree. Imports no simulator."""
+"""The rules of GPU simulation, each with an id and a degree, and how an author silences one. Imports no simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+import linecache
+import re
+import tokenize
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 Degree = Literal["stop", "warn", "off"]
@@ -23,6 +28,8 @@ class Rule:
     """What the task must do, in a sentence."""
     otherwise: str
     """What happens on the GPU if the task does not."""
+    hook: str = "_initialize_episode"
+    """The hook that it guards."""
 
 
 _TABLE = (
@@ -44,6 +51,7 @@ _TABLE = (
         "stop",
         "After a step, state is fetched before it is written and applied.",
         "Every body of every env is put back to before the step.",
+        "step",
     ),
     Rule(
         "rows-lost",
@@ -63,6 +71,7 @@ _TABLE = (
         "warn",
         "State that is set outside _initialize_episode is applied before other envs are reset.",
         "The reset of other envs applies it, at a moment that the task did not choose.",
+        "step",
     ),
     Rule(
         "not-applied",
@@ -70,48 +79,56 @@ _TABLE = (
         "State that is set outside _initialize_episode is applied (scene._gpu_apply_all(), then "
         "scene._gpu_fetch_all()) before the next fetch.",
         "Physics never sees it; pictures do.",
+        "step",
     ),
     Rule(
         "link-pose-set",
         "warn",
         "Links are moved by the qpos and the root pose of their articulation.",
         "Physics never sees the pose of a link; pictures do.",
+        "step",
     ),
     Rule(
         "read-before-fetch",
         "warn",
         "After a step, state is fetched before it is read.",
         "A read gives the state before the step.",
+        "step",
     ),
     Rule(
         "link-before-update",
         "warn",
         "After qpos or a root pose was set, links are read after gpu_update_articulation_kinematics().",
         "The links are still where they were.",
+        "step",
     ),
     Rule(
         "behind-the-tensors",
         "warn",
         "State is set through ManiSkill's objects, not through SAPIEN's.",
         "Nothing: the GPU's simulation does not look there.",
+        "step",
     ),
     Rule(
         "evaluate-rows",
         "stop",
         "evaluate() returns a row for each env.",
         "It is broadcast over the envs, or fails far away.",
+        "evaluate",
     ),
     Rule(
         "reward-rows",
         "warn",
         "The reward is a floating tensor with a number for each env.",
         "It is broadcast over the envs, into (N, N) in a trainer.",
+        "compute_dense_reward",
     ),
     Rule(
         "observation-rows",
         "warn",
         "Observations have a row for each env.",
         "They are broadcast over the envs, or fail far away.",
+        "_get_obs_extra",
     ),
 )
 RULES: Mapping[str, Rule] = {rule.id: rule for rule in _TABLE}
@@ -155,3 +172,79 @@ class Finding:
     def key(self) -> tuple[str, str | None, str, str]:
         """Stays the same when lines around it move."""
         return self.rule, self.file, self.function, self.code
+
+
+# --- silenced in the source ------------------------------------------------------------------------------
+# ``# workbench: off[reward-rows] one env only, see the paper`` stands in the line of the finding, alone in the line above, or
+# in the ``def`` or ``class`` line around it. Without a reason it silences nothing, and `reasonless` finds it.
+
+_COMMENT = re.compile(r"#\s*workbench:\s*off\[([\w\s,-]*)\]\s*(.*)")
+
+
+@dataclass(frozen=True)
+class Silence:
+    """One comment."""
+
+    line: int
+    """1-based."""
+    rules: frozenset[str]
+    reason: str
+    alone: bool
+    """Whether nothing else is in its line."""
+
+
+def silences(text: str) -> tuple[Silence, ...]:
+    """The comments of a file's text; none of a text that Python cannot read."""
+    return _read(text)[0]
+
+
+def reason_of_silence(file: str | None, line: int | None, rule: str) -> str | None:
+    """Why a finding at this line is silenced; None if it is not."""
+    if file is None or line is None or file.startswith("<"):
+        return None
+    found, scopes = _read("".join(linecache.getlines(file)))
+    if not found:
+        return None
+    # A decorator belongs to its function: a finding may be placed at either.
+    heads = {head for first, head, last in scopes if first <= line <= last}
+    for one in found:
+        here = one.line == line or one.line in heads or (one.alone and one.line == line - 1)
+        if here and rule in one.rules and one.reason:
+            return one.reason
+    return None
+
+
+def reasonless(file: str) -> list[tuple[int, str]]:
+    """Line and rules of the comments of a file that lack a reason."""
+    found, _ = _read("".join(linecache.getlines(file)))
+    return [(one.line, ", ".join(sorted(one.rules))) for one in found if not one.reason]
+
+
+@lru_cache(maxsize=64)
+def _read(text: str) -> tuple[tuple[Silence, ...], tuple[tuple[int, int, int], ...]]:
+    """The comments, and (first, head, last) line of each function and class."""
+    if "workbench:" not in text:
+        return (), ()
+    try:
+        found = tuple(_comments(text))
+        scopes = tuple(_scopes(ast.parse(text)))
+    except (SyntaxError, tokenize.TokenError, ValueError, RecursionError):
+        return (), ()
+    return found, scopes
+
+
+def _comments(text: str) -> Iterator[Silence]:
+    lines = iter(text.splitlines(keepends=True))
+    for token in tokenize.generate_tokens(lambda: next(lines, "")):
+        if token.type != tokenize.COMMENT or (match := _COMMENT.match(token.string)) is None:
+            continue
+        rules = frozenset(re.split(r"[\s,]+", match[1].strip())) - {""}
+        alone = not token.line[: token.start[1]].strip()
+        yield Silence(token.start[0], rules, match[2].strip(" -–:"), alone)
+
+
+def _scopes(tree: ast.Module) -> Iterator[tuple[int, int, int]]:
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            first = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+            yield first, node.lineno, node.end_lineno or node.lineno

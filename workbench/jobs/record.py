@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.reference import named_file
 from workbench.core.broken_rule import warn_of
 from workbench.core.cameras.render import recorded_pictures, step_pictures
@@ -21,7 +22,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SUFFIXES, ActionChooser, RecordActionChooser, read_actions
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
-from workbench.jobs.open_task import OpenedTask, blamed, open_task
+from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.policy import find_policy
 from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work, envs_per_process
 from workbench.jobs.replay import restore_recorded

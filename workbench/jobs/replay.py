@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.loading.blamed import blamed
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import (
     new_physics,
@@ -22,7 +23,7 @@ from workbench.core.capture.recorded_state import (
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.snapshot import Snapshot, step_only
-from workbench.jobs.open_task import OpenedTask, blamed
+from workbench.jobs.open_task import OpenedTask
 from workbench.machine.text import length
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states, state_distance
@@ -17,7 +18,7 @@ from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.snapshot import step_only
 from workbench.jobs.from_recording import run_of
-from workbench.jobs.open_task import OpenedTask, blamed
+from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayable
 from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
 from workbench.recording.episode.episode import Episode

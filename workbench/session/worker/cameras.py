@@ -13,6 +13,7 @@ from typing import Any
 
 from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.camera_source.run_hooks import run_hooks
+from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
 from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.problem import problem_from_exception
@@ -43,7 +44,7 @@ from workbench.core.cameras.visibility import (
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.hot_swap import keep_observation_space, put_class, undone
 from workbench.core.env.task_env import TaskEnv
-from workbench.jobs.open_task import OpenedTask, blamed
+from workbench.jobs.open_task import OpenedTask
 from workbench.session.protocol.messages import (
     CameraRequest,
     CannotAnswer,

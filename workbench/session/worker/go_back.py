@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from itertools import count
 
+from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.problem import Interrupted, TaskError
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
@@ -20,7 +21,7 @@ from workbench.core.snapshots.snapshot import (
     step_only,
 )
 from workbench.jobs.from_recording import changed_since
-from workbench.jobs.open_task import OpenedTask, blamed
+from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.replay import replay_text, replay_to
 from workbench.jobs.task import NO_MOMENT, Restored
 from workbench.session.protocol.messages import EnterRecording, Restore

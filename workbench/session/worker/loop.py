@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.core.capture.inspect_env import inspect_env
@@ -20,7 +21,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import ActionChooser
-from workbench.jobs.open_task import OpenedTask, Opening, blamed, warm_up
+from workbench.jobs.open_task import OpenedTask, Opening, warm_up
 from workbench.jobs.task import Restored
 from workbench.jobs.verdict import Rescore
 from workbench.machine.folders import CurrentFolder

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, undo_load, with_late_imports
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.reference import reference_to_class
@@ -32,7 +33,6 @@ from workbench.jobs.open_task import (
     Clock,
     OpenedTask,
     Opening,
-    blamed,
     build_task,
     import_task,
     notices_of,

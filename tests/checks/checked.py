@@ -1,0 +1,70 @@
+"""Runs the check of one rule on an edited copy of the example task, or on a text."""
+
+from __future__ import annotations
+
+import linecache
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from workbench.authoring.loading.load import load_task, undo_load
+from workbench.checks.checkup import Checkup
+from workbench.checks.rules import RULES
+from workbench.checks.run import GROUPS, RuleResult, core_results, run_group
+from workbench.core.rules import Finding
+
+EXAMPLE = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+Edits = tuple[tuple[str, str], ...]
+Checked = Callable[..., RuleResult]
+
+
+@pytest.fixture
+def checked(tmp_path: Path) -> Checked:
+    """``checked(rule, (old, new), ..., text=..., num_envs=4, seeds=8, **env_kwargs)``: the rule's result.
+
+    Each `old` must be in the text, which is the example's by default.
+    """
+
+    def check(
+        rule: str,
+        *edits: tuple[str, str],
+        text: str | None = None,
+        num_envs: int = 4,
+        seeds: int = 8,
+        **env_kwargs: Any,
+    ) -> RuleResult:
+        file = tmp_path / "task.py"
+        content = EXAMPLE.read_text() if text is None else text
+        for old, new in edits:
+            assert old in content, old
+            content = content.replace(old, new)
+        file.write_text(content)
+        linecache.checkcache(str(file))
+        return check_rule(rule, str(file), num_envs=num_envs, seeds=seeds, **env_kwargs)
+
+    return check
+
+
+def check_rule(rule: str, reference: str, num_envs: int, seeds: int, **env_kwargs: Any) -> RuleResult:
+    """The result of one rule on a task file or an id."""
+    degrees = dict.fromkeys(RULES, "off") | {rule: RULES[rule].degree}
+    loaded = load_task(reference)
+    checkup = Checkup(loaded, env_kwargs, num_envs=num_envs, seeds=seeds)
+    results: list[RuleResult] = []
+    try:
+        for group in GROUPS:
+            results += run_group(group, checkup, degrees)  # type: ignore[arg-type]
+        results += core_results(checkup.findings, degrees)  # type: ignore[arg-type]
+    finally:
+        checkup.close()
+        undo_load(loaded)
+    return next(result for result in results if result.rule == rule)
+
+
+def the_finding(result: RuleResult) -> Finding:
+    """The only finding of a rule that is broken."""
+    assert result.state == "broken", result
+    (finding,) = result.findings
+    return finding

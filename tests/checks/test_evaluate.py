@@ -1,0 +1,77 @@
+"""Rules of what ``evaluate`` says, each with a task that breaks it and one that keeps it."""
+
+from __future__ import annotations
+
+from tests.checks.checked import Checked, the_finding
+
+
+def test_success_right_after_a_reset(checked: Checked) -> None:
+    finding = the_finding(checked("success-at-reset", ("(distance < GOAL_RADIUS)", "(distance < 1)")))
+    assert finding.count == 8 and "8 of 8 seeds" in finding.message and finding.degree == "stop"
+    assert finding.code.startswith('"success": (distance < 1)') and finding.function == "evaluate"
+
+
+def test_no_success_at_a_reset_keeps_it(checked: Checked) -> None:
+    assert checked("success-at-reset").state == "kept"
+
+
+def test_no_entry_for_success(checked: Checked) -> None:
+    finding = the_finding(
+        checked(
+            "success-stays-possible",
+            ('"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),', ""),
+            ('"fail": height < -0.1,', ""),
+            ('reward[info["success"]] = 3', ""),
+            ('reward[info["fail"]] = 0', ""),
+        )
+    )
+    assert finding.code.startswith("def evaluate")
+
+
+def test_how_many_random_episodes_succeed_is_noted(checked: Checked) -> None:
+    result = checked(
+        "success-stays-possible", ('"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)')
+    )
+    assert result.state == "kept" and result.notes == ("success in 8 of 8 random episodes",)
+
+
+def test_an_entry_that_is_nearly_success(checked: Checked) -> None:
+    finding = the_finding(
+        checked("entry-name", ('"success": (dist', '"succes": (dist'), ('info["success"]', 'info["succes"]'))
+    )
+    assert "'succes'" in finding.message and finding.code.startswith('"succes"')
+
+
+def test_other_entries_are_no_typo(checked: Checked) -> None:
+    assert checked("entry-name").state == "kept"
+
+
+def test_success_and_fail_together(checked: Checked) -> None:
+    edits = (
+        ('"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)'),
+        ("height < -0.1", "height < 1"),
+    )
+    assert "`success & ~fail`" in the_finding(checked("success-and-fail", *edits)).message
+    assert checked("success-and-fail").state == "kept"
+
+
+def test_success_that_is_true_for_a_single_step_at_a_time(checked: Checked) -> None:
+    flickers = '"success": (distance < 1) & (self.elapsed_steps % 2 == 1)'
+    finding = the_finding(checked("success-flickers", ('"success": (distance < GOAL_RADIUS)', flickers)))
+    assert "single step" in finding.message
+    lasts = '"success": (distance < 1) & (self.elapsed_steps > 2)'
+    assert checked("success-flickers", ('"success": (distance < GOAL_RADIUS)', lasts)).state == "kept"
+
+
+def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:
+    easy = '"success": (distance < 1) & (height.abs() < 0.005),'
+    edit = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
+    why = "begins where another task ends"
+    result = checked("success-at-reset", (edit, f"{easy}  # workbench: off[success-at-reset] {why}"))
+    assert result.state == "silenced" and result.silenced[0].reason == why and not result.findings
+    assert (
+        checked("success-at-reset", (edit, f"{easy}  # workbench: off[success-at-reset]")).state == "broken"
+    )
+    assert (
+        checked("success-at-reset", (edit, f"{easy}  # workbench: off[reward-rows] {why}")).state == "broken"
+    )

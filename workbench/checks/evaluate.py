@@ -1,0 +1,111 @@
+"""Checks of what ``evaluate`` says: success and fail, and the names of its entries."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+
+READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
+FLICKER_SHARE = 0.25
+"""Of the steps on which success was true for the first time and gone at the next."""
+
+
+def success_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over all seeds."""
+    success = _flag(checkup.starts, "success")[0]
+    if success.any():
+        seeds = [seed for seed, true in zip(checkup.starts.seeds, success, strict=True) if true]
+        yield Found(
+            f"success is true right after the reset of {of(len(seeds), len(success), 'seed')} (seed {listed(seeds)}): "
+            "the episode would end at its first step. Place the bodies away from the goal, or ask in evaluate() for "
+            "more than they have at the start.",
+            checkup.places.entry("success"),
+            len(seeds),
+        )
+
+
+def success_and_fail(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts."""
+    both = _flag(checkup.random, "success") & _flag(checkup.random, "fail")
+    if both.any():
+        step, env = (int(i) for i in np.argwhere(both)[0])
+        yield Found(
+            f"success and fail are both true in {of(int(both.any(axis=0).sum()), both.shape[1], 'episode')}, first at "
+            f"step {step} of seed {checkup.random.seeds[env]}. Write `success & ~fail`.",
+            checkup.places.entry("success"),
+            int(both.sum()),
+        )
+
+
+def success_flickers(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts that succeed."""
+    success = _flag(checkup.random, "success")
+    begun = success[1:-1] & ~success[:-2]
+    if not begun.any():
+        raise CannotCheck("no random episode succeeds")
+    gone = begun & ~success[2:]
+    if gone.sum() > max(1, FLICKER_SHARE * begun.sum()):
+        yield Found(
+            f"success is true for a single step {int(gone.sum())} of {int(begun.sum())} times. Ask for a state that "
+            "lasts, such as `is_robot_static` or a count of steps, or an easier threshold.",
+            checkup.places.entry("success"),
+            int(gone.sum()),
+        )
+
+
+def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
+    """Whether there is an entry at all, and whether random actions reach it."""
+    entries = checkup.starts.evaluate
+    if "success" not in entries and "fail" not in entries:
+        yield Found(
+            "evaluate() returns neither success nor fail: no episode ends before its time limit, and no success rate "
+            "is counted. Return {'success': ...} as a bool tensor with a row for each env.",
+            checkup.places.hook("evaluate"),
+        )
+    elif "success" in entries:
+        reached = int(checkup.random.evaluate["success"].any(axis=0).sum())
+        yield Note(f"success in {of(reached, len(checkup.random.seeds), 'random episode')}")
+
+
+def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
+    """Entries one or two letters away from one that ManiSkill reads."""
+    for name in checkup.starts.evaluate:
+        for known in READ_BY_MANISKILL:
+            close = difflib.SequenceMatcher(None, name.lower(), known).ratio() >= 0.8
+            if name != known and known not in checkup.starts.evaluate and close and "/" not in name:
+                yield Found(
+                    f"evaluate() returns {name!r}, and ManiSkill reads {known!r}. Rename the entry.",
+                    checkup.places.entry(name),
+                )
+
+
+def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
+    """(T + 1, K)"""
+    rows = episodes.evaluate.get(name)
+    if rows is None:
+        raise CannotCheck(f"evaluate() has no entry {name}")
+    return rows.reshape(*rows.shape[:2], -1).astype(bool).any(axis=2)
+
+
+def of(count: int, total: int, what: str) -> str:
+    """``3 of 32 seeds``."""
+    return f"{count} of {total} {what}{'' if total == 1 else 's'}"
+
+
+def listed(values: list[int], most: int = 5) -> str:
+    """``1, 2, 3 ...``."""
+    return ", ".join(map(str, values[:most])) + (" ..." if len(values) > most else "")
+
+
+CHECKS: Mapping[str, Check] = {
+    "success-at-reset": success_at_reset,
+    "success-stays-possible": success_stays_possible,
+    "entry-name": entry_name,
+    "success-and-fail": success_and_fail,
+    "success-flickers": success_flickers,
+}

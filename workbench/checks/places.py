@@ -1,0 +1,124 @@
+"""Where in the author's source a finding belongs."""
+
+from __future__ import annotations
+
+import ast
+import linecache
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+from workbench.authoring.loading.load import LoadedTask
+from workbench.authoring.problem import hook_definition
+from workbench.core.broken_rule import Place
+
+
+@dataclass(frozen=True)
+class Module:
+    """A parsed file of the author."""
+
+    file: str
+    tree: ast.Module
+
+    @cached_property
+    def functions(self) -> tuple[ast.FunctionDef, ...]:
+        return tuple(node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef))
+
+    def place(self, node: ast.AST, function: str = "") -> Place:
+        line: int = getattr(node, "lineno", 1)
+        inside = [f for f in self.functions if f.lineno <= line <= (f.end_lineno or f.lineno)]
+        return self.file, line, function or (inside[-1].name if inside else "")
+
+
+class Places:
+    """Lines of one version of a task."""
+
+    def __init__(self, loaded: LoadedTask) -> None:
+        self._loaded = loaded
+
+    @cached_property
+    def modules(self) -> tuple[Module, ...]:
+        """The task's file first. Files that are no Python are left out: they were executed, so there are none."""
+        texts = {str(file): self._text(str(file)) for file in self._loaded.source_files}
+        return tuple(Module(file, ast.parse(text)) for file, text in texts.items())
+
+    def _text(self, file: str) -> str:
+        return self._loaded.source.get(file) or "".join(linecache.getlines(file))
+
+    def hook(self, *names: str) -> Place | None:
+        """The ``def`` of the first of these hooks that the author's files have; else the class."""
+        found = hook_definition(self._loaded.cls, names, self._loaded.source_files)
+        return self.task if found is None else (*found[1], found[0])
+
+    @cached_property
+    def task(self) -> Place | None:
+        """The ``class`` line."""
+        for module in self.modules:
+            for node in ast.walk(module.tree):
+                if isinstance(node, ast.ClassDef) and node.name == self._loaded.class_name:
+                    return module.file, node.lineno, node.name
+        return None
+
+    def functions(self, *names: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
+        """The functions of these names in the author's files; all if none is named."""
+        for module in self.modules:
+            for function in module.functions:
+                if not names or function.name in names:
+                    yield module, function
+
+    def entry(self, name: str) -> Place | None:
+        """Where ``evaluate`` makes this entry, as a key or a keyword; else its ``def``."""
+        for module, function in self.functions("evaluate"):
+            for node in ast.walk(function):
+                if isinstance(node, ast.Constant) and node.value == name:
+                    return module.place(node, "evaluate")
+                if isinstance(node, ast.keyword) and node.arg == name:
+                    return module.place(node.value, "evaluate")
+        return self.hook("evaluate")
+
+    def body(self, name: str, *hooks: str) -> Place | None:
+        """Where a body is made or placed.
+
+        Args:
+            name: as in `SceneIndex.names`.
+            hooks: the functions to search, in order; then the hook's ``def``. First for a line that places
+                the attribute that holds the body, then for one that names it.
+        """
+        owner = name.split("/", 1)[0]
+        attributes = set(self._attributes_of(owner))
+        for hook in hooks:
+            for module, function in self.functions(hook):
+                for node in ast.walk(function):
+                    if _places(node, attributes):
+                        return module.place(node, hook)
+        for module, function in self.functions():
+            for node in ast.walk(function):
+                if isinstance(node, ast.Constant) and node.value == owner:
+                    return module.place(node, function.name)
+        return self.hook(*hooks)
+
+    def _attributes_of(self, owner: str) -> Iterator[str]:
+        """Names of ``self.x`` that are assigned in a statement which has the body's name in it, and the name itself."""
+        yield owner
+        if any(robot in owner for robot in ("panda", "robot", "agent")):
+            yield from ("agent", "robot")
+        for _, function in self.functions():
+            for node in ast.walk(function):
+                if not isinstance(node, ast.Assign):
+                    continue
+                named = any(
+                    isinstance(part, ast.Constant) and part.value == owner for part in ast.walk(node.value)
+                )
+                for target in node.targets:
+                    if named and isinstance(target, ast.Attribute):
+                        yield target.attr
+
+
+def _places(node: ast.AST, attributes: set[str]) -> bool:
+    """Whether it is ``self.<attribute>....set_...(...)``."""
+    if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+        return False
+    if not node.func.attr.startswith("set_"):
+        return False
+    parts = [part.attr for part in ast.walk(node.func.value) if isinstance(part, ast.Attribute)]
+    return not attributes.isdisjoint(parts)

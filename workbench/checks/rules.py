@@ -1,0 +1,457 @@
+"""The rules of `workbench check`, with those of GPU simulation in one table. Imports no simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from workbench.core import rules as core_rules
+from workbench.core.rules import Degree, Rule
+
+_TABLE = (
+    # --- the class and its file -----------------------------------------------------------------------
+    Rule(
+        "registered",
+        "warn",
+        "The class inherits BaseEnv and is registered with @register_env.",
+        "gym.make, ManiSkill's own commands and trainers cannot make it.",
+        "class",
+    ),
+    Rule(
+        "versioned-id",
+        "warn",
+        "The registered id ends in a version (-v1).",
+        "A later change of the task cannot be told from the earlier one in results.",
+        "class",
+    ),
+    Rule(
+        "time-limit",
+        "warn",
+        "@register_env has max_episode_steps.",
+        "Episodes end at success or failure only: a policy that reaches neither never resets.",
+        "class",
+    ),
+    Rule(
+        "id-taken",
+        "warn",
+        "No other task has the registered id.",
+        "Stock ManiSkill skips the registration, and gym.make gives the other task.",
+        "class",
+    ),
+    Rule(
+        "supported-robots",
+        "warn",
+        "SUPPORTED_ROBOTS lists the robots, with the default of robot_uids among them.",
+        "ManiSkill warns about each env, and nobody knows which robots were tried.",
+        "class",
+    ),
+    Rule(
+        "reward-modes",
+        "warn",
+        "Each of SUPPORTED_REWARD_MODES has its method.",
+        "The first step in that mode raises NotImplementedError.",
+        "class",
+    ),
+    Rule(
+        "unknown-name",
+        "warn",
+        "Attributes that are set on builders, and methods that are called on self and the scene, exist.",
+        "A typo on a builder (inital_pose) is ignored silently; a call that does not exist fails when it is reached.",
+        "class",
+    ),
+    Rule(
+        "unseeded-random",
+        "warn",
+        "Random numbers come from torch in _initialize_episode, and from self._batched_episode_rng where the scene is built.",
+        "The same seed gives another episode each time: nothing can be reproduced.",
+        "class",
+    ),
+    Rule(
+        "backend-only-call",
+        "warn",
+        "Calls that only one backend has stand behind `if self.gpu_sim_enabled:` or its opposite.",
+        "The task runs on the CPU or on the GPU, and fails on the other.",
+        "class",
+    ),
+    Rule(
+        "missing-file",
+        "stop",
+        "Files that the task names exist.",
+        "It cannot be built on another machine.",
+        "class",
+    ),
+    Rule(
+        "undeclared-assets",
+        "warn",
+        "Assets that need a download are named in asset_download_ids.",
+        "ManiSkill asks for the download at a prompt, where a cluster has none, or fails to find the files.",
+        "class",
+    ),
+    # --- _load_agent, _load_scene --------------------------------------------------------------------------
+    Rule(
+        "robot-pose",
+        "warn",
+        "_load_agent gives the robot an initial pose.",
+        "It is built at the origin, inside whatever stands there, and the GPU starts with the collision.",
+        "_load_agent",
+    ),
+    Rule(
+        "initial-pose",
+        "warn",
+        "Every builder has an initial_pose before it is built.",
+        "Bodies are built inside each other at the origin; on the GPU that first collision can stay in the simulation.",
+        "_load_scene",
+    ),
+    Rule(
+        "overlap-at-load",
+        "warn",
+        "Bodies do not overlap where they are built, before the first reset.",
+        "The GPU's simulation may begin with an explosion and needs more memory for contacts.",
+        "_load_scene",
+    ),
+    Rule(
+        "kinematic-never-moved",
+        "warn",
+        "A body that is never moved is built static.",
+        "A kinematic body costs GPU memory and time in each of thousands of envs.",
+        "_load_scene",
+    ),
+    Rule(
+        "body-names",
+        "warn",
+        "Bodies have names, each its own.",
+        "ManiSkill overwrites the first body of that name in the state, so it is neither saved nor restored.",
+        "_load_scene",
+    ),
+    Rule(
+        "too-many-links",
+        "warn",
+        "An articulation has at most 64 links.",
+        "PhysX on the GPU refuses more.",
+        "_load_scene",
+    ),
+    Rule(
+        "hull-fills-hollow",
+        "warn",
+        "A hollow mesh is not replaced by its convex hull for collisions.",
+        "Nothing can be put into a bowl or a box: an invisible lid is in the way.",
+        "_load_scene",
+    ),
+    Rule(
+        "decomposition-at-load",
+        "warn",
+        "Convex decompositions are made once, not at every build.",
+        "Every process that makes the task waits for it, seconds to minutes a mesh.",
+        "_load_scene",
+    ),
+    Rule(
+        "heavy-mesh",
+        "warn",
+        "Drawn meshes have at most 100,000 triangles.",
+        "Pictures are slow, and each env of a GPU renderer needs its memory.",
+        "_load_scene",
+    ),
+    Rule(
+        "merged-actors",
+        "warn",
+        "Of actors that are made per env and merged, only the merged one is in the state.",
+        "The state dict has leaves of another batch size: it cannot be saved, sliced or restored.",
+        "_load_scene",
+    ),
+    Rule(
+        "reconfigures",
+        "warn",
+        "A scene that is built at random is rebuilt now and then (reconfiguration_freq), at one env at each reset.",
+        "One env trains on the same objects for ever.",
+        "_load_scene",
+    ),
+    Rule(
+        "frequencies",
+        "warn",
+        "sim_freq is a multiple of control_freq.",
+        "A control step has not the length that control_freq says.",
+        "_default_sim_config",
+    ),
+    Rule(
+        "env-spacing",
+        "warn",
+        "What moves stays within half of the spacing between envs (scene_config, sim_config.spacing).",
+        "On the GPU all envs share one space: bodies of neighbours meet.",
+        "_default_sim_config",
+    ),
+    # --- _initialize_episode ---------------------------------------------------------------------------------
+    Rule(
+        "batch-of-reset",
+        "warn",
+        "_initialize_episode makes tensors of len(env_idx) rows, not of self.num_envs.",
+        "A partial reset, which every trainer does, fails or writes rows of other envs.",
+    ),
+    Rule(
+        "runs",
+        "stop",
+        "Resets of any subset of envs with any seed, and steps with any action, work.",
+        "Training ends there.",
+    ),
+    Rule(
+        "overlap-at-reset",
+        "warn",
+        "Bodies do not overlap after a reset.",
+        "They are pushed apart in the first steps, often far away, and the policy learns from that.",
+    ),
+    Rule(
+        "falls-at-reset",
+        "warn",
+        "Bodies stay where a reset puts them while the robot holds still.",
+        "Episodes begin with falling, drifting or exploding bodies, in another state than the reset says.",
+    ),
+    Rule(
+        "robot-holds",
+        "warn",
+        "The robot holds the pose of a reset while its targets are not changed.",
+        "It sags or swings before the policy acts; stiffness, damping or force limits are too low.",
+    ),
+    Rule(
+        "outside-reach",
+        "warn",
+        "What the robot is to touch lies within its reach.",
+        "Part of the episodes cannot be solved by anybody.",
+    ),
+    Rule(
+        "unit-quaternion",
+        "warn",
+        "Quaternions that are set have length 1.",
+        "Pictures, matrices and distances come out scaled or turned.",
+    ),
+    Rule(
+        "quaternion-order",
+        "warn",
+        "Quaternions are in the order w, x, y, z.",
+        "Bodies lie on their sides or upside down (x, y, z, w is SciPy's and ROS's order).",
+    ),
+    # --- evaluate --------------------------------------------------------------------------------------------
+    Rule(
+        "success-at-reset",
+        "stop",
+        "evaluate() does not report success right after a reset.",
+        "Episodes end before the policy acts, and the success rate counts them.",
+        "evaluate",
+    ),
+    Rule(
+        "success-and-fail",
+        "warn",
+        "success and fail are never true together.",
+        "An episode counts as both.",
+        "evaluate",
+    ),
+    Rule(
+        "success-flickers",
+        "warn",
+        "success holds for some steps once it is true.",
+        "Whether an episode counts depends on the step at which it is looked at.",
+        "evaluate",
+    ),
+    Rule(
+        "success-stays-possible",
+        "warn",
+        "evaluate() has an entry success (or fail).",
+        "No episode ends early, and no success rate can be counted.",
+        "evaluate",
+    ),
+    Rule(
+        "entry-name",
+        "warn",
+        "An entry of evaluate() that ManiSkill reads is spelt as it reads it.",
+        "'succes' is passed on as any other entry, and no episode ever succeeds.",
+        "evaluate",
+    ),
+    Rule(
+        "info-rows",
+        "warn",
+        "Every entry of evaluate() has a row for each env.",
+        "Vectorised wrappers and loggers cannot slice it by env, and fail or drop it.",
+        "evaluate",
+    ),
+    # --- rewards ---------------------------------------------------------------------------------------------
+    Rule(
+        "reward-finite",
+        "stop",
+        "Rewards are finite, also at the edges of joints and table.",
+        "One NaN makes the whole network NaN.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "reward-changes",
+        "warn",
+        "A dense reward changes while the robot moves.",
+        "There is nothing to learn from.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "reward-normalized",
+        "warn",
+        "The normalized dense reward lies within -1 and 1.",
+        "Learning rates and clipping of trainers expect that range.",
+        "compute_normalized_dense_reward",
+    ),
+    Rule(
+        "reward-ratio",
+        "warn",
+        "The normalized dense reward is the dense reward divided by a constant.",
+        "The two modes train different tasks.",
+        "compute_normalized_dense_reward",
+    ),
+    Rule(
+        "reward-order",
+        "warn",
+        "At success the dense reward is not lower than elsewhere in the same episode.",
+        "Policies learn to avoid success.",
+        "compute_dense_reward",
+    ),
+    # --- reproducibility -------------------------------------------------------------------------------------
+    Rule(
+        "same-seed",
+        "stop",
+        "The same seed gives the same state after a reset, whatever came before.",
+        "Runs, demonstrations and bugs cannot be reproduced.",
+    ),
+    Rule(
+        "same-for-any-batch",
+        "warn",
+        "What is built for a seed does not depend on the number of envs.",
+        "A demonstration that was recorded with one env shows other objects when it is replayed among many.",
+        "_load_scene",
+    ),
+    Rule(
+        "state-restores",
+        "warn",
+        "The state dict restores evaluate(), reward and observation.",
+        "Replayed demonstrations, state-based resets and planners see another goal than the recorded one.",
+        "get_state_dict",
+    ),
+    Rule(
+        "actions-replay",
+        "warn",
+        "The same actions from the same seed give the same episode.",
+        "Demonstrations cannot be replayed.",
+        "step",
+    ),
+    # --- observations ----------------------------------------------------------------------------------------
+    Rule(
+        "observation-finite",
+        "stop",
+        "Observations are finite.",
+        "One NaN makes the whole network NaN.",
+        "_get_obs_extra",
+    ),
+    Rule(
+        "observation-constant",
+        "warn",
+        "Numbers of an observation differ between episodes or steps.",
+        "They carry nothing, and normalisers divide by their zero variance.",
+        "_get_obs_extra",
+    ),
+    Rule(
+        "observation-huge",
+        "warn",
+        "Numbers of an observation are below 1000.",
+        "They drown all others in a network without normalisation; most often a hidden body or a wrong unit.",
+        "_get_obs_extra",
+    ),
+    Rule(
+        "ground-truth",
+        "warn",
+        "In visual modes _get_obs_extra leaves out the state of objects (if self.obs_mode_struct.use_state).",
+        "A policy from pictures is told what it should see, and cannot run on a real robot.",
+        "_get_obs_extra",
+    ),
+    Rule(
+        "hidden-goal",
+        "warn",
+        "A goal that is hidden from pictures is in _get_obs_extra.",
+        "The policy cannot know what to do.",
+        "_get_obs_extra",
+    ),
+    # --- cameras ---------------------------------------------------------------------------------------------
+    Rule(
+        "camera-sees",
+        "warn",
+        "Each sensor camera, or one of them, sees the objects of the task.",
+        "What a policy must act on is not in its pictures.",
+        "_default_sensor_configs",
+    ),
+    Rule(
+        "camera-background",
+        "warn",
+        "A sensor camera looks at a scene: at most half of its pixels are empty background.",
+        "Depth is 0 there, and pixels are spent on nothing.",
+        "_default_sensor_configs",
+    ),
+    Rule(
+        "camera-pose",
+        "warn",
+        "A camera's quaternion has length 1.",
+        "Extrinsics come out scaled: look_at straight down or up does this (tilt the view a little).",
+        "_default_sensor_configs",
+    ),
+    Rule(
+        "camera-names",
+        "warn",
+        "Cameras of task, robot and people have different names.",
+        "One of them is replaced silently, or its override fails.",
+        "_default_sensor_configs",
+    ),
+    Rule(
+        "camera-size",
+        "warn",
+        "A sensor camera has at most 512 x 512 pixels.",
+        "Thousands of envs do not fit the GPU's memory.",
+        "_default_sensor_configs",
+    ),
+    # --- time ------------------------------------------------------------------------------------------------
+    Rule(
+        "loop-over-envs",
+        "warn",
+        "Hooks that run at every step do not loop over envs in Python.",
+        "At 4096 envs the loop takes longer than the simulation.",
+        "evaluate",
+    ),
+    Rule(
+        "device-copies",
+        "warn",
+        "Hooks that run at every step leave tensors on their device (.cpu(), .item(), float(tensor), if tensor:).",
+        "Each is a stop of the GPU, every step.",
+        "evaluate",
+    ),
+    Rule(
+        "foreign-device",
+        "warn",
+        "Tensors are made on self.device (with torch.device(self.device), or device=self.device).",
+        "On the GPU: 'Expected all tensors to be on the same device'.",
+        "_initialize_episode",
+    ),
+)
+CHECK_RULES: Mapping[str, Rule] = {rule.id: rule for rule in _TABLE}
+"""Those that `checks` looks at, beyond the rules of GPU simulation."""
+RULES: Mapping[str, Rule] = {**core_rules.RULES, **CHECK_RULES}
+"""All, by id."""
+
+
+def degree_of_each(
+    select: Collection[str] = (), ignore: Collection[str] = (), choice: Degree | None = None
+) -> dict[str, Degree]:
+    """The degree of each rule.
+
+    Args:
+        select: only these rules; all others are off. Empty for all.
+        ignore: rules that are off.
+        choice: the degree of all others; None for each rule's own.
+
+    Raises:
+        ValueError: an id that no rule has.
+    """
+    for rule in (*select, *ignore):
+        if rule not in RULES:
+            raise ValueError(f"no rule is called {rule!r}; `workbench help rules` lists them")
+    return {
+        rule.id: "off" if rule.id in ignore or (select and rule.id not in select) else choice or rule.degree
+        for rule in RULES.values()
+    }
