@@ -309,7 +309,7 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
     page.locator(field(page, "New name")).fill("third")
     button(page, "Add sensor")
-    expect(page.get_by_text(re.compile("It looks at cube, goal from your side, 0"))).to_be_visible()
+    expect(page.get_by_text(re.compile("It looks at cube, goal from where you look, 0"))).to_be_visible()
     sight = page.get_by_alt_text("what it would see")
     until(lambda: sight.evaluate("e => e.naturalWidth") == 128, "its picture, before it is written")
     assert task_file.read_text() == before

@@ -64,7 +64,7 @@ def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
 
 
 def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:
-    desk.page.get_by_role("button", name="zoom to episode").click()
+    desk.page.get_by_role("button", name="zoom in").click()
     thumb = desk.page.get_by_role("slider").last
     expect(thumb).to_have_attribute("aria-valuemin", str(-STEPS))
     until(

@@ -74,7 +74,7 @@ def commands_of_both_pages() -> Commands:
 
 def keys_page(commands: Commands) -> str:
     live = [one for one in commands.live if one.key]
-    camera = [one for one in live if (one.modifier or "").startswith(("alt", "cmd"))]
+    camera = [one for one in live if "camera" in one.label.lower().split()]
     return "\n".join(
         [
             "# Keys",

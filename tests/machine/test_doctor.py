@@ -64,9 +64,9 @@ def test_what_a_requirement_excludes_is_named_with_the_command(monkeypatch: pyte
     (finding,) = doctor._packages()
     assert finding.ok is False and "viser<1 is wanted" in finding.what
     assert "no-such-package>=2 is missing" in finding.what
-    assert (
-        finding.advice and f"{sys.executable} -m pip install 'viser<1' 'no-such-package>=2'" in finding.advice
-    )
+    # By uv or by pip, as the environment was made.
+    assert finding.advice and "pip install" in finding.advice and sys.executable in finding.advice
+    assert "'viser<1' 'no-such-package>=2'" in finding.advice
 
 
 def test_a_question_that_takes_too_long_is_told_without_its_program(

@@ -105,7 +105,7 @@ def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -
     )
 
 
-EMPTY = SessionView(activity="starting the worker", recording=RecordingStatus(folder="recordings"))
+EMPTY = SessionView(activity="a worker process", recording=RecordingStatus(folder="recordings"))
 """A session that has just begun."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import linecache
 import re
@@ -292,7 +293,24 @@ def _message(exc: BaseException) -> str:
         text = f"<its __str__ raised {type(failure).__qualname__}>"
     if isinstance(exc, BdbQuit) and not text:
         text = "a debugger's prompt was left, or had no terminal; it was called just before this line: remove the call"
-    return shorten(f"{name}: {text}" if text.strip() else name)
+    return shorten(f"{name}: {text}{_suggestion(exc)}" if text.strip() else name)
+
+
+def _suggestion(exc: BaseException) -> str:
+    """A name that is nearly the missing one, as Python's interactive prompt would say it; empty if there is none."""
+    wanted = getattr(exc, "name", None)
+    if not isinstance(wanted, str) or not isinstance(exc, (NameError, AttributeError)):
+        return ""
+    if isinstance(exc, AttributeError):
+        try:
+            known = dir(exc.obj)
+        except Exception:  # the author's own __dir__ may raise
+            return ""
+    else:
+        frame = next(reversed([frame for frame, _ in tracebacks.walk_tb(exc.__traceback__)]), None)
+        known = [] if frame is None else [*frame.f_locals, *frame.f_globals, *frame.f_builtins]
+    close = difflib.get_close_matches(wanted, [name for name in known if name != wanted], n=1, cutoff=0.75)
+    return f". Did you mean {close[0]!r}?" if close and "Did you mean" not in str(exc) else ""
 
 
 def _chain(exc: BaseException) -> Iterator[BaseException]:

@@ -21,8 +21,8 @@ SHORT_HASH = 12
 LONGEST = 400
 """Characters of a shown name."""
 FOLLOWED = (
-    "From then on, for as long as it is open live, every save of this file and of the modules beside it runs without asking, "
-    "whoever saves it, and Rescore takes the file as it is."
+    "While it is open live, every save of this file and of the modules beside it runs without asking, whoever saves it. "
+    "Rescore uses the file as it is then."
 )
 """Warning before going live with a file that a recording names."""
 

@@ -142,9 +142,9 @@ def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
 def test_what_going_live_means_is_said_before() -> None:
     said = question_html(replace(PLAIN, followed=True))
     assert "every save of this file and of the modules beside it runs without asking" in said
-    assert "Rescore takes the file as it is" in said
-    assert "Its text may run already" in question_html(replace(PLAIN, followed=True, agreed=True))
-    assert "until the workbench ends" in ONCE
+    assert "Rescore uses the file as it is then" in said
+    assert "You have allowed its present text" in question_html(replace(PLAIN, followed=True, agreed=True))
+    assert "ask again next time" in ONCE
 
 
 def test_where_imports_are_computed_no_module_is_said_to_be_imported() -> None:

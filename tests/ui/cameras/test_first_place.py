@@ -27,7 +27,7 @@ def test_from_far_away_it_comes_near_along_the_direction_of_the_view_and_sees_mo
     (ex, ey, ez), (x, y, z) = (middle + 30 * side).tolist(), middle.tolist()
     seen_from = with_pose(NEW, pose_from_look_at(LookAt((ex, ey, ez), (x, y, z))))
     found, words = first_place(seen_from, ("cube",), things)
-    assert found.quaternion == seen_from.quaternion and "at cube from your side" in words
+    assert found.quaternion == seen_from.quaternion and "at cube from where you look" in words
     towards = middle - found.position
     forward = axes_of(found.quaternion)[0]
     assert 0.55 < np.linalg.norm(towards) < 5 and np.allclose(np.cross(forward, towards), 0, atol=1e-3)

@@ -32,12 +32,12 @@ def test_what_a_build_could_not_carry_is_named_up_to_a_number() -> None:
     html = version_html(
         ReloadReport("rebuilt", "_load_scene changed", ("actor goal",), missing), 1500.0, True
     )
-    assert "1.5 s" in html and "was restored" in html
+    assert "1.5 s" in html and "put back to where it was" in html
     assert "actor cube_0" in html and f"actor cube_{MOST_SHOWN}" not in html and "and 3 more" in html
 
 
 def test_a_build_without_a_moment_says_that_an_episode_began() -> None:
-    assert "new episode" in version_html(ReloadReport("rebuilt", "another task"), 900.0, loaded=True)
+    assert "New episodes" in version_html(ReloadReport("rebuilt", "another task"), 900.0, loaded=True)
 
 
 def test_what_comes_of_the_file_is_escaped() -> None:

@@ -117,9 +117,9 @@ def test_names_are_shown_without_their_time_and_the_scope_stays_as_chosen(
     assert ">Push_seed0001_env00.eye.mp4<" in panels.html()
     same = [name, name.replace("41", "42")]
     assert short_names(same) == same
-    assert not panel.takes_opened(True) and panels.shows("Of")
-    panels.set("Of", OPENED)
-    assert panel.takes_opened(True) and not panel.takes_opened(False) and not panels.shows("Of")
+    assert not panel.takes_opened(True) and panels.shows("Share")
+    panels.set("Share", OPENED)
+    assert panel.takes_opened(True) and not panel.takes_opened(False) and not panels.shows("Share")
     assert panel.takes_opened(True)
 
 

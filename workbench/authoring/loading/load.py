@@ -386,7 +386,7 @@ def _unknown_id(env_id: str) -> TaskError:
 
 
 IMPORT_HINT = (
-    "An id that a package of yours registers is known once that is imported: --import PACKAGE on the command line, "
+    "If a package of yours registers it, import that package first: --import PACKAGE on the command line, "
     "`import package` before workbench.make."
 )
 

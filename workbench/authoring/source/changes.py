@@ -78,7 +78,7 @@ class Changes:
                 raise RefusedEdit(f"`{name}` means something else in this file (line {line})")
         missing = [line for name, line in lines.items() if name not in bindings]
         for line in missing:
-            self.note(f"`{line}` is added at the top of the file")
+            self.note(f"{line}: added at the top of the file")
         if missing:
             place = file.import_place()
             text = "".join(f"{line}\n" for line in sorted(missing, key=lambda line: line.startswith("from")))

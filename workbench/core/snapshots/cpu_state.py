@@ -375,7 +375,7 @@ def _joined(
     for part in contents:
         source = index_of.pop((part.name, part.joints is None), None)
         if source is None:
-            missed[str(part)] = "the snapshot has none of this name: left as it is"
+            missed[str(part)] = "it is not in the snapshot; left unchanged"
         elif parts[source].joints != part.joints:
             missed[str(part)] = "its joints differ from those of the snapshot: left as it is"
             source = None

@@ -348,7 +348,7 @@ def write_gpu_state(
         fits = kept.shape[1] == BODY + (2 + len(_JOINT_TENSORS)) * width
         fitting = [i for i in targets if fits and not np.isnan(kept[position[i]]).any()]
         if len(fitting) < len(targets):
-            missed[_plain_name(name)] = "the snapshot has none of this name and shape: left as it is"
+            missed[_plain_name(name)] = "the snapshot has none of this name and shape; left unchanged"
         if not fitting:
             continue
         carried[_plain_name(name)] = None

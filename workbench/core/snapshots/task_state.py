@@ -158,7 +158,7 @@ def write_task_state(
             if built is None or leaf.path not in state.built:
                 # A controller's start and step exist from its first action on, without meaning before it.
                 if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
-                    missed[leaf.path] = "the snapshot has none of this name: left as it is"
+                    missed[leaf.path] = "it is not in the snapshot; left unchanged"
                 continue
             kept, chosen = built.kept, env_idx
         if id(value) in replaced and isinstance(value, (torch.Tensor, np.ndarray)):

@@ -63,7 +63,7 @@ class LiveState:
     """Build options; the seed is that of `now`."""
     history_bytes: int
     """Memory limit of the history."""
-    now: SessionView = SessionView(activity="starting the worker")
+    now: SessionView = SessionView(activity="a worker process")
     """The live view, without the fields that `view` adds."""
     timeline: Timeline | None = None
     """None before a task is loaded."""

@@ -252,7 +252,8 @@ class Rescorer:
             if failure.problem is None:
                 raise
             raise JobFailed(
-                f"{group.info.task} could not be opened to rescore with", failure.problem
+                f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE",
+                failure.problem,
             ) from failure
         self._update(job, state="rescoring")
         began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps

@@ -119,7 +119,7 @@ def drift_summary(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
     furthest = max(known, key=lambda verdict: verdict.metres or 0.0)
     metres, radians = furthest.metres or 0.0, max(verdict.radians for verdict in known)
     if metres == 0 and radians == 0:
-        return "Every body is where it was, to the last bit: the differences come from the code."
+        return "Every body is where it was, to the last bit, so any difference comes from the code."
     amount = f"{length(metres)} and {math.degrees(radians):.2g}°"
     if not (far := count_drifted(known)):
         return f"States drifted by at most {amount}: the rewards are comparable."

@@ -123,8 +123,13 @@ def source_changes(
         before, after = (
             {PurePath(name).name: text for name, text in texts.items()} for texts in (before, after)
         )
-    for name in dict.fromkeys([*before, *after]):
-        old, new = before.get(name, ""), after.get(name, "")
+    pairs = {name: (before.get(name, ""), after.get(name, "")) for name in dict.fromkeys([*before, *after])}
+    gone, new_ones = next(iter(before), None), next(iter(after), None)
+    if gone is not None and new_ones is not None and gone not in after and new_ones not in before:
+        # The task's own file comes first in both. It has another name: without this all its lines are changed.
+        del pairs[gone], pairs[new_ones]
+        pairs = {f"{gone} → {new_ones}": (before[gone], after[new_ones]), **pairs}
+    for name, (old, new) in pairs.items():
         if old == new:
             continue
         lines: list[tuple[str, str]] = []

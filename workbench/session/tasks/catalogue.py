@@ -171,7 +171,7 @@ class Catalogue:
             f"{self._recordings.name or self._recordings}/",
             "Look through recorded episodes: play, compare, share"
             if self._recordings.is_dir()
-            else "No episode was recorded yet; look for other folders with workbench review FOLDER",
+            else "No recordings here yet. workbench review FOLDER opens another folder.",
         )
         why_not = registered.why_not
         # Those that cannot be opened before something is downloaded come last.

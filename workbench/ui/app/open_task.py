@@ -63,6 +63,8 @@ class OpenTask:
         self._wish: Entry | None = None
         self._doing = ""
         self._closing = False
+        self._ran: set[str] = set()
+        """References that were open in this run: going back to one asks nothing."""
         self._kept: dict[str, KeptWork] = {}
         """By `lasting` reference: what was done in sessions of this run."""
         self._thread = watched_thread("open-task", self._serve)
@@ -131,13 +133,15 @@ class OpenTask:
             self._change(reference, entry)
 
     def _cleared(self, entry: Entry) -> TaskName:
-        """What to open. A file is opened unasked where the workbench was started, and if it is one of the examples.
+        """What to open. A file is opened unasked where the workbench was started, if it is one of the examples, and if it
+        was open before in this run.
 
         Raises:
             NotCleared: it may not run.
         """
         file = entry.file
-        if file is None or is_below(file, self.catalogue.folder) or file in example_tasks():
+        known = lasting(entry.reference) in self._ran or file in example_tasks()
+        if file is None or known or is_below(file, self.catalogue.folder):
             return entry.reference
         return self._clearances.clear_file(file, file_and_class(entry.reference)[1], self._withdrawn)
 
@@ -147,6 +151,10 @@ class OpenTask:
         if old is not None:
             old.pause()
             self._kept[lasting(str(old.reference))] = old.kept_work()
+            if isinstance(
+                old.reference, str
+            ):  # not the texts of a recording, which name a path and are other code
+                self._ran.add(lasting(old.reference))
         kept = self._kept.get(lasting(entry.reference))
         place.session = place.home = self._open_session(
             reference, entry.options or self.catalogue.options, kept

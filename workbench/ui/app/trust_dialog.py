@@ -16,8 +16,8 @@ from workbench.ui.widgets.templates import render
 TITLE = "Run this code?"
 DO_NOT, ONCE, ALWAYS = (
     "Don't run it",
-    "Run it, without asking until the workbench ends",
-    "Run it, and trust this text from now on",
+    "Run it, and ask again next time",
+    "Run it, and don't ask again unless it changes",
 )
 MOST_OF_ONE, MOST_OF_ALL = 200_000, 1_000_000
 """Characters of one text, and of all texts, that go to the page; it says how much is left out."""

@@ -91,7 +91,7 @@ class CamerasPanel:
         self,
         server: viser.ViserServer,
         ask: Callable[[tuple[CameraRequest, ...]], None],
-        no_camera: str = "This task has no camera.",
+        no_camera: str = "This task has no camera yet. Add sensor on the Studio tab makes one.",
         studio_shows: Callable[[], str] = lambda: COLOUR,
         clock: Clock = time.monotonic,
     ) -> None:

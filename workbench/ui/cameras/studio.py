@@ -209,7 +209,7 @@ class StudioPanel(PagePart[SessionView]):
         self._choice.handle.visible = bool(keys)
         if not keys:
             text = (
-                "This task has no camera."
+                "This task has no camera yet. Add a sensor below."
                 if view.task is not None
                 else "Cameras appear when the task has loaded."
             )

@@ -126,8 +126,8 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
 ADD_SENSOR, ADD_HUMAN = "Add sensor", "Add human view"
 WHERE = (
-    "A new sensor looks at the task's objects from your side; a human view is placed at your viewpoint. Its picture "
-    "comes with the change, before anything is saved."
+    "A new sensor looks at the task's objects from where you look; a human view is placed at your viewpoint. Its picture "
+    "follows in a moment, before anything is saved."
 )
 LONGEST_NAME = 64
 NEW = CameraSettings(
@@ -341,7 +341,7 @@ def first_place(
         return seen_from, stays
     x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
     told = ", ".join(names[:MOST_NAMES]) + (" and others" if len(names) > MOST_NAMES else "")
-    words = f"It looks at {told} from your side, {wanted:.2f} m away; you are {away:.1f} m away."
+    words = f"It looks at {told} from where you look, {wanted:.2f} m away; you are {away:.1f} m away."
     return replace(seen_from, position=(x, y, z)), words
 
 

@@ -81,6 +81,7 @@ class LibraryPanel(PagePart[object]):
                 "Tag",
                 "Add or remove tags (T)",
                 self._edits.ask_tags,
+                reads=False,
                 named="Tag the selected recordings",
                 key="T",
             ),
@@ -88,6 +89,7 @@ class LibraryPanel(PagePart[object]):
                 "Note",
                 "Edit its note (Shift T)",
                 self._edits.ask_note,
+                reads=False,
                 named="Edit the note of the selected recordings",
                 key="T",
                 modifier="shift",
@@ -96,6 +98,7 @@ class LibraryPanel(PagePart[object]):
                 "Delete",
                 "Move its files to the trash (Delete)",
                 self._edits.ask_delete,
+                reads=False,
                 named="Delete the selected recordings",
                 key="delete",
             ),
@@ -236,7 +239,9 @@ class LibraryPanel(PagePart[object]):
                     if outcome == "all" and len(others) < len(view.rows)
                     else counts[outcome],
                     "on": outcome == listed.outcome,
-                    "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
+                    "press": self._press(
+                        ("outcome", outcome), lambda outcome=outcome: listed.choose(outcome)
+                    ),
                 }
                 for outcome, means in MEANS.items()
                 if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
@@ -324,8 +329,8 @@ class LibraryPanel(PagePart[object]):
             ],
             summary=f"{count} selected" if count else "Click a row to select it" if rows else "",
             count=len(rows),
-            all=self._press("all", listed.select_all) if count < len(rows) else "",
-            none=self._press("none", lambda: self.select(())) if count else "",
+            all=self._press(("select", "all"), listed.select_all) if count < len(rows) else "",
+            none=self._press(("select", "none"), lambda: self.select(())) if count else "",
             undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
             pages=listed.pages.shown(self._press),
         )
@@ -369,5 +374,13 @@ class LibraryPanel(PagePart[object]):
         elif action.most is not None and len(ids) > action.most:
             body = f"{action.label} takes at most {action.most} at once."
             tell_all(self._server, f"{len(ids)} are selected", body, seconds=8.0)
+        elif action.reads and (why := self._why_unreadable(ids)):
+            tell_all(self._server, f"{action.label} needs files that can be read", why, "red")
         else:
             action.run(ids)
+
+    def _why_unreadable(self, ids: tuple[str, ...]) -> str:
+        """Why none of these can be read; empty if one can."""
+        rows = [row for row in self._library.view().rows if row.id in ids]
+        broken = [row for row in rows if row.problem]
+        return "" if len(broken) < len(rows) or not rows else f"{broken[0].name} {broken[0].problem}"

@@ -139,7 +139,7 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> di
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
     env = "" if row.env_index is None else f"env {row.env_index}"
     actions = f"actions: {row.acted_by}" if row.acted_by else ""
-    about = (row.name, env, size(row.size), row.control_mode, actions)
+    about = (row.name, env, size(row.size), row.control_mode, actions, row.problem)
     return {
         "task": row.task or ("?" if row.problem else ""),
         "date": "" if when is None else _short_date(when, now),

@@ -34,7 +34,7 @@ RANGE_EVERY = 0.5
 STANDS_STILL = 0.35
 """Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
-EPISODE, EVERYTHING = "zoom to episode", "zoom out"
+EPISODE, EVERYTHING = "zoom in", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Continue from here"
 UNDO = "undo"

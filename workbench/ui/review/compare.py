@@ -120,7 +120,7 @@ def headline(found: Difference) -> str:
         return "One of them has no scene; only numbers are compared."
     if found.bodies.position is None:
         apart = "" if found.bodies.largest == "0" else f", at most {found.bodies.largest} apart"
-        return f"All bodies stay together{apart}."
+        return f"All bodies move alike{apart}."
     return (
         f"They diverge at step {found.bodies.position} ({found.bodies.values}), up to {found.bodies.largest}."
     )

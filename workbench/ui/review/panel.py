@@ -17,6 +17,8 @@ from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import letter, render
 
+MOST_OF_CODE = 200_000
+"""Characters of one file."""
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "overlaid", "side by side"
 GO_LIVE, STAY = "Continue live from here", "Stay here"
@@ -168,6 +170,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
         info=info,
         version=recorded_version(info) or info.source_hash,
         changed=changed,
+        most=MOST_OF_CODE,
         acted_by=acted_by_text(info.acted_by),
         assignments=assignments,
         local_time=local_time,

@@ -69,7 +69,7 @@ class SharePanel:
         self._chosen = Chosen()
         self._drawn: object = None
         self._of = server.gui.add_dropdown(
-            "Of", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="Stays as you choose it"
+            "Share", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="Stays as you choose it"
         )
         self._about = server.gui.add_html("")
         self._what = server.gui.add_dropdown("Make", tuple(WHAT))

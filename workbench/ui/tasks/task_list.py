@@ -152,9 +152,13 @@ def _note(section: Section, view: CatalogueView, some: bool, searched: bool) -> 
         if known.problem:
             return known.problem
         if not known.ids:
-            return "ManiSkill is asked for its tasks: some seconds the first time …" if known.doing else ""
+            return (
+                "Loading ManiSkill's list of tasks. The first time takes a few seconds …"
+                if known.doing
+                else ""
+            )
         if known.doing and known.waiting:
-            return f"Pictures: {len(known.pictures)} of {len(known.ids)}, the others are being drawn"
+            return f"Drawing pictures: {len(known.pictures)} of {len(known.ids)} so far"
     return ""
 
 
