@@ -31,8 +31,9 @@
 
   function markAgain(list) {
     const rows = rowsOf(list);
-    // The best match of other words is the first.
-    if (list.dataset.words !== words || !rows.some((row) => row.dataset.row === marked)) marked = rows[0]?.dataset.row ?? "";
+    // The best match of other words is the first that is not open already.
+    const best = rows.find((row) => !("open" in row.dataset)) ?? rows[0];
+    if (list.dataset.words !== words || !rows.some((row) => row.dataset.row === marked)) marked = best?.dataset.row ?? "";
     words = list.dataset.words;
     if (rows.some((row) => row.classList.contains("wb-marked-task") !== (row.dataset.row === marked))) mark(list, marked);
   }

@@ -172,6 +172,18 @@ def test_endless_recursion_and_endless_messages_are_bounded(task: LoadedTask) ->
     assert deep.traceback.splitlines()[-1].startswith("RecursionError")
 
 
+def test_a_name_that_is_nearly_right_is_suggested(write: Write) -> None:
+    file = write(
+        "names.py",
+        "import torch\ncube_size = 1\ndef a(): cube_sise\ndef b(): torch.zeross\ndef c(): nothing_like_it\n",
+    )
+    names: dict[str, Callable[[], object]] = {}
+    exec(compile(file.read_text(), str(file), "exec"), names)
+    messages = [caught(names[name], (file,)).message for name in "abc"]
+    assert messages[0].endswith("Did you mean 'cube_size'?") and messages[1].endswith("Did you mean 'zeros'?")
+    assert "Did you mean" not in messages[2]
+
+
 def test_chains_that_bite_their_tail_end() -> None:
     one, two = ValueError("one"), ValueError("two")
     one.__context__, two.__context__ = two, one

@@ -69,6 +69,13 @@ def test_turning_counts_and_either_sign_of_a_quaternion_is_the_same() -> None:
 
 
 def test_the_lines_that_changed() -> None:
+    ((name, lines),) = source_changes(
+        {"a/task_v1.py": "a\nb\n", "a/m.py": "x"}, {"b/task_v2.py": "a\nc\n", "b/m.py": "x"}
+    )
+    assert name == "task_v1.py → task_v2.py" and [text for kind, text in lines if kind in ("add", "del")] == [
+        "-b",
+        "+c",
+    ]
     ((name, lines),) = source_changes({"/old/push.py": "a\nb\nc\n"}, {"/new/push.py": "a\nB\nc\n"})
     assert name == "push.py"
     assert ("del", "-b") in lines and ("add", "+B") in lines and ("same", " a") in lines

@@ -155,6 +155,19 @@ def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk
     desk.panels.press(ONCE)
     desk.session_of("other.py")
     assert desk.opened[-1][1] == TaskOptions(3, env_kwargs={"size": 2}), "as it was opened last"
+    assert desk.place.open_task.is_open(desk.row("other.py"))
+    assert not desk.place.open_task.is_open(desk.row("push.py"))
+    desk.choose("push.py")
+    desk.session_of("push.py")
+    desk.choose("other.py")
+    desk.session_of("other.py")
+
+
+def test_going_back_to_a_file_that_was_open_in_this_run_asks_nothing(desk: Desk) -> None:
+    other = str(desk.folder / "elsewhere/other.py")
+    # As a file that was named on the command line: nobody was asked.
+    desk.place.session = desk.place.home = desk.place.open_task._open_session(other, TaskOptions(), None)
+    desk.session_of("other.py")
     desk.choose("push.py")
     desk.session_of("push.py")
     desk.choose("other.py")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.panels import Clock, Panels, told_so_far
+from tests.drive.waiting import until
 from tests.recording.library_files import describe
 from workbench.recording.library.library import Library
 from workbench.ui.library.listing import MOST_ROWS, RANGE, TOGGLE, Action, LibraryList, walking
@@ -125,12 +126,35 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown()[:3] == ["id00", "id01", "id02"]
     table.press("sort seed")
     assert table.shown()[0] == newest(0, 1)[0]
-    table.press("failed")
+    table.press("outcome failed")
     assert len(table.shown()) == COUNT // 2 and table.shown()[0] == "id53"
     table.look_for("seed:7")
     assert table.shown() == ["id07"]
     table.look_for("nothing has this")
     assert table.shown() == [] and "nothing has this" in table.panels.html("wb-library")
+
+
+def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
+    table.press("outcome failed")
+    failed = table.shown()
+    table.press_row(failed[0])
+    table.press("select all")
+    assert table.shown() == failed and len(table.selected()) == COUNT // 2
+    table.press("select none")
+    assert table.selected() == () and table.shown() == failed
+
+
+def test_what_cannot_be_read_is_not_opened_and_says_why(
+    table: Table, library: Library, told: Told, tmp_path: Path
+) -> None:
+    (tmp_path / "cut.rrd").write_bytes(b"RRF2 and nothing more")
+    library.refresh()
+    until(lambda: any(row.problem for row in library.view().rows), "the damaged file")
+    table.draw()
+    (damaged,) = (row for row in library.view().rows if row.problem)
+    table.panel.select([damaged.id])
+    table.command("Open the selected recordings")
+    assert told.opened == []
 
 
 def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> None:
@@ -184,7 +208,7 @@ def test_the_cursor_is_followed_for_keys_only_and_goes_with_its_row(library: Lib
 def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
     table.command("Select all listed recordings")
     assert len(table.selected()) == COUNT
-    table.press("success")
+    table.press("outcome success")
     assert len(table.selected()) == (COUNT + 1) // 2
     library.delete(table.selected()[:3])
     table.draw()

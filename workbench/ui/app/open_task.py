@@ -83,6 +83,11 @@ class OpenTask:
         """What it is doing, for the page; empty if nothing."""
         return self._doing
 
+    def is_open(self, entry: Entry) -> bool:
+        """Whether this is the open task."""
+        home = self._place.home
+        return home is not None and lasting(str(home.reference)) == lasting(entry.reference)
+
     def close(self) -> None:
         """Withdraw a question and end the thread; a session that is being closed is waited for."""
         with self._wake:
@@ -116,7 +121,7 @@ class OpenTask:
             self.catalogue.refresh()
             return
         home = self._place.home
-        if home is not None and lasting(str(home.reference)) == lasting(entry.reference):
+        if home is not None and self.is_open(entry):
             self._place.go_live.let_go()
             self._place.session = home
             self._place.pages.show("live")

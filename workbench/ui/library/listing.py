@@ -170,12 +170,12 @@ class Action:
     run: Callable[[tuple[str, ...]], None]
     most: int | None = None
     """Most recordings at once."""
-    reads: bool = True
-    """Whether it reads the recordings; False for what also applies to files that cannot be read."""
     named: str = ""
     """Label of its command; empty: a button only."""
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
+    reads: bool = True
+    """Whether it reads the recordings; False for what also applies to files that cannot be read."""
 
 
 def walking(listed: LibraryList) -> list[Command]:

@@ -329,8 +329,8 @@ class LibraryPanel(PagePart[object]):
             ],
             summary=f"{count} selected" if count else "Click a row to select it" if rows else "",
             count=len(rows),
-            all=self._press(("select", "all"), listed.select_all) if count < len(rows) else "",
-            none=self._press(("select", "none"), lambda: self.select(())) if count else "",
+            select_all=self._press(("select", "all"), listed.select_all) if count < len(rows) else "",
+            select_none=self._press(("select", "none"), lambda: self.select(())) if count else "",
             undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
             pages=listed.pages.shown(self._press),
         )

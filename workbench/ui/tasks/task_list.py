@@ -42,6 +42,10 @@ class Chooser(Protocol):
         """What it is doing, for the page; empty if nothing."""
         ...
 
+    def is_open(self, entry: Entry) -> bool:
+        """Whether this is the open task."""
+        ...
+
 
 class TaskList:
     """A search field and the list, in the present container.
@@ -86,7 +90,9 @@ class TaskList:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        self._html.content = tasks_html(view, self._words, doing, self._numbers, self._clear)
+        self._html.content = tasks_html(
+            view, self._words, doing, self._numbers, self._clear, self._chooser.is_open
+        )
 
     def _look_for(self, words: str) -> None:
         self._words = words[:LONGEST_WORDS]
@@ -102,13 +108,21 @@ class TaskList:
         self._on_chosen()
 
 
-def tasks_html(view: CatalogueView, words: str, doing: str, numbers: str, clear: str) -> str:
+def tasks_html(
+    view: CatalogueView,
+    words: str,
+    doing: str,
+    numbers: str,
+    clear: str,
+    is_open: Callable[[Entry], bool] = lambda entry: False,
+) -> str:
     """The list.
 
     Args:
         words: searched for.
         doing: what is being opened, if anything.
         numbers, clear: ids of the input that takes a row's number, and of the button that clears the search.
+        is_open: whether a row is the open task, which is marked and which Enter does not choose.
     """
     wanted = words.lower().split()
     found = [entry for entry in view.entries if entry.matches(wanted)]
@@ -132,6 +146,7 @@ def tasks_html(view: CatalogueView, words: str, doing: str, numbers: str, clear:
         pictures=view.registered.pictures,
         registered=Section.REGISTERED,
         picture_of=_picture_of,
+        is_open=is_open,
     )
 
 
