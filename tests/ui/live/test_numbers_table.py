@@ -116,6 +116,12 @@ def test_what_has_no_row_for_each_env_is_shown_as_it_is_and_marked() -> None:
 @pytest.mark.parametrize("num_envs", [1, 4])
 def test_the_mark_is_on_the_page(num_envs: int) -> None:
     rows = number_rows(replace(step_of(POSES[:num_envs]), others=OTHERS), 0, None)
+    modes = ("sparse", "normalized_dense", "dense")
+    assert [number_rows(step_of(POSES), 0, None, mode)[1].about for mode in modes] == [
+        "sparse",
+        "normalized",
+        "",
+    ]
     html = render("numbers", rows=rows, env=0, num_envs=num_envs, has_success=True)
     marked = sum(1 for row in rows if row.whole)
     assert html.count("not per env</span>") == marked == 8

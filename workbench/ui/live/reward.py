@@ -269,15 +269,19 @@ class NumberRow:
     """The value of an entry that is not per env, instead of `selected` and `batch`."""
     hint: str = ""
     """Further information about the value."""
+    about: str = ""
+    """Beside the name: the mode of a reward."""
 
 
-def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | None) -> list[NumberRow]:
+def number_rows(
+    step: StepResult, selected_env: int, max_episode_steps: int | None, reward_mode: str = ""
+) -> list[NumberRow]:
     """Elapsed steps, reward, success and fail first, then every other entry by its name."""
     env = selected_env
     of = f" / {max_episode_steps}" if max_episode_steps else ""
     rows = [
         NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps)),
-        _reward_row(step, env),
+        _reward_row(step, env, reward_mode),
     ]
     first = [key for key in ("success", "fail") if key in step.evaluate]
     rest = sorted(key for key in [*step.evaluate, *step.others] if key not in first)
@@ -306,7 +310,7 @@ def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
     return NumberRow(name, "", "", whole=value, hint=f"not per env: {hint}")
 
 
-def _reward_row(step: StepResult, env: int) -> NumberRow:
+def _reward_row(step: StepResult, env: int, mode: str) -> NumberRow:
     """The reward's row: a dash right after a reset, when there is none (neither zero nor a NaN of the task)."""
     there = np.isfinite(step.reward) | ((step.elapsed_steps > 0) & (step.action is not None))
     there &= step.elapsed_steps > 0
@@ -314,6 +318,7 @@ def _reward_row(step: StepResult, env: int) -> NumberRow:
         "reward",
         _item(step.reward, env) if env < len(there) and there[env] else "—",
         _batch(step.reward[there]) if there.any() else "—",
+        about="" if mode == "dense" else mode.replace("_dense", ""),
     )
 
 
@@ -378,7 +383,7 @@ class NumbersPanel(PagePart[SessionView]):
         task, step = view.task, view.step
         rows = []
         if task is not None and step is not None:
-            rows = number_rows(step, view.selected_env, task.max_episode_steps)
+            rows = number_rows(step, view.selected_env, task.max_episode_steps, task.reward_mode)
         self._handle.content = render(
             "numbers",
             rows=rows,
