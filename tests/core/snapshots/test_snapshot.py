@@ -546,7 +546,7 @@ def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick
     edited.reset(seed=[0, 1, 2, 3])
     ball = edited.ball.pose.raw_pose.clone()
     report = restore_snapshot(edited, snapshot, [0, 2], source=[5, 1])
-    assert report.not_carried["actor ball"].startswith("the snapshot has none")
+    assert report.not_carried["actor ball"].startswith("it is not in the snapshot")
     assert torch.equal(edited.ball.pose.raw_pose, ball)
     cube, qpos = pick.cube.pose.raw_pose, pick.agent.robot.get_qpos()
     torch.testing.assert_close(edited.cube.pose.raw_pose[[0, 2]], cube[[5, 1]])
@@ -674,6 +674,6 @@ def test_what_a_gpu_state_has_not_is_left_and_told(pick: BaseEnv) -> None:
     )
     carried, missed = write_gpu_state(pick, [2], kept, [0])
     assert carried == {"actor table-workspace": None}
-    left = "the snapshot has none of this name and shape: left as it is"
+    left = "the snapshot has none of this name and shape; left unchanged"
     there = ("actor cube", "actor goal_site", "articulation panda")
     assert missed == {"actor box": "this env has none of this name", **dict.fromkeys(there, left)}
