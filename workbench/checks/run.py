@@ -7,10 +7,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from workbench.authoring.problem import TaskError
 from workbench.checks import evaluate, reward
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
 from workbench.checks.rules import CHECK_RULES, RULES
+from workbench.core.env import actions
 from workbench.core.rules import Degree, Finding, reason_of_silence
 
 State = Literal["kept", "broken", "silenced", "skipped", "failed"]
@@ -52,6 +55,8 @@ GROUPS: tuple[Group, ...] = (
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"
+CORE_RESETS = 6
+"""Resets of random envs, with steps between them."""
 
 
 def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
@@ -72,6 +77,23 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
                 yield result_of("runs", degrees["runs"], [raised(error)])
             continue
         yield replace(result_of(rule, degrees[rule], seen), seconds=time.perf_counter() - began)
+
+
+def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
+    """Steps, and resets of random envs among them, while the rules of GPU simulation look. Gives a result only where the
+    task raises; what was found is in `Checkup.findings`."""
+    rng = np.random.default_rng(0)
+    try:
+        task = checkup.task
+        checkup.reset(task, checkup.seeds[0])
+        for _ in range(CORE_RESETS):
+            for _ in range(2):
+                checkup.step(task, actions.random_action(task.parts, task.num_envs, rng))
+            count = int(rng.integers(1, max(2, task.num_envs)))
+            checkup.reset(task, None, sorted(rng.choice(task.num_envs, count, replace=False).tolist()))
+    except TaskError as error:
+        if degrees["runs"] != "off":
+            yield result_of("runs", degrees["runs"], [raised(error)])
 
 
 def raised(error: TaskError) -> Found:
