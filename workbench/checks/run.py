@@ -80,8 +80,8 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
 
 
 def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
-    """Steps, and resets of random envs among them, while the rules of GPU simulation look. Gives a result only where the
-    task raises; what was found is in `Checkup.findings`."""
+    """Steps, and resets of random envs among them, while the rules of GPU simulation look. Gives results only where the task
+    raises; what was found is in `Checkup.findings`, see `core_results`."""
     rng = np.random.default_rng(0)
     try:
         task = checkup.task
@@ -92,6 +92,8 @@ def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> I
             count = int(rng.integers(1, max(2, task.num_envs)))
             checkup.reset(task, None, sorted(rng.choice(task.num_envs, count, replace=False).tolist()))
     except TaskError as error:
+        for rule in _core_rules(degrees):
+            yield RuleResult(rule, "failed", why=str(error))
         if degrees["runs"] != "off":
             yield result_of("runs", degrees["runs"], [raised(error)])
 
@@ -105,12 +107,14 @@ def raised(error: TaskError) -> Found:
 
 def core_results(findings: list[Finding], degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
     """The results of the rules of GPU simulation, of what was seen while the others were checked."""
-    for rule in RULES:
-        if rule in CHECK_RULES or degrees[rule] == "off":
-            continue
+    for rule in _core_rules(degrees):
         of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
         once = {each.key: each for each in of_rule}
         yield RuleResult(rule, "broken" if once else "kept", tuple(once.values()))
+
+
+def _core_rules(degrees: Mapping[str, Degree]) -> list[str]:
+    return [rule for rule in RULES if rule not in CHECK_RULES and degrees[rule] != "off"]
 
 
 def result_of(rule: str, degree: Degree, seen: list[Found | Note]) -> RuleResult:

@@ -124,6 +124,13 @@ def groups_of(degrees: Mapping[str, Degree]) -> list[Group]:
     return [*groups, Group(CORE_GROUP, {})] if core or degrees["runs"] != "off" else groups
 
 
+def count_rules(degrees: Mapping[str, Degree]) -> int:
+    """How many rules a check gives a result of."""
+    in_groups = {rule for group in groups_of(degrees) for rule in group.checks if degrees[rule] != "off"}
+    core = {rule for rule in RULES if rule not in CHECK_RULES and degrees[rule] != "off"}
+    return len(in_groups | core)
+
+
 def check(
     what: CheckOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
@@ -153,7 +160,7 @@ def check(
             raise ValueError(f"--{name} must be at least 1, not {number}")
     groups = groups_of(degrees)
     if not groups:
-        raise ValueError("no rule is left to check: --ignore names all of those that --select does")
+        raise ValueError("no rule is left to check")
     cores = len(os.sched_getaffinity(0))
     workers = min(cores if what.workers is None else what.workers, len(groups))
     found = _Results(degrees, on_activity, on_result)
@@ -264,9 +271,7 @@ def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
             undo_load(loaded)
 
 
-def _check_group(
-    group: Group, checkup: Checkup, degrees: Mapping[str, Degree], queue: ItemQueue
-) -> None:
+def _check_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree], queue: ItemQueue) -> None:
     known = len(checkup.findings)
     run = run_core if group.name == CORE_GROUP else run_group
     for result in run(group, checkup, degrees):
