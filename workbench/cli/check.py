@@ -11,12 +11,12 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
 from workbench.authoring.problem import TaskError
-from workbench.checks.rules import RULES, degree_of_each
+from workbench.checks.rules import RULES
 from workbench.checks.run import RuleResult
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
 from workbench.core.rules import Degree, Finding
-from workbench.jobs.check import CheckOptions, CheckReport, check, count_rules
+from workbench.jobs.check import CheckOptions, CheckReport, check, count_rules, degrees_of_request
 from workbench.jobs.pool import PoolError
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
@@ -44,9 +44,9 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
     """
     here, root = CurrentFolder(), Path.cwd()  # a task may change it
     try:
+        total = count_rules(degrees_of_request(what))
         with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
-            degrees = degree_of_each(what.select, what.ignore)
-            row = bar.add_task("opening", total=count_rules(degrees))
+            row = bar.add_task("opening", total=total)
             done: set[str] = set()
 
             def show(result: RuleResult) -> None:
@@ -56,7 +56,13 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
                     # A bar in a file or a pipe is drawn once, at the end.
                     err.print(escape(f"{result.rule}: {result.state}"), soft_wrap=True)
 
-            report = check(what, lambda activity: bar.update(row, description=activity), show, began=began)
+            try:
+                report = check(
+                    what, lambda activity: bar.update(row, description=activity), show, began=began
+                )
+            except BaseException:
+                bar.update(row, visible=False)
+                raise
             bar.update(row, completed=len(report.results), description="checked")
     except TaskError as error:
         print_problem(error.problem)

@@ -229,6 +229,7 @@ def check(
 
     try:
         options = envs.options()
+        # Before torch is imported: a typo is answered at once.
         degree_of_each(separated(select), separated(ignore))
     except ValueError as error:
         return refuse(str(error))

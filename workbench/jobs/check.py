@@ -131,6 +131,17 @@ def count_rules(degrees: Mapping[str, Degree]) -> int:
     return len(in_groups | core)
 
 
+def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
+    """The degree of each rule. Raises ValueError for a request that is invalid."""
+    for name, number in (("seeds", what.seeds), ("workers", what.workers)):
+        if number is not None and number < 1:
+            raise ValueError(f"--{name} must be at least 1, not {number}")
+    degrees = degree_of_each(what.select, what.ignore)
+    if not groups_of(degrees):
+        raise ValueError("no rule is left to check")
+    return degrees
+
+
 def check(
     what: CheckOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
@@ -154,13 +165,8 @@ def check(
         ValueError: the request is invalid.
     """
     began = time.monotonic() if began is None else began
-    degrees = degree_of_each(what.select, what.ignore)
-    for name, number in (("seeds", what.seeds), ("workers", what.workers)):
-        if number is not None and number < 1:
-            raise ValueError(f"--{name} must be at least 1, not {number}")
+    degrees = degrees_of_request(what)
     groups = groups_of(degrees)
-    if not groups:
-        raise ValueError("no rule is left to check")
     cores = len(os.sched_getaffinity(0))
     workers = min(cores if what.workers is None else what.workers, len(groups))
     found = _Results(degrees, on_activity, on_result)
