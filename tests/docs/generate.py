@@ -1,8 +1,9 @@
-"""Writes the parts of the docs that are made from the code: the keys, the commands, and the rules of GPU simulation.
+"""Writes the parts of the docs that are made from the code: the keys, the commands, and the rules.
 
     python -m tests.docs.generate          # `test_generated.py` fails where a page says something else
 
-Keys are those of both pages as they are built, commands what ``--help`` prints, rules what `core.rules` lists.
+Keys are those of both pages as they are built, commands what ``--help`` prints, rules what `checks.rules` and `core.rules`
+list.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from unittest.mock import patch
 
 from tests.docs.pages import DOCS
 from tests.drive.scripted import no_success, scripted
+from workbench.checks.rules import CHECK_RULES
 from workbench.cli import main
-from workbench.core.rules import RULES
+from workbench.core.rules import RULES, Rule
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.ui.app.workplace import Workplace
@@ -30,7 +32,20 @@ from workbench.ui.widgets.hotkeys import Command
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"
 RULES_PAGE = DOCS / "batched_env.md"
-COMMANDS = ("start", "open", "review", "record", "rescore", "share", "export", "view", "doctor", "help")
+ALL_RULES = DOCS / "reference" / "rules.md"
+COMMANDS = (
+    "start",
+    "open",
+    "review",
+    "record",
+    "check",
+    "rescore",
+    "share",
+    "export",
+    "view",
+    "doctor",
+    "help",
+)
 """In the order in which a reader meets them; `test_generated.py` compares them with those that there are."""
 
 
@@ -156,6 +171,32 @@ def rules_table() -> str:
     )
 
 
+def all_rules_page() -> str:
+    """A table for each hook; links to the pages that there are (`test_rule_pages.py` asks for all of them)."""
+    by_hook: dict[str, list[Rule]] = {}
+    for rule in (*CHECK_RULES.values(), *RULES.values()):
+        by_hook.setdefault(rule.hook, []).append(rule)
+    lines = [
+        "# Rules",
+        "",
+        "What [`workbench check`](../checks.md) looks at, by the hook in which a mistake is mended. Where a rule with the degree",
+        "*stop* is broken, the exit code is 1. `workbench help RULE` shows the page of one rule. Those of GPU simulation are also",
+        "checked [while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is made from the code.",
+        "",
+    ]
+    for hook, rules in by_hook.items():
+        title = "The class and its file" if hook == "class" else f"`{hook}`"
+        lines += [f"## {title}", "", "| rule | degree | what the task does |", "| --- | --- | --- |"]
+        lines += [f"| {linked(rule.id)} | {rule.degree} | {code(rule.asks)} |" for rule in rules]
+        lines += [""]
+    return "\n".join(lines)
+
+
+def linked(rule: str) -> str:
+    page = DOCS / "rules" / f"{rule}.md"
+    return f"[{rule}](../rules/{rule}.md)" if page.is_file() else rule
+
+
 def code(sentence: str) -> str:
     """Names of functions and attributes set as code."""
     return re.sub(
@@ -179,6 +220,7 @@ def pages() -> dict[Path, str]:
         KEYS: keys_page(commands_of_both_pages()),
         CLI: cli_page(),
         RULES_PAGE: with_rules(RULES_PAGE.read_text()),
+        ALL_RULES: all_rules_page(),
     }
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 import torch
 import tyro
+import yaml
 
 from tests.docs.pages import PAGES, ROOT, Fence, fences, without_fences
 from tests.drive.page import open_workbench
@@ -31,12 +32,14 @@ KINDS = {
     *(("python", mark) for mark in ("", "slow", "fragment", "wrong")),
     *(("sh", mark) for mark in ("", "slow", "fragment", "wrong")),
     ("json", ""),
+    ("yaml", ""),
     ("text", ""),
 }
 RUN = ("", "slow", "wrong")
 OPENS_A_PAGE = ("open", "review")
 COMMANDS = {"open": main.open_page} | {
-    name: getattr(main, name) for name in ("record", "review", "rescore", "share", "export", "view", "doctor")
+    name: getattr(main, name)
+    for name in ("record", "check", "review", "rescore", "share", "export", "view", "doctor")
 }
 TYPED = [
     page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))
@@ -73,6 +76,8 @@ def test_a_fragment_is_well_formed(page: Path) -> None:
     for fence in fences(page):
         if fence.language == "json":
             json.loads(fence.text)
+        elif fence.language == "yaml":
+            assert yaml.safe_load(fence.text), fence.place
         elif fence.language == "python":
             ast.parse(fence.text, fence.place)
         elif fence.language == "sh":

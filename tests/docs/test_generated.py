@@ -29,6 +29,7 @@ def made(child_process: None) -> dict[Path, str]:
             ),
         ),
         generate.RULES_PAGE,
+        generate.ALL_RULES,
     ],
     ids=lambda page: page.stem,
 )

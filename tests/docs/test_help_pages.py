@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from tests.docs.pages import DOCS, PAGES, ROOT, without_fences
+from workbench.cli.help import show_help
 from workbench.machine.folders import web_assets_folder
 from workbench.ui.app import help_pages
-from workbench.ui.app.help_pages import ADDRESS, Topic, find_topic, html_of, reply, topics
+from workbench.ui.app.help_pages import ADDRESS, RULE_PAGES, Topic, find_topic, html_of, reply, topics
 
 MOST_LINES_OF_README = 150
 MOST_ENTRIES = 12
@@ -126,8 +127,22 @@ def test_a_topic_is_found_as_people_write_it(named: str) -> None:
 
 def test_readme_is_short_and_folders_are_no_heaps() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= MOST_LINES_OF_README
-    folders = [DOCS, *(path for path in DOCS.iterdir() if path.is_dir())]
-    assert {folder.name: n for folder in folders if (n := len(list(folder.iterdir()))) > MOST_ENTRIES} == {}
+    # Pages of rules are found by the name of the rule.
+    folders = [DOCS, *(path for path in DOCS.iterdir() if path.is_dir() and path.name != RULE_PAGES)]
+    assert {
+        folder.name: n for folder in folders if (n := len(list(folder.glob("*.md")))) > MOST_ENTRIES
+    } == {}
+
+
+def test_the_page_of_a_rule_is_found_by_its_name_and_in_no_list(capsys: pytest.CaptureFixture[str]) -> None:
+    for named in ("reward-rows", "reward_rows", "Reward rows"):
+        found = find_topic(named)
+        assert found is not None and found.path == "web_assets/docs/rules/reward-rows.md"
+    assert "reward-rows" not in reply("overview")[2].decode()
+    assert "<h1" in reply("reward-rows")[2].decode()
+    assert show_help("reward-rows") == 0 and show_help("") == 0
+    page, listed = capsys.readouterr().out.split("Use it\n")
+    assert "Mend" in page and "reward-rows" not in listed and "rules" in listed
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,19 @@ from workbench.cli import main, terminal
 from workbench.cli.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
-COMMANDS = ("start", "open", "record", "review", "rescore", "share", "export", "view", "doctor", "help")
+COMMANDS = (
+    "start",
+    "open",
+    "record",
+    "check",
+    "review",
+    "rescore",
+    "share",
+    "export",
+    "view",
+    "doctor",
+    "help",
+)
 CALLS = {
     "workbench": ["nonsense", "--nonsense", "open --nonsense", "record"],
     "start": [
@@ -59,6 +71,18 @@ CALLS = {
         "record push.py --out push.py",
         "record broken.py --no-pictures --episodes 1",
     ],
+    "check": [
+        "check",
+        "check gone.py",
+        "check push.py --num-envs 0",
+        "check push.py --seeds 0",
+        "check push.py --workers 0",
+        "check push.py --select nonsense",
+        "check push.py --select runs --ignore runs",
+        "check push.py --fail-on off",
+        "check push.py --sarif gone/report.sarif",
+        "check untidy.py",
+    ],
     "review": ["review gone", "review made --task gone.py", "review made --host 0.0.0.0 --no-token"],
     "rescore": [
         "rescore",
@@ -66,7 +90,8 @@ CALLS = {
         "rescore empty",
         "rescore push.py",
         "rescore made --task push.py --recorded-source",
-        "rescore made --csv gone/table.csv",
+        "rescore made --csv-file gone/table.csv",
+        "rescore made --csv --json",
         "rescore made",
     ],
     "share": [
@@ -99,6 +124,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "empty").mkdir()
     text = (folder / "push.py").read_text()
     assert "> WANTED" in text
+    (folder / "untidy.py").write_text("import nothing_of_this_name\n")
     (folder / "broken.py").write_text(text.replace("> WANTED", "> WANTED.gone"))
     return folder
 
@@ -197,7 +223,7 @@ def test_what_is_written_for_programs(capsys: pytest.CaptureFixture[str]) -> Non
     # With nightly builds the distribution has another name.
     text = path.read_text().replace('"mani_skill-nightly"', '"mani_skill"')
     holds("recording.json", json.dumps(shape(json.loads(text)), indent=1))
-    code, _ = run(capsys, "rescore new --task push.py --json table.json --csv table.csv")
+    code, _ = run(capsys, "rescore new --task push.py --json-file table.json --csv-file table.csv")
     assert code == Exit.DONE
     holds("rescore.json", json.dumps(shape(json.loads(Path("table.json").read_text())), indent=1))
     holds("rescore.csv", Path("table.csv").read_text().splitlines()[0])

@@ -124,9 +124,9 @@ def test_they_are_judged_as_they_were(
 ) -> None:
     """They come from another installation, so their code is run where that is said, and else not."""
     table = tmp_path / "table.json"
-    code, _, err = run(capsys, "rescore", place, "--json", table)
+    code, _, err = run(capsys, "rescore", place, "--json-file", table)
     assert code == Exit.NOT_TRUSTED and "push.py" in err and not table.exists()
-    assert run(capsys, "rescore", place, "--json", table, "--trust")[0] == Exit.DONE
+    assert run(capsys, "rescore", place, "--json-file", table, "--trust")[0] == Exit.DONE
     rows = {row["episode"]: row for row in json.loads(table.read_text())}
     everything = {name: (kind, facts) for kind in KINDS for name, facts in expected[kind].items()}
     assert rows.keys() == everything.keys()
@@ -159,7 +159,7 @@ def test_they_are_judged_by_the_text_that_they_hold(
     for arguments, halved in (((), True), (("--recorded-source",), False)):
         table = tmp_path / "table.json"
         code, _, _ = run(
-            capsys, "rescore", tmp_path / place.name / kind, "--json", table, "--trust", *arguments
+            capsys, "rescore", tmp_path / place.name / kind, "--json-file", table, "--trust", *arguments
         )
         assert code == Exit.DONE
         (row,) = json.loads(table.read_text())

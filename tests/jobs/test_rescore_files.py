@@ -219,13 +219,24 @@ def test_the_command_prints_a_table_and_writes_it(
     edit(author, REWARD, f"{REWARD} * 2")
     tables = [tmp_path / "out.csv", tmp_path / "out.json"]
     recordings = str(author / "recordings")
-    code, out, _ = run([recordings, "--csv", str(tables[0]), "--json", str(tables[1])], capsys)
+    code, out, _ = run([recordings, "--csv-file", str(tables[0]), "--json-file", str(tables[1])], capsys)
     assert code == 0 and f"{EPISODES} of {EPISODES} episodes differ" in out
     rows = list(csv.DictReader(tables[0].open()))
     assert [row["seed"] for row in rows] == ["20", "21", "22"]
     said = json.loads(tables[1].read_text())
     assert all(row["return_now"] == pytest.approx(2 * row["return_before"], rel=1e-5) for row in said)
     assert all(row["first_difference"] == 1 and row["drift_metres"] == 0 for row in said)
+
+
+def test_what_is_printed_for_programs_has_nothing_else_in_it(
+    author: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(author, REWARD, f"print('printed by the task')\n        {REWARD}")
+    code, out, err = run([str(author / "recordings"), "--json"], capsys)
+    assert code == 0 and [row["seed"] for row in json.loads(out)] == [20, 21, 22]
+    assert "printed by the task" in err
+    code, out, _ = run([str(author / "recordings"), "--csv"], capsys)
+    assert code == 0 and [row["seed"] for row in csv.DictReader(out.splitlines())] == ["20", "21", "22"]
 
 
 def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -248,7 +259,7 @@ def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreig
 def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = str(author / "recordings")
     assert run([recordings, "--task", "x.py", "--recorded-source"], capsys)[0] == 2
-    code, _, err = run([recordings, "--csv", str(author / "no" / "where.csv")], capsys)
+    code, _, err = run([recordings, "--csv-file", str(author / "no" / "where.csv")], capsys)
     assert code == 2 and "there is no folder" in err
     code, _, err = run([str(author / "nothing")], capsys)
     assert code == 2 and "There is nothing at" in err

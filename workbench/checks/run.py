@@ -7,10 +7,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from workbench.authoring.problem import TaskError
 from workbench.checks import evaluate, reward
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
 from workbench.checks.rules import CHECK_RULES, RULES
+from workbench.core.env import actions
 from workbench.core.rules import Degree, Finding, reason_of_silence
 
 State = Literal["kept", "broken", "silenced", "skipped", "failed"]
@@ -52,6 +55,8 @@ GROUPS: tuple[Group, ...] = (
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"
+CORE_RESETS = 6
+"""Resets of random envs, with steps between them."""
 
 
 def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
@@ -74,6 +79,25 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
         yield replace(result_of(rule, degrees[rule], seen), seconds=time.perf_counter() - began)
 
 
+def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
+    """Steps, and resets of random envs among them, while the rules of GPU simulation look. Gives results only where the task
+    raises; what was found is in `Checkup.findings`, see `core_results`."""
+    rng = np.random.default_rng(0)
+    try:
+        task = checkup.task
+        checkup.reset(task, checkup.seeds[0])
+        for _ in range(CORE_RESETS):
+            for _ in range(2):
+                checkup.step(task, actions.random_action(task.parts, task.num_envs, rng))
+            count = int(rng.integers(1, max(2, task.num_envs)))
+            checkup.reset(task, None, sorted(rng.choice(task.num_envs, count, replace=False).tolist()))
+    except TaskError as error:
+        for rule in _core_rules(degrees):
+            yield RuleResult(rule, "failed", why=str(error))
+        if degrees["runs"] != "off":
+            yield result_of("runs", degrees["runs"], [raised(error)])
+
+
 def raised(error: TaskError) -> Found:
     """What the task raised, as a breach of the rule `runs`."""
     problem = error.problem
@@ -83,12 +107,14 @@ def raised(error: TaskError) -> Found:
 
 def core_results(findings: list[Finding], degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
     """The results of the rules of GPU simulation, of what was seen while the others were checked."""
-    for rule in RULES:
-        if rule in CHECK_RULES or degrees[rule] == "off":
-            continue
+    for rule in _core_rules(degrees):
         of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
         once = {each.key: each for each in of_rule}
         yield RuleResult(rule, "broken" if once else "kept", tuple(once.values()))
+
+
+def _core_rules(degrees: Mapping[str, Degree]) -> list[str]:
+    return [rule for rule in RULES if rule not in CHECK_RULES and degrees[rule] != "off"]
 
 
 def result_of(rule: str, degree: Degree, seen: list[Found | Note]) -> RuleResult:

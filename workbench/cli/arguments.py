@@ -97,6 +97,34 @@ class EnvArguments(BatchArguments):
         return replace(super().options(), seed=self.seed, env_kwargs=kwargs)
 
 
+@dataclass(frozen=True)
+class CheckArguments:
+    """On what a task is checked.
+
+    Args:
+        num_envs: environments to run at once.
+        seeds: how many seeds are tried.
+        seed: the first of them; each further one counts up.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
+        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+    """
+
+    num_envs: int = 8
+    seeds: int = 32
+    seed: int = 0
+    imports: Imports = ()
+    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+
+    def options(self) -> TaskOptions:
+        return EnvArguments(self.num_envs, "cpu", None, self.imports, self.seed, self.env).options()
+
+
+def separated(names: Sequence[str]) -> tuple[str, ...]:
+    """The names of an option that is given several times, or once with commas."""
+    return tuple(name for one in names for name in one.replace(",", " ").split())
+
+
 def imported(names: Sequence[str]) -> tuple[str, ...]:
     """The modules of ``--import``, checked and not imported. Raises ValueError."""
     from workbench.authoring.loading.reference import find_module, is_module_name, not_found_text

@@ -7,20 +7,23 @@ import workbench.machine.processes.own_path  # noqa: F401
 
 # isort: split
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from workbench.cli.arguments import (
     BatchArguments,
+    CheckArguments,
     EnvArguments,
     Imports,
     PageArguments,
     Rules,
     history_bytes,
     imported,
+    separated,
 )
 from workbench.cli.terminal import Exit, print_problem, print_text, refuse, warn
 from workbench.jobs.task import RecordArguments
@@ -187,6 +190,59 @@ def record(
 
 
 @app.command
+def check(
+    task: Task,
+    /,
+    *,
+    envs: CheckArguments,
+    workers: int | None = None,
+    select: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    ignore: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    fail_on: Literal["stop", "warn"] = "stop",
+    json: bool = False,
+    json_file: Path | None = None,
+    junit: Path | None = None,
+    sarif: Path | None = None,
+) -> int:
+    """Check a task for what goes wrong on a GPU cluster or in training, with the line of each mistake. The exit code is 1
+    where a rule is broken, and 2 where the task cannot be imported.
+
+    Args:
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
+        workers: processes, which share the groups of rules; as many as cores and groups allow.
+        select: check only this rule; repeatable, or several with commas. workbench help rules lists them.
+        ignore: do not check this rule; repeatable, or several with commas.
+        fail_on: lowest degree of a finding that makes the exit code 1.
+        json: print the result as JSON in place of text.
+        json_file: also write the result to this file, as JSON.
+        junit: also write it to this file as JUnit's XML, with a test case for each rule.
+        sarif: also write it to this file as SARIF 2.1.0, for code scanning.
+    """
+    began = time.monotonic()
+    if _lacks_maniskill("check"):
+        return Exit.REFUSED
+    from workbench.authoring.loading.reference import why_missing
+
+    if (why := why_missing(task) or _no_folder(json_file, junit, sarif)) is not None:
+        return refuse(why)
+    from workbench.checks.rules import degree_of_each
+
+    try:
+        options = envs.options()
+        # Before torch is imported: a typo is answered at once.
+        degree_of_each(separated(select), separated(ignore))
+    except ValueError as error:
+        return refuse(str(error))
+    use_private_driver()
+    with quick_imports():
+        from workbench.cli.check import CheckOutput, check_in_terminal
+        from workbench.jobs.check import CheckOptions
+
+    what = CheckOptions(task, options, envs.seeds, separated(select), separated(ignore), workers)
+    return check_in_terminal(what, CheckOutput(json, json_file, junit, sarif, fail_on), began)
+
+
+@app.command
 def review(
     folder: Annotated[Path, tyro.conf.Positional] = Path("recordings"),
     /,
@@ -247,8 +303,10 @@ def rescore(
     use_env_states: bool = False,
     *,
     batch: BatchArguments,
-    csv: Path | None = None,
-    json: Path | None = None,
+    csv: bool = False,
+    csv_file: Path | None = None,
+    json: bool = False,
+    json_file: Path | None = None,
     trust: bool = False,
 ) -> int:
     """Rescore recorded episodes with today's reward and evaluate, and list what differs (on the page: Rescore).
@@ -259,21 +317,26 @@ def rescore(
             one each names.
         recorded_source: rescore each with the text that it was recorded with.
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
-        csv: also write the table to this file, as CSV.
-        json: also write the table to this file, as JSON.
+        csv: print the table as CSV in place of text.
+        csv_file: also write the table to this file, as CSV.
+        json: print the table as JSON in place of text.
+        json_file: also write the table to this file, as JSON.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
             it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
     if _lacks_maniskill("rescore"):
         return Exit.REFUSED
     with quick_imports():
-        from workbench.cli.rescore import RescoreOptions, run_rescore
+        from workbench.cli.rescore import RescoreOptions, RescoreOutput, run_rescore
 
     if task is not None and recorded_source:
         return refuse("--task and --recorded-source name two versions to rescore with: give one of them")
-    for table in (csv, json):
-        if table is not None and not table.resolve().parent.is_dir():
-            return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
+    if csv and json:
+        return refuse(
+            "--csv and --json both print the table: give one of them, and --csv-file or --json-file"
+        )
+    if (why := _no_folder(csv_file, json_file)) is not None:
+        return refuse(why)
     try:
         base = batch.options()
     except ValueError as error:
@@ -285,7 +348,7 @@ def rescore(
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)
     try:
-        return run_rescore(what, csv, json, trust)
+        return run_rescore(what, RescoreOutput(csv, csv_file, json, json_file), trust)
     except NotTrusted as error:
         for line in not_trusted_lines(error):
             refuse(line)
@@ -399,6 +462,14 @@ def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
     from workbench.cli import help
 
     return help.show_help(topic)
+
+
+def _no_folder(*files: Path | None) -> str | None:
+    """Why one of these files cannot be written; None if each has its folder."""
+    for file in files:
+        if file is not None and not file.resolve().parent.is_dir():
+            return f"there is no folder {file.resolve().parent} to write {file.name} into"
+    return None
 
 
 def _lacks_maniskill(command: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,16 @@ from rich.table import Table
 
 from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import TaskError
-from workbench.cli.terminal import Exit, TerminalPrompt, can_ask, out, print_finding, progress_bar, warn
+from workbench.cli.terminal import (
+    Exit,
+    TerminalPrompt,
+    can_ask,
+    out,
+    print_finding,
+    progress_bar,
+    stdout_to_stderr,
+    warn,
+)
 from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
@@ -53,6 +62,18 @@ class RescoreOptions:
     num_envs: int = 16
     base: TaskOptions = field(default_factory=TaskOptions)
     """The backend and other options that are the same for all."""
+
+
+@dataclass(frozen=True)
+class RescoreOutput:
+    """What is given besides the table as text."""
+
+    csv: bool = False
+    """Print it as CSV instead."""
+    csv_file: Path | None = None
+    json: bool = False
+    """Print it as JSON instead."""
+    json_file: Path | None = None
 
 
 def rescore_all(
@@ -139,13 +160,15 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
     return cleared
 
 
-def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust: bool) -> int:
+def run_rescore(what: RescoreOptions, output: RescoreOutput, trust: bool) -> int:
     """Rescore, print, and write the requested tables; raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may change it
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
-    with progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
+    for_programs = output.csv or output.json
+    quiet = stdout_to_stderr() if for_programs else nullcontext()
+    with quiet, progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
         row = bar.add_task("reading the recordings", total=None)
 
         def report(episodes: int, total: int, steps: int) -> None:
@@ -167,11 +190,14 @@ def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust
             warn,
         )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="rescored")
-    for path, text in ((csv, verdict_text.as_csv), (json, verdict_text.as_json)):
+    for path, text in ((output.csv_file, verdict_text.as_csv), (output.json_file, verdict_text.as_json)):
         if path is not None:
             with here.again():
                 replace_file(path, text(verdicts).encode())
-    print_verdicts(verdicts, out)
+    if for_programs:
+        print((verdict_text.as_csv if output.csv else verdict_text.as_json)(verdicts), end="", flush=True)
+    else:
+        print_verdicts(verdicts, out)
     for note in (*notes, *verdict_text.not_carried(verdicts)):
         warn(note)
     if verdict_text.count_drifted(verdicts):

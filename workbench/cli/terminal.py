@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from enum import IntEnum
 from typing import IO, TYPE_CHECKING
 
@@ -29,7 +30,7 @@ class Exit(IntEnum):
 
     DONE = 0
     FAILED = 1
-    """The author's code raised, or fewer results than requested."""
+    """The author's code raised, a check found something, or fewer results than requested."""
     REFUSED = 2
     """Nothing was done: a wrong argument, a missing file."""
     NOT_TRUSTED = 4
@@ -75,6 +76,20 @@ _printed_notices: set[str] = set()
 def print_text(text: object) -> None:
     """Print one line to stdout without wrapping, so that it can be copied."""
     print(plain_text(str(text)), flush=True)
+
+
+@contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """Within this, what the author's code, native libraries and child processes print goes to stderr: stdout is for results."""
+    sys.stdout.flush()
+    before = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:

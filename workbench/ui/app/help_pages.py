@@ -34,9 +34,11 @@ GROUPS = (
     ("developers", "Change the workbench"),
 )
 """Folders of the documents, and what a reader wants who looks there."""
+RULE_PAGES = "rules"
+"""Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
-    OVERVIEW, "install", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "batched_env", "safety",
-    "limits", "keys", "cli",
+    OVERVIEW, "install", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env", "safety",
+    "limits", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics; those that are not listed follow by name."""
 _DOCS = "web_assets/docs/"
@@ -48,6 +50,7 @@ class Topic:
     name: str
     title: str
     group: str
+    """One of `GROUPS`, or `RULE_PAGES`."""
     path: str
     """From the root of a checkout; links of the page are relative to it."""
     text: str
@@ -72,7 +75,7 @@ def topics() -> tuple[Topic, ...]:
         found.append(
             (file.stem, below.parent.as_posix().removeprefix("."), f"{_DOCS}{below.as_posix()}", file)
         )
-    folders = [name for name, _ in GROUPS]
+    folders = [*(name for name, _ in GROUPS), RULE_PAGES]
 
     def place(one: tuple[str, str, str, Path]) -> tuple[int, int, str]:
         name, group, *_ = one
@@ -90,18 +93,23 @@ def _overview_file(folder: Path) -> Path:
 def _topic(name: str, group: str, path: str, file: Path) -> Topic:
     text = file.read_text(encoding="utf-8")
     title = "The first ten minutes" if name == OVERVIEW else text.partition("\n")[0].removeprefix("# ")
-    return Topic(name, title, dict(GROUPS)[group], path, text)
+    return Topic(name, title, dict(GROUPS).get(group, RULE_PAGES), path, text)
 
 
 def find_topic(name: str) -> Topic | None:
-    """The topic of this name; ``Batched env`` and ``batched-env`` name ``batched_env``."""
-    wanted = re.sub(r"[\s-]+", "_", name.strip().lower()).removesuffix(".md")
-    return next((topic for topic in topics() if topic.name == wanted), None)
+    """The topic of this name; ``Batched env`` and ``batched-env`` name ``batched_env``, and ``rows_lost`` ``rows-lost``."""
+    wanted = _as_named(name.strip().lower().removesuffix(".md"))
+    return next((topic for topic in topics() if _as_named(topic.name) == wanted), None)
+
+
+def _as_named(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", name)
 
 
 def topics_about(words: str) -> list[Topic]:
-    """Topics whose text holds these words, whatever their case."""
-    return [topic for topic in topics() if words.lower() in topic.text.lower()]
+    """Topics whose text holds these words, whatever their case; pages of rules only where no other does."""
+    found = [topic for topic in topics() if words.lower() in topic.text.lower()]
+    return [topic for topic in found if topic.group != RULE_PAGES] or found
 
 
 def by_path(path: str) -> Topic | None:

@@ -1,0 +1,162 @@
+"""The job of ``workbench check``: the same results in any number of processes, and what becomes of a task that raises."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from mani_skill.utils import assets
+
+from workbench.authoring.problem import TaskError
+from workbench.checks.rules import RULES
+from workbench.checks.run import RuleResult
+from workbench.core.rules import Finding
+from workbench.jobs.check import CheckOptions, CheckReport, check, comments_without_effect, merged
+from workbench.jobs.pool import Processes
+from workbench.jobs.task import TaskOptions
+
+TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
+AT_ONCE = '"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)'
+LOSES_ROWS = "b = len(env_idx)\n", "b = len(env_idx)\n            self.drawn = torch.rand((b, 2))\n"
+RAISES = '"cube_height": height,', '"cube_height": height / self.gone,'
+PLAIN = {"render_backend": "none"}
+
+
+def task_of(folder: Path, *edits: tuple[str, str]) -> str:
+    text = TEXT
+    for old, new in edits:
+        assert old in text, old
+        text = text.replace(old, new)
+    file = folder / "task.py"
+    file.write_text(text)
+    return str(file)
+
+
+def options(task: str, *select: str, workers: int = 1, ignore: tuple[str, ...] = ()) -> CheckOptions:
+    made = TaskOptions(num_envs=4, env_kwargs=PLAIN)
+    return CheckOptions(task, made, seeds=4, select=select, ignore=ignore, workers=workers)
+
+
+def states(report: CheckReport) -> dict[str, str]:
+    return {result.rule: result.state for result in report.results}
+
+
+def test_each_rule_has_its_result_in_the_order_of_the_table_whoever_looked(
+    tmp_path: Path, child_process: None
+) -> None:
+    """The first two are of other groups, and the last is seen while they look."""
+    task = task_of(tmp_path, AT_ONCE, LOSES_ROWS)
+    rules = ("reward-finite", "success-at-reset", "rows-lost")
+    seen: list[str] = []
+    alone = check(options(task, *rules), on_result=lambda result: seen.append(result.rule))
+    assert seen == ["success-at-reset", "reward-finite"], "as they come"
+    several = check(options(task, *rules, workers=2), executor=Processes())
+    assert states(alone) == states(several) and list(states(alone)) == [r for r in RULES if r in rules]
+    assert states(alone) == {"rows-lost": "broken", "success-at-reset": "broken", "reward-finite": "kept"}
+    told = [(finding.key, finding.message, finding.degree, finding.line) for finding in alone.findings]
+    assert told == [(one.key, one.message, one.degree, one.line) for one in several.findings]
+    assert alone.task == several.task and alone.task.env_id == "WorkbenchPushCube-v1"
+    for report in (alone, several):
+        assert report.fails("stop") and 0 < report.start_seconds < report.seconds
+
+
+def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path) -> None:
+    report = check(options(task_of(tmp_path, LOSES_ROWS), "rows-lost"))
+    (finding,) = report.findings
+    assert finding.degree == "stop" and finding.code == "self.drawn = torch.rand((b, 2))"
+    assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "kept"}
+
+
+def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_path: Path) -> None:
+    task = task_of(tmp_path, RAISES)
+    report = check(options(task, "runs", "reward-finite", "success-at-reset", "rows-lost"))
+    assert states(report) == {
+        "rows-lost": "failed", "runs": "broken", "success-at-reset": "failed", "reward-finite": "failed"
+    }  # fmt: skip
+    (finding,) = report.findings
+    assert (
+        "self.gone" in finding.code and finding.rule == "runs" and "gone" in report.of_state("failed")[0].why
+    )
+
+
+def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
+    """Where `runs` is not asked for, nothing else would tell a job in CI."""
+    report = check(options(task_of(tmp_path, RAISES), "reward-finite"))
+    assert report.findings == () and report.fails("stop")
+
+
+def test_a_finding_below_the_degree_that_fails_is_told_and_passes(tmp_path: Path) -> None:
+    both = AT_ONCE, ("height < -0.1", "height < 1")
+    report = check(options(task_of(tmp_path, *both), "success-and-fail"))
+    assert [finding.degree for finding in report.findings] == ["warn"]
+    assert report.fails("warn") and not report.fails("stop")
+
+
+def test_a_job_that_is_stopped_gives_what_it_has(tmp_path: Path) -> None:
+    seen: list[RuleResult] = []
+    rules = "success-at-reset", "reward-finite"
+    report = check(options(task_of(tmp_path), *rules), on_result=seen.append, stop=lambda: bool(seen))
+    assert report.stopped and states(report) == {"success-at-reset": "kept"}
+
+
+def test_the_task_and_its_folder_are_left_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    moves = "import numpy as np\n", "import os\n\nimport numpy as np\n\nos.chdir('/')\n"
+    before = set(sys.modules)
+    check(options(task_of(tmp_path, moves), "entry-name"))
+    assert Path.cwd() == tmp_path
+    assert not any("task" in name.split(".")[-1] and name not in before for name in sys.modules)
+
+
+def test_a_task_that_cannot_be_imported_or_lacks_a_download_is_not_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
+    with pytest.raises(TaskError, match="broken.py:1: ModuleNotFoundError"):
+        check(options(str(tmp_path / "broken.py")))
+    monkeypatch.setattr(assets, "is_data_source_downloaded", lambda name: name != "ycb")
+    with pytest.raises(TaskError, match="mani_skill.utils.download_asset ycb"):
+        check(options("PickSingleYCB-v1", "runs"))
+
+
+def test_a_request_that_is_wrong_is_refused_before_anything_runs() -> None:
+    with pytest.raises(ValueError, match="no rule is called 'nonsense'"):
+        check(options("gone.py", "nonsense"))
+    with pytest.raises(ValueError, match="no rule is left"):
+        check(options("gone.py", "entry-name", ignore=("entry-name",)))
+    with pytest.raises(ValueError, match="--workers must be at least 1"):
+        check(options("gone.py", workers=0))
+
+
+def test_what_several_processes_say_of_one_rule_becomes_one_result() -> None:
+    finding = Finding("runs", "stop", "step: it raised", "a.py", 3, "x()", "evaluate", 1, 0)
+    other = Finding("runs", "stop", "reset: it raised", "a.py", 9, "y()", "reset", 1, 0)
+    again = Finding("runs", "stop", "step: it raised", "a.py", 3, "x()", "evaluate", 4, 0)
+    one = merged(
+        [
+            RuleResult("runs", "kept", seconds=1.0, notes=("a",)),
+            RuleResult("runs", "broken", (finding,), seconds=0.5),
+            RuleResult("runs", "broken", (other, again), notes=("a", "b")),
+        ]
+    )
+    assert one == RuleResult("runs", "broken", (again, other), notes=("a", "b"), seconds=1.5)
+    undecided = [RuleResult("runs", "kept"), RuleResult("runs", "failed", why="it raised")]
+    assert merged(undecided).state == "failed" and merged(undecided).why == "it raised"
+
+
+def test_a_comment_that_silences_nothing_is_told() -> None:
+    text = (
+        "x = 1  # workbench: off[reward-rows]\n"
+        "y = 2  # workbench: off[reward-row] one env only\n"
+        "z = 3  # workbench: off[] because\n"
+        "w = 4  # workbench: off[reward-rows, same-seed] one env only\n"
+    )
+    told = [(one.line, one.message) for one in comments_without_effect("a.py", text)]
+    assert told == [
+        (1, "off[reward-rows] silences nothing until a reason stands behind it"),
+        (2, "no rule is called reward-row"),
+        (3, "the comment names no rule, as in off[reward-rows]"),
+    ]

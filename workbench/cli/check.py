@@ -1,0 +1,160 @@
+"""Runs ``workbench check``: a progress bar, the findings by degree, a summary, and reports for other programs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.markup import escape
+from rich.progress import MofNCompleteColumn, TimeElapsedColumn
+
+from workbench.authoring.problem import TaskError
+from workbench.checks.rules import RULES
+from workbench.checks.run import RuleResult
+from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
+from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
+from workbench.core.rules import Degree, Finding
+from workbench.jobs.check import CheckOptions, CheckReport, check, count_rules, degrees_of_request
+from workbench.jobs.pool import PoolError
+from workbench.machine.files import replace_file
+from workbench.machine.folders import CurrentFolder
+from workbench.machine.text import plain_text
+
+
+@dataclass(frozen=True)
+class CheckOutput:
+    """What a check gives besides its text."""
+
+    json: bool = False
+    """Print JSON in place of the text."""
+    json_file: Path | None = None
+    junit: Path | None = None
+    sarif: Path | None = None
+    fail_on: Degree = "stop"
+    """The lowest degree of a finding that makes the exit code 1."""
+
+
+def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> int:
+    """Check, print, and write the reports; returns the exit code.
+
+    Args:
+        began: when the command began, by ``time.monotonic()``.
+    """
+    here, root = CurrentFolder(), Path.cwd()  # a task may change it
+    try:
+        total = count_rules(degrees_of_request(what))
+        with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
+            row = bar.add_task("opening", total=total)
+            done: set[str] = set()
+
+            def show(result: RuleResult) -> None:
+                done.add(result.rule)
+                bar.update(row, completed=len(done))
+                if result.state in ("broken", "failed") and not err.is_terminal:
+                    # A bar in a file or a pipe is drawn once, at the end.
+                    err.print(escape(f"{result.rule}: {result.state}"), soft_wrap=True)
+
+            try:
+                report = check(
+                    what, lambda activity: bar.update(row, description=activity), show, began=began
+                )
+            except BaseException:
+                bar.update(row, visible=False)
+                raise
+            bar.update(row, completed=len(report.results), description="checked")
+    except TaskError as error:
+        print_problem(error.problem)
+        return Exit.REFUSED
+    except (OSError, ValueError, PoolError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted")
+    said = Reported(report, what, root, output.fail_on)
+    try:
+        with here.again():
+            for path, made in (
+                (output.json_file, as_json),
+                (output.junit, as_junit),
+                (output.sarif, as_sarif),
+            ):
+                if path is not None:
+                    replace_file(path, made(said).encode())
+    except OSError as error:
+        return refuse(str(error))
+    if output.json:
+        print(as_json(said), end="", flush=True)
+    else:
+        print_report(said)
+    return Exit.FAILED if report.fails(output.fail_on) else Exit.DONE
+
+
+# --- text ------------------------------------------------------------------------------------------------
+
+
+def print_report(said: Reported) -> None:
+    """Print the findings, and a summary."""
+    report = said.report
+    findings = report.findings
+    for degree, style in (("stop", "red"), ("warn", "yellow")):
+        of_degree = [finding for finding in findings if finding.degree == degree]
+        if of_degree:
+            _print(f"[bold {style}]{degree}[/]: {count_text(len(of_degree), 'finding')}\n")
+        for finding in of_degree:
+            _print_finding(finding, said.root, style)
+    _print_summary(report, said.root)
+    for comment in report.task.comments:
+        warn(f"{shown_path(comment.file, said.root)}:{comment.line}: {comment.message}")
+    for notice in report.task.notices:
+        warn(notice)
+    if report.task.others:
+        name = Path(report.task.file or "").name
+        others = ", ".join(f"{name}:{other}" for other in report.task.others)
+        warn(f"Not checked, as one task is checked at a time: {others}")
+
+
+def _print_finding(finding: Finding, root: Path, style: str) -> None:
+    place = "" if finding.file is None else f"{shown_path(finding.file, root)}:{finding.line or 1}: "
+    times = f", {finding.count} times" if finding.count > 1 else ""
+    _print(f"{_safe(place)}[{style}]{finding.rule}[/] ({finding.degree}{times})")
+    _print(f"  {_safe(finding.message)}")
+    if finding.code:
+        _print(f"      [bold]{_safe(finding.code)}[/]")
+    _print(f"  Otherwise: {escape(RULES[finding.rule].otherwise)}")
+    _print(f"  [dim]workbench help {finding.rule}[/]\n")
+
+
+def _print_summary(report: CheckReport, root: Path) -> None:
+    for error, rules in _by_reason(report.of_state("failed")).items():
+        _print(f"[red]not decided[/] {', '.join(rules)}: {_safe(error)}")
+    for result in report.results:
+        for one in result.silenced:
+            file = shown_path(one.finding.file or "", root)
+            _print(f"[dim]silenced[/] {file}:{one.finding.line}: {result.rule}: {_safe(one.reason)}")
+    for reason, rules in _by_reason(report.of_state("skipped")).items():
+        _print(f"[dim]skipped[/] {', '.join(rules)}: {_safe(reason)}")
+    for result in report.results:
+        for note in result.notes:
+            _print(f"[dim]note[/] {result.rule}: {_safe(note)}")
+    counts = Counter(result.state for result in report.results)
+    words = [f"{count_text(counts['kept'], 'rule')} kept", f"{counts['broken']} broken"]
+    words += [f"{counts[state]} {state}" for state in ("silenced", "skipped") if counts[state]]
+    words += [f"{counts['failed']} not decided"] if counts["failed"] else []
+    seconds = f"{report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
+    _print(f"{_safe(report.task.env_id)}: {', '.join(words)}. {seconds}.")
+
+
+def _by_reason(results: Sequence[RuleResult]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for result in results:
+        found.setdefault(result.why, []).append(result.rule)
+    return found
+
+
+def _safe(text: str) -> str:
+    return escape(plain_text(text))
+
+
+def _print(text: str) -> None:
+    out.print(text, soft_wrap=True)

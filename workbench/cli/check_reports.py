@@ -1,0 +1,281 @@
+"""What a check came to as JSON, as JUnit's XML for CI, and as SARIF for code scanning."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections import Counter
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+from xml.etree import ElementTree
+
+from workbench.checks.rules import RULES
+from workbench.checks.run import RuleResult
+from workbench.core.rules import DEGREES, Degree, Finding
+from workbench.jobs.check import CheckOptions, CheckReport
+from workbench.ui.app.help_pages import find_topic
+
+DISTRIBUTION = "maniskill-workbench"
+SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+LEVELS = {"stop": "error", "warn": "warning", "off": "none"}
+"""Degree to SARIF's level."""
+_NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A report, and what its texts say of files."""
+
+    report: CheckReport
+    what: CheckOptions
+    root: Path
+    """The current folder of the command."""
+    fail_on: Degree
+
+    def fails(self, finding: Finding) -> bool:
+        return DEGREES.index(finding.degree) <= DEGREES.index(self.fail_on)
+
+
+def count_text(count: int, what: str) -> str:
+    """``1 finding``, ``3 findings``."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def shown_path(file: str, root: Path) -> str:
+    """Relative to `root` if it is below it."""
+    path = Path(file)
+    return str(path.relative_to(root)) if path.is_relative_to(root) else file
+
+
+def repository_of(folder: Path) -> Path:
+    """The root of the checkout around a folder, from which CI counts paths; else the folder."""
+    return next((each for each in (folder, *folder.parents) if (each / ".git").exists()), folder)
+
+
+# --- JSON ------------------------------------------------------------------------------------------------
+
+
+def as_json(said: Reported) -> str:
+    """All that is known, as one object."""
+    report, what = said.report, said.what
+    task = report.task
+    return _json(
+        {
+            "task": {
+                "id": task.env_id,
+                "class": task.class_name,
+                "file": None if task.file is None else shown_path(task.file, said.root),
+                "not_checked": list(task.others),
+            },
+            "num_envs": what.options.num_envs,
+            "seeds": what.seeds,
+            "first_seed": what.options.seed,
+            "seconds": round(report.seconds, 3),
+            "start_seconds": round(report.start_seconds, 3),
+            "fail_on": said.fail_on,
+            "fails": report.fails(said.fail_on),
+            "counts": dict(Counter(result.state for result in report.results)),
+            "findings": [_finding(finding, said.root) for finding in report.findings],
+            "rules": [_rule(result, said.root) for result in report.results],
+            "comments": [
+                {"file": shown_path(one.file, said.root), "line": one.line, "message": one.message}
+                for one in task.comments
+            ],
+        }
+    )
+
+
+def _finding(finding: Finding, root: Path) -> dict[str, Any]:
+    rule = RULES[finding.rule]
+    return {
+        "rule": finding.rule,
+        "degree": finding.degree,
+        "message": finding.message,
+        "file": None if finding.file is None else shown_path(finding.file, root),
+        "line": finding.line,
+        "code": finding.code,
+        "function": finding.function,
+        "count": finding.count,
+        "hook": rule.hook,
+        "asks": rule.asks,
+        "otherwise": rule.otherwise,
+    }
+
+
+def _rule(result: RuleResult, root: Path) -> dict[str, Any]:
+    silenced = [{**_finding(one.finding, root), "reason": one.reason} for one in result.silenced]
+    return {
+        "rule": result.rule,
+        "state": result.state,
+        "why": result.why,
+        "seconds": round(result.seconds, 3),
+        "notes": list(result.notes),
+        "silenced": silenced,
+    }
+
+
+def _json(value: Any) -> str:
+    # Not every program reads bytes of a file's name that are no UTF-8: ASCII alone.
+    return json.dumps(value, indent=1) + "\n"
+
+
+# --- JUnit -----------------------------------------------------------------------------------------------
+
+
+def as_junit(said: Reported) -> str:
+    """A test case for each rule, as pytest writes it and GitLab, Jenkins and GitHub's actions read it. A finding below
+    ``--fail-on`` is output of a test that passes."""
+    report = said.report
+    root = repository_of(said.root)
+    cases = [_case(result, said, root) for result in report.results]
+    counts = {
+        "tests": len(cases),
+        "failures": sum(case.find("failure") is not None for case in cases),
+        "errors": sum(case.find("error") is not None for case in cases),
+        "skipped": sum(case.find("skipped") is not None for case in cases),
+    }
+    totals = {**{name: str(count) for name, count in counts.items()}, "time": f"{report.seconds:.3f}"}
+    suites = ElementTree.Element("testsuites", {"name": "workbench check", **totals})
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    named = {"name": _xml(report.task.env_id), "timestamp": now}
+    suite = ElementTree.SubElement(suites, "testsuite", {**named, **totals})
+    suite.extend(cases)
+    ElementTree.indent(suites)
+    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element:
+    task = said.report.task
+    place = next((f for f in result.findings if f.file is not None), None)
+    file = task.file if place is None else place.file
+    case = ElementTree.Element(
+        "testcase",
+        classname=_xml(f"workbench.check.{task.env_id}"),
+        name=result.rule,
+        time=f"{result.seconds:.3f}",
+    )
+    if file is not None:
+        case.set("file", _xml(shown_path(file, root)))
+        case.set("line", str(1 if place is None else place.line or 1))
+    failing = [finding for finding in result.findings if said.fails(finding)]
+    if failing:
+        failure = ElementTree.SubElement(case, "failure", type=result.rule, message=_xml(failing[0].message))
+        failure.text = _xml("\n\n".join(_text(finding, root) for finding in failing))
+    elif result.state == "failed":
+        error = ElementTree.SubElement(case, "error", type="TaskError", message=_xml(result.why))
+        error.text = _xml(result.why)
+    elif result.state == "skipped":
+        ElementTree.SubElement(case, "skipped", type="workbench.skip", message=_xml(result.why))
+    lines = [_text(finding, root) for finding in result.findings if not said.fails(finding)]
+    lines += [f"silenced: {_text(one.finding, root)}\nreason: {one.reason}" for one in result.silenced]
+    lines += result.notes
+    if lines:
+        ElementTree.SubElement(case, "system-out").text = _xml("\n\n".join(lines))
+    return case
+
+
+def _text(finding: Finding, root: Path) -> str:
+    place = "" if finding.file is None else f"{shown_path(finding.file, root)}:{finding.line or 1}: "
+    code = f"\n    {finding.code}" if finding.code else ""
+    otherwise = RULES[finding.rule].otherwise
+    return f"{place}{finding.rule} ({finding.degree})\n{finding.message}{code}\nOtherwise: {otherwise}"
+
+
+def _xml(text: str) -> str:
+    """The text with what XML cannot hold escaped."""
+    return _NOT_IN_XML.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+# --- SARIF -----------------------------------------------------------------------------------------------
+
+
+def as_sarif(said: Reported) -> str:
+    """SARIF 2.1.0 with what GitHub's code scanning asks for. Paths are relative to the repository."""
+    report = said.report
+    root = repository_of(said.root)
+    ids = [result.rule for result in report.results]
+    silenced = [(one.finding, one.reason) for result in report.results for one in result.silenced]
+    results = [_result(finding, ids, said, root) for finding in report.findings]
+    results += [
+        {
+            **_result(finding, ids, said, root),
+            "suppressions": [{"kind": "inSource", "justification": reason}],
+        }
+        for finding, reason in silenced
+    ]
+    notes = [
+        {"level": "error", "message": {"text": f"{one.rule} is not decided: {one.why}"}}
+        for one in report.of_state("failed")
+    ]
+    notes += [
+        {
+            "level": "warning",
+            "message": {"text": comment.message},
+            "locations": [_location(comment.file, comment.line, root)],
+        }
+        for comment in report.task.comments
+    ]
+    driver = {
+        "name": "workbench check",
+        "semanticVersion": version(DISTRIBUTION),
+        "rules": [_sarif_rule(rule) for rule in ids],
+    }
+    run = {
+        "tool": {"driver": driver},
+        "originalUriBaseIds": {"%SRCROOT%": {"uri": f"{root.as_uri()}/"}},
+        "invocations": [
+            {
+                "executionSuccessful": not report.of_state("failed") and not report.stopped,
+                "toolExecutionNotifications": notes,
+            }
+        ],
+        "columnKind": "unicodeCodePoints",
+        "results": results,
+    }
+    return _json({"$schema": SCHEMA, "version": "2.1.0", "runs": [run]})
+
+
+def _sarif_rule(rule_id: str) -> dict[str, Any]:
+    rule = RULES[rule_id]
+    page = find_topic(rule_id)
+    words = f"{rule.asks} Otherwise: {rule.otherwise}"
+    return {
+        "id": rule.id,
+        "shortDescription": {"text": rule.asks},
+        "fullDescription": {"text": words},
+        "help": {
+            "text": words if page is None else page.text,
+            "markdown": words if page is None else page.text,
+        },
+        "defaultConfiguration": {"level": LEVELS[rule.degree]},
+        "properties": {"tags": ["maniskill", rule.hook]},
+    }
+
+
+def _result(finding: Finding, ids: list[str], said: Reported, root: Path) -> dict[str, Any]:
+    # A result without a place is shown nowhere: the first line of the task's file.
+    file = finding.file or said.report.task.file
+    key = [finding.rule, shown_path(file or "", root), finding.function, finding.code]
+    found = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
+    return {
+        "ruleId": finding.rule,
+        "ruleIndex": ids.index(finding.rule),
+        "level": LEVELS[finding.degree],
+        "message": {"text": finding.message},
+        "locations": [] if file is None else [_location(file, finding.line or 1, root)],
+        "partialFingerprints": {"primaryLocationLineHash": f"{found}:1"},
+    }
+
+
+def _location(file: str, line: int, root: Path) -> dict[str, Any]:
+    path = Path(file)
+    if path.is_relative_to(root):
+        place = {"uri": quote(path.relative_to(root).as_posix()), "uriBaseId": "%SRCROOT%"}
+    else:
+        place = {"uri": path.as_uri()}
+    return {"physicalLocation": {"artifactLocation": place, "region": {"startLine": line}}}

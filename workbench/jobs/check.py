@@ -1,0 +1,317 @@
+"""Checks a task against the rules of `workbench check`, in one process or several."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.load import LoadedTask, undo_load
+from workbench.checks.checkup import Checkup
+from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
+from workbench.checks.run import (
+    CORE_GROUP,
+    GROUPS,
+    Group,
+    RuleResult,
+    State,
+    core_results,
+    run_core,
+    run_group,
+)
+from workbench.core.env.assets import require_assets, robots_of
+from workbench.core.env.keywords import constructor_arguments
+from workbench.core.rules import DEGREES, Degree, Finding, silences
+from workbench.jobs.open_task import Opening, import_task
+from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work
+from workbench.jobs.task import TaskOptions
+from workbench.machine.folders import CurrentFolder
+
+_ORDER: tuple[State, ...] = ("broken", "silenced", "failed", "kept", "skipped")
+"""Of the states that one rule has in several processes, the first counts."""
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """What to check, and how."""
+
+    task: str
+    options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=8))
+    seeds: int = 32
+    """How many are tried, from ``options.seed`` on."""
+    select: tuple[str, ...] = ()
+    """Only these rules; empty for all."""
+    ignore: tuple[str, ...] = ()
+    workers: int | None = None
+    """Processes; None for as many as cores and groups of rules allow."""
+
+
+@dataclass(frozen=True)
+class Comment:
+    """A comment in the source that was to silence a rule and silences none."""
+
+    file: str
+    line: int
+    message: str
+
+
+@dataclass(frozen=True)
+class CheckedTask:
+    """The task that was imported."""
+
+    env_id: str
+    class_name: str
+    file: str | None
+    others: tuple[str, ...] = ()
+    """Further tasks of the file, which were not checked."""
+    notices: tuple[str, ...] = ()
+    comments: tuple[Comment, ...] = ()
+
+
+@dataclass(frozen=True)
+class CheckUpdate:
+    """Progress of a process; one of these."""
+
+    task: CheckedTask | None = None
+    """It is imported, and the checks begin."""
+    activity: str = ""
+    """What is being looked at."""
+    result: RuleResult | None = None
+    finding: Finding | None = None
+    """Of a rule of GPU simulation."""
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What the checks came to."""
+
+    task: CheckedTask
+    results: tuple[RuleResult, ...]
+    """In the order of the table, without rules that are off."""
+    seconds: float
+    start_seconds: float
+    """Of those, until the first process had imported the task."""
+    stopped: bool = False
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Those that stop first; then in the order of the table."""
+        found = [finding for result in self.results for finding in result.findings]
+        return tuple(sorted(found, key=lambda finding: DEGREES.index(finding.degree)))
+
+    def of_state(self, state: State) -> tuple[RuleResult, ...]:
+        return tuple(result for result in self.results if result.state == state)
+
+    def fails(self, fail_on: Degree) -> bool:
+        """Whether a finding has this degree or a higher one, or a rule is undecided because the task raised."""
+        highest = DEGREES.index(fail_on)
+        if any(DEGREES.index(finding.degree) <= highest for finding in self.findings):
+            return True
+        accepted = any(result.rule == "runs" for result in self.of_state("silenced"))
+        return bool(self.of_state("failed")) and not accepted
+
+
+def groups_of(degrees: Mapping[str, Degree]) -> list[Group]:
+    """The groups with a rule that is not off; the last one lets the rules of GPU simulation look, and checks none itself."""
+    groups = [group for group in GROUPS if any(degrees[rule] != "off" for rule in group.checks)]
+    core = any(degrees[rule] != "off" for rule in RULES if rule not in CHECK_RULES)
+    # Whether the task runs is known from there too.
+    return [*groups, Group(CORE_GROUP, {})] if core or degrees["runs"] != "off" else groups
+
+
+def count_rules(degrees: Mapping[str, Degree]) -> int:
+    """How many rules a check gives a result of."""
+    in_groups = {rule for group in groups_of(degrees) for rule in group.checks if degrees[rule] != "off"}
+    core = {rule for rule in RULES if rule not in CHECK_RULES and degrees[rule] != "off"}
+    return len(in_groups | core)
+
+
+def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
+    """The degree of each rule. Raises ValueError for a request that is invalid."""
+    for name, number in (("seeds", what.seeds), ("workers", what.workers)):
+        if number is not None and number < 1:
+            raise ValueError(f"--{name} must be at least 1, not {number}")
+    degrees = degree_of_each(what.select, what.ignore)
+    if not groups_of(degrees):
+        raise ValueError("no rule is left to check")
+    return degrees
+
+
+def check(
+    what: CheckOptions,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_result: Callable[[RuleResult], None] = lambda result: None,
+    stop: Callable[[], bool] = lambda: False,
+    executor: Executor | None = None,
+    began: float | None = None,
+) -> CheckReport:
+    """Check a task.
+
+    Args:
+        on_activity: gets what is being looked at, for a status line.
+        on_result: gets the result of each rule as it comes; of a rule that several processes look at, several.
+        stop: called between steps; after True the rules that are not done are missing in the report.
+        executor: None for this process, or for spawned processes with several workers.
+        began: when the work began, by ``time.monotonic()``; None for now.
+
+    Raises:
+        TaskError: the task cannot be imported, or lacks assets.
+        PoolError: a process that checks died.
+        ValueError: the request is invalid.
+    """
+    began = time.monotonic() if began is None else began
+    degrees = degrees_of_request(what)
+    groups = groups_of(degrees)
+    cores = len(os.sched_getaffinity(0))
+    workers = min(cores if what.workers is None else what.workers, len(groups))
+    found = _Results(degrees, on_activity, on_result)
+    deal: Deal[None, CheckUpdate] = Deal(range(len(groups)), lambda number, none: None, found.take, stop)
+    work = Work(_check_groups, [what] * workers, result=None, update=CheckUpdate, name="that checks")
+    (executor or (ThisProcess() if workers == 1 else Processes())).run(work, deal)
+    return found.report(began, stop())
+
+
+class _Results:
+    """Collects the results of all processes."""
+
+    def __init__(
+        self,
+        degrees: Mapping[str, Degree],
+        on_activity: Callable[[str], None],
+        on_result: Callable[[RuleResult], None],
+    ) -> None:
+        self._degrees, self._on_activity, self._on_result = degrees, on_activity, on_result
+        self._task: CheckedTask | None = None
+        self._started = 0.0
+        self._results: list[RuleResult] = []
+        self._findings: list[Finding] = []
+
+    def take(self, update: CheckUpdate) -> None:
+        if update.task is not None and self._task is None:
+            self._task, self._started = update.task, time.monotonic()
+        if update.activity:
+            self._on_activity(update.activity)
+        if update.result is not None:
+            self._results.append(update.result)
+            self._on_result(update.result)
+        if update.finding is not None:
+            self._findings.append(update.finding)
+
+    def report(self, began: float, stopped: bool) -> CheckReport:
+        # Stopped before the task was imported: nothing is known of it.
+        task = self._task or CheckedTask("", "", None)
+        results = [*self._results, *core_results(self._findings, self._degrees)]
+        by_rule: dict[str, list[RuleResult]] = {}
+        for result in results:
+            by_rule.setdefault(result.rule, []).append(result)
+        ordered = tuple(merged(by_rule[rule]) for rule in RULES if rule in by_rule)
+        now = time.monotonic()
+        return CheckReport(task, ordered, now - began, (self._started or now) - began, stopped)
+
+
+def merged(results: Iterable[RuleResult]) -> RuleResult:
+    """One result of those that one rule has in several processes. The same breach counts once: they look at the same seeds."""
+    results = sorted(results, key=lambda result: _ORDER.index(result.state))
+    first = results[0]
+    findings: dict[object, Finding] = {}
+    for finding in (finding for result in results for finding in result.findings):
+        known = findings.setdefault(finding.key, finding)
+        if finding.count > known.count:
+            findings[finding.key] = finding
+    silenced = {one.finding.key: one for result in results for one in result.silenced}
+    return replace(
+        first,
+        findings=tuple(findings.values()),
+        silenced=tuple(silenced.values()),
+        notes=tuple(dict.fromkeys(note for result in results for note in result.notes)),
+        seconds=sum(result.seconds for result in results),
+    )
+
+
+# --- one process -----------------------------------------------------------------------------------------
+
+
+class _Stopped(Exception):
+    """No result is needed any more."""
+
+
+def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
+    """Check the groups that one process gets. Raises as `check`."""
+    torch.set_num_threads(1)  # see workbench.session.worker.loop.work
+    degrees = degree_of_each(what.select, what.ignore)
+    groups = groups_of(degrees)
+    number = -1
+
+    def keep_going() -> None:
+        if queue.limit() <= number:
+            raise _Stopped
+
+    with CurrentFolder().again():  # the task may change it
+        opening = Opening(lambda activity: queue.send_update(CheckUpdate(activity=activity)))
+        loaded = import_task(what.task, what.options, None, opening)
+        checkup = Checkup(
+            loaded,
+            what.options.env_kwargs,
+            num_envs=what.options.num_envs,
+            seeds=what.seeds,
+            first_seed=what.options.seed,
+            keep_going=keep_going,
+        )
+        try:
+            _require_assets(loaded, what)
+            queue.send_update(CheckUpdate(task=_described(loaded)))
+            while (taken := queue.next()) is not None:
+                number = taken
+                queue.send_update(CheckUpdate(activity=groups[number].name))
+                _check_group(groups[number], checkup, degrees, queue)
+                queue.send_result(number, None)
+        except _Stopped:
+            pass
+        finally:
+            checkup.close()
+            undo_load(loaded)
+
+
+def _check_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree], queue: ItemQueue) -> None:
+    known = len(checkup.findings)
+    run = run_core if group.name == CORE_GROUP else run_group
+    for result in run(group, checkup, degrees):
+        queue.send_update(CheckUpdate(result=result))
+    for finding in checkup.findings[known:]:
+        queue.send_update(CheckUpdate(finding=finding))
+
+
+def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:
+    """Raise TaskError for a download that is missing: no line of the task is at fault."""
+    given = {**loaded.default_kwargs, **constructor_arguments(loaded.cls, what.options.env_kwargs, BaseEnv)}
+    with blamed("build", loaded):
+        require_assets(loaded.cls.__name__, loaded.asset_ids, robots_of(loaded.cls, given))
+
+
+def _described(loaded: LoadedTask) -> CheckedTask:
+    file = None if loaded.file is None else str(loaded.file)
+    others = loaded.others if loaded.followed else ()
+    notices = loaded.notices if loaded.followed else ()
+    comments = [
+        comment for path, text in loaded.source.items() for comment in comments_without_effect(path, text)
+    ]
+    return CheckedTask(loaded.env_id, loaded.chosen, file, others, notices, tuple(comments))
+
+
+def comments_without_effect(file: str, text: str) -> Iterable[Comment]:
+    """The silencing comments of a file that lack a reason, or name no rule that there is."""
+    for comment in silences(text):
+        named = ", ".join(sorted(comment.rules))
+        if unknown := sorted(comment.rules - RULES.keys()):
+            yield Comment(file, comment.line, f"no rule is called {', '.join(unknown)}")
+        elif not comment.rules:
+            yield Comment(file, comment.line, "the comment names no rule, as in off[reward-rows]")
+        if comment.rules and not comment.reason:
+            yield Comment(
+                file, comment.line, f"off[{named}] silences nothing until a reason stands behind it"
+            )
