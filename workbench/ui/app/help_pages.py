@@ -31,6 +31,7 @@ OVERVIEW = "overview"
 GROUPS = (
     ("", "Use it"),
     ("reference", "Look something up"),
+    ("rules", "Rules of the checks"),
     ("developers", "Change the workbench"),
 )
 """Folders of the documents, and what a reader wants who looks there."""
@@ -95,8 +96,12 @@ def _topic(name: str, group: str, path: str, file: Path) -> Topic:
 
 def find_topic(name: str) -> Topic | None:
     """The topic of this name; ``Batched env`` and ``batched-env`` name ``batched_env``."""
-    wanted = re.sub(r"[\s-]+", "_", name.strip().lower()).removesuffix(".md")
-    return next((topic for topic in topics() if topic.name == wanted), None)
+    wanted = _plain(name.strip().lower().removesuffix(".md"))
+    return next((topic for topic in topics() if _plain(topic.name) == wanted), None)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", name)
 
 
 def topics_about(words: str) -> list[Topic]:
