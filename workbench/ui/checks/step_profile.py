@@ -32,7 +32,7 @@ class StepProfilePanel(PagePart[SessionView]):
         with server.gui.add_folder(TITLE, expand_by_default=False):
             self._start = server.gui.add_button(
                 PROFILE,
-                icon=viser.Icon.STOPWATCH,
+                icon=viser.Icon.CLOCK,
                 color="gray",
                 hint="Times each hook and line over some hundred control steps, in a process of its own.",
             )
