@@ -41,7 +41,7 @@ from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
 
-PANEL_WIDTH = 340
+PANEL_WIDTH = 372
 ENVS_WIDTH = 520
 
 

@@ -21,7 +21,7 @@ from workbench.ui.widgets.templates import place, render
 
 TAB = "Checks"
 CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
-AFTER_SAVE = "Check after each save"
+AFTER_SAVE = "After each save"
 REST = "rest"
 """Key of the fold of rules without a finding."""
 
@@ -53,7 +53,7 @@ class ChecksPanel(PagePart[SessionView]):
             server.gui.add_checkbox(
                 AFTER_SAVE,
                 True,
-                hint="In a process of its own, at low priority: while it runs, playing goes first.",
+                hint="Check each version that loads. In a process of its own at low priority: playing goes first.",
             ),
             send=self._check_after_save,
         )
@@ -158,4 +158,6 @@ def list_html(
     """
     known = {"found": found, "more": more, "opened": opened, "id_of": press, "link": link, "most": MOST_SHOWN}
     rest = [result for result in checks.results if result.state != "broken" or result.notes]
-    return render("checks", **known, rest=rest, REST=REST, RULES=RULES)
+    kept = [result.rule for result in rest if result.state == "kept" and not result.notes]
+    told = [result for result in rest if result.rule not in kept]
+    return render("checks", **known, rest=len(rest), told=told, kept=kept, REST=REST, RULES=RULES)
