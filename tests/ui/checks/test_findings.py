@@ -47,6 +47,11 @@ def test_what_was_seen_while_playing_says_how_often_and_since_when_and_is_no_sec
     assert len(both.rows) == 1 and both.rows[0].played
 
 
+def test_a_rule_that_is_broken_while_playing_is_not_counted_as_kept() -> None:
+    kept = ChecksView("done", results=(RuleResult("not-applied", "kept"), RuleResult("entry-name", "kept")))
+    assert summary(kept, cards(kept, RulesBroken((PLAYED,)))) == "1 warn, 1 kept"
+
+
 def test_findings_of_the_version_before_come_last_and_count() -> None:
     view = ChecksView(
         "checking", before=(STOPS,), results=(RuleResult("reward-changes", "broken", (WARNS,)),)

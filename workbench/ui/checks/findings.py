@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from workbench.checks.results import counts
+from workbench.checks.results import RuleResult, counts
 from workbench.checks.rules import RULES
 from workbench.core.rules import DEGREES, Degree, Finding, Rule
 from workbench.session.checks.checks import ChecksView
@@ -72,13 +72,19 @@ def count(shown: Iterable[Card]) -> int:
     return sum(len(card.rows) for card in shown)
 
 
+def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
+    """Results of the rules that have no finding: a rule that the checks kept may be broken while playing."""
+    broken = {card.rule.id for card in shown if not card.old}
+    return [result for result in checks.results if result.rule not in broken]
+
+
 def summary(checks: ChecksView, shown: list[Card]) -> str:
     """``2 stop, 3 warn, 50 kept, 3 not applicable``: findings by degree, then rules."""
     by_degree = dict.fromkeys(DEGREES, 0)
     for card in shown:
         for row in card.rows:
             by_degree[row.finding.degree] += not row.old
-    states = counts(checks.results)
+    states = counts(without_finding(checks, shown))
     old = sum(row.old for card in shown for row in card.rows)
     told = (
         *((by_degree[degree], degree) for degree in DEGREES),
@@ -106,4 +112,5 @@ def _played(finding: Finding) -> str:
 
 
 def _worst(findings: Iterable[Finding]) -> Degree:
-    return min((finding.degree for finding in findings), key=DEGREES.index)
+    degrees: list[Degree] = [finding.degree for finding in findings]
+    return min(degrees, key=DEGREES.index)

@@ -11,7 +11,7 @@ from workbench.machine.kept_choices import keep_check_after_save
 from workbench.session.checks.checks import RUNNING, ChecksView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary
+from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary, without_finding
 from workbench.ui.server.viser_private import set_tab_label
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.editor import LinkTo, no_links
@@ -157,7 +157,7 @@ def list_html(
         press: the id of the button that folds a part.
     """
     known = {"found": found, "more": more, "opened": opened, "id_of": press, "link": link, "most": MOST_SHOWN}
-    rest = [result for result in checks.results if result.state != "broken" or result.notes]
+    rest = without_finding(checks, found)
     kept = [result.rule for result in rest if result.state == "kept" and not result.notes]
     told = [result for result in rest if result.rule not in kept]
     return render("checks", **known, rest=len(rest), told=told, kept=kept, REST=REST, RULES=RULES)
