@@ -1,4 +1,4 @@
-// What the handlers in the server's templates do: press, choose, place, copy, bring into sight.
+// What the handlers in the server's templates do: press, choose, place, copy, bring into sight, open a tab.
 //
 // The page's policy runs no code that is written in HTML, whoever put it there, but for a few fixed calls of what is
 // here (HANDLERS in workbench/ui/server/responses.py). Values come from data attributes, never from the text of a handler.
@@ -68,6 +68,13 @@
       const show = () => target()?.scrollIntoView({ block: "nearest" });
       show();
       setTimeout(show, 150);
+    },
+
+    // viser's tabs hear a key and a pointer that goes down and up, and no click.
+    openTab(sheet) {
+      const named = (tab) => tab.textContent.trim().replace(/ \d+$/, "") === sheet.dataset.openTab;
+      const enter = { key: "Enter", code: "Enter", bubbles: true };
+      [...document.querySelectorAll("[role=tab]")].find(named)?.dispatchEvent(new KeyboardEvent("keydown", enter));
     },
 
     follow(sheet) {

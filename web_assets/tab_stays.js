@@ -11,7 +11,8 @@
   let looking = 0;
 
   const marker = () => document.querySelector("[data-which]");
-  const nameOf = (tab) => tab.textContent.trim();
+  // Without the number of findings behind it.
+  const nameOf = (tab) => tab.textContent.trim().replace(/ \d+$/, "");
   const tabsOf = (mark) => {
     const panel = mark?.closest(".mantine-Paper-root");
     return panel ? [...panel.querySelectorAll("[role=tab]")] : [];

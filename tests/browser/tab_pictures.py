@@ -34,7 +34,7 @@ from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 PLACE = Path("/tmp/golden")
-LIVE_TABS = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Log")
+LIVE_TABS = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log")
 REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "Rescore", "Share")
 STEPS = 6
 WIDTH, HEIGHT = 1280, 1000

@@ -57,12 +57,12 @@ def test_the_page_opens_with_the_task_and_without_an_error(desk: Desk) -> None:
 def test_tabs_that_have_nothing_to_show_are_not_there(desk: Desk) -> None:
     tabs = desk.page.get_by_role("tab").all_inner_texts()
     assert [tab for tab in tabs if tab not in ("Envs", "Timeline")] == [
-        *("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Log")
+        *("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log")
     ]
 
 
 def test_all_tabs_are_on_one_row(desk: Desk) -> None:
-    names = ("Run", "Cameras", "Reward", "Inspect", "Episodes", "Log")
+    names = ("Run", "Cameras", "Reward", "Inspect", "Episodes", "Checks", "Log")
     boxes = [desk.page.get_by_role("tab", name=name, exact=True).bounding_box() for name in names]
     assert len({box["y"] for box in boxes if box is not None}) == 1 and None not in boxes
 
@@ -227,17 +227,14 @@ def test_the_mark_of_a_rule_that_only_warns_stands_until_the_file_is_mended(calm
     line = broken[: broken.index(DRAWN)].count("\n") + 1
     calm.tab("Reward")
     calm.file.write_text(broken)
-    mark, row = calm.page.locator(".wb-rules-mark"), calm.page.locator(".wb-rules-row")
-    expect(mark).to_contain_text("1 warning")
+    mark, row = calm.page.locator(".wb-rules-mark"), calm.page.locator(".wb-check")
+    expect(mark).to_contain_text("1 finding")
     told = rf"warning .*push_cube\.py:{line}: self\.drawn is changed in env 1"
     calm.opened.wait_for_line(told)
-    expect(calm.page.get_by_role("tab", name="Reward")).to_be_visible()
     mark.click()
+    expect(calm.page.get_by_role("tab", name="Checks 1")).to_have_attribute("aria-selected", "true")
     expect(row).to_contain_text(f"push_cube.py:{line}")
     expect(row).to_contain_text("self.drawn = torch.rand((self.num_envs, 2))")
-    expect(calm.page.get_by_role("tab", name="Reward")).to_be_visible()
-    mark.click()
-    expect(row).to_be_hidden()
     calm.file.write_text(text)
     expect(mark).to_be_hidden()
     expect(calm.page.get_by_text("paused", exact=True)).to_be_visible()

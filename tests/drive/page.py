@@ -29,6 +29,7 @@ from playwright.sync_api import (
 )
 
 from tests.drive.waiting import until
+from workbench.machine.kept_choices import keep_check_after_save
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 """The example task; what is edited is a copy of it."""
@@ -115,9 +116,18 @@ def _sight_of(page: Page, errors: list[str]) -> Sight:
 
 @contextmanager
 def open_workbench(
-    *arguments: str, cwd: Path | None = None, what: str = "open", env: dict[str, str] | None = None
+    *arguments: str,
+    cwd: Path | None = None,
+    what: str = "open",
+    env: dict[str, str] | None = None,
+    checks: bool = False,
 ) -> Iterator[Opened]:
-    """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends."""
+    """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends.
+
+    Args:
+        checks: Whether rules are checked after each load, which takes a core for some seconds.
+    """
+    keep_check_after_save(checks)
     command = [sys.executable, "-m", "workbench.cli.main", what, *arguments, "--port", "0"]
     process = subprocess.Popen(
         command,
@@ -217,15 +227,17 @@ def page_on(
     height: int = 720,
     drawn: bool = False,
     spare: bool = False,
+    checks: bool = False,
 ) -> Iterator[tuple[Page, list[str], Opened]]:
     """A page that shows the file's task, paused; what is wrong on it so far; and the terminal.
 
     Args:
         spare: Whether a second worker warms up beside, which takes a core for some ten seconds.
+        checks: As in `open_workbench`.
     """
     arguments = arguments if spare else (*arguments, "--no-spare")
     with (
-        open_workbench(str(file), *arguments, cwd=file.parent) as opened,
+        open_workbench(str(file), *arguments, cwd=file.parent, checks=checks) as opened,
         page_at(browser, opened.url, width, height, drawn) as (page, errors),
     ):
         expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)

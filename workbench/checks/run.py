@@ -5,39 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from workbench.authoring.problem import TaskError
 from workbench.checks import evaluate, reward
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
+from workbench.checks.results import RuleResult, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.env import actions
 from workbench.core.rules import Degree, Finding, reason_of_silence
-
-State = Literal["kept", "broken", "silenced", "skipped", "failed"]
-
-
-@dataclass(frozen=True)
-class Silenced:
-    finding: Finding
-    reason: str
-
-
-@dataclass(frozen=True)
-class RuleResult:
-    """What the check of one rule came to."""
-
-    rule: str
-    state: State
-    """``skipped`` where it says nothing about this task, ``failed`` where the task raised; `why` says more."""
-    findings: tuple[Finding, ...] = ()
-    silenced: tuple[Silenced, ...] = ()
-    notes: tuple[str, ...] = ()
-    """Worth knowing, and no breach."""
-    why: str = ""
-    seconds: float = 0.0
 
 
 @dataclass(frozen=True)

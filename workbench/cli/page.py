@@ -18,6 +18,7 @@ from workbench.authoring.loading.reference import TaskName, named_file
 from workbench.cli.terminal import out, print_addresses, print_event, print_line, print_text, refuse, warn
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
 from workbench.jobs.task import TaskOptions
+from workbench.machine.kept_choices import kept_choices
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reader.reading import start_reading
 from workbench.session.live.session import HISTORY_BYTES, KeptWork, Session
@@ -185,7 +186,8 @@ class _HowToOpen:
         on_event: Callable[[Event], None],
     ) -> Session:
         callbacks = {"on_event": on_event, "on_line": print_line, "on_notice": warn}
-        given = {"history_bytes": self.history_bytes, "worker": worker, "kept": kept}
+        check = kept_choices().check_after_save
+        given = {"history_bytes": self.history_bytes, "worker": worker, "kept": kept, "check": check}
         return Session(task, options, recordings=self.recordings, **given, **callbacks)
 
 

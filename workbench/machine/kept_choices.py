@@ -20,6 +20,8 @@ class Choices(msgspec.Struct, frozen=True):
 
     hints_closed: bool = False
     """The hints of the first page were closed."""
+    check_after_save: bool = True
+    """Rules are checked after each load."""
     policies: dict[str, list[str]] = {}
     """Policies that were used, by the folder where the command was started; the newest first."""
 
@@ -37,6 +39,11 @@ def kept_choices() -> Choices:
 def close_hints() -> None:
     """The hints are not shown again."""
     _change(lambda kept: msgspec.structs.replace(kept, hints_closed=True))
+
+
+def keep_check_after_save(wanted: bool) -> None:
+    """Whether rules are checked after each load."""
+    _change(lambda kept: msgspec.structs.replace(kept, check_after_save=wanted))
 
 
 def used_policies(folder: Path) -> tuple[str, ...]:

@@ -282,9 +282,7 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
         assert has_it.wait(90)
         queue: list[Future[Any]] = [threads.submit(waiting, job) for job in before]
         queue.append(
-            threads.submit(
-                background.in_turns, aside, lambda: background.ensure(aside, load), low_priority=True
-            )
+            threads.submit(background.in_turns, aside, lambda: background.ensure(aside, load), priority="low")
         )
         given_up = threads.submit(waiting, stopped)
         stopped.stopped = True

@@ -18,6 +18,8 @@ from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.session.cameras.selection import KeptPlacements
 from workbench.session.cameras.studio import CameraStudio
+from workbench.session.checks.checks import Checks
+from workbench.session.checks.profile import StepProfiler
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.live_state import LiveState, SharedState, scene_kept
 from workbench.session.live.timeline import TimeTravel
@@ -80,6 +82,7 @@ class Session:
         history_bytes: int = HISTORY_BYTES,
         worker: WorkerOptions | None = None,
         kept: KeptWork | None = None,
+        check: bool = False,
         make_worker: Callable[..., Supervisor] = Supervisor,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[PrintedLine], None] = lambda line: None,
@@ -92,6 +95,7 @@ class Session:
             history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
             kept: of an earlier session of this task; its options are used in place of `options`.
+            check: whether the rules are checked after each load; `checks` changes it.
             make_worker: makes the supervisor; tests without a worker process give another.
             on_event: called with every event of the worker, and with its death as `LoadFailed`, on the session's thread.
             on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
@@ -135,6 +139,10 @@ class Session:
         """Asks the background process."""
         self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
         self.rescorer = PastRescorer(self._notify, self._background)
+        self.checks = Checks(self._notify, self._background, check)
+        """The rules of the running version."""
+        self.profiler = StepProfiler(self._notify, self._background)
+        """Where a step of the running version goes."""
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """The timeline."""
@@ -163,6 +171,8 @@ class Session:
             "printed": self._printed.view(),
             "vitals": self._worker.vitals,
             "rescored": self.rescorer.rescoring.view,
+            "checks": self.checks.view,
+            "profile": self.profiler.view,
         }
         with self._lock:
             view = self._state.view(**known)
@@ -339,6 +349,16 @@ class Session:
         self._send(request(tuple(range(task.num_envs)) if everywhere else (env,)))
         self._notify()
 
+    def check_now(self) -> None:
+        """Check the rules of the running version."""
+        if (load := self.versions.running_load()) is not None:
+            self.checks.check(load)
+
+    def profile_step(self) -> None:
+        """Time a control step of the running version."""
+        if (load := self.versions.running_load()) is not None:
+            self.profiler.profile(load)
+
     def show(self, env: int, serial: int) -> None:
         """Select an env and show a moment of the history."""
         self.change(selected_env=env)
@@ -352,6 +372,8 @@ class Session:
         self._policy_file.close()
         self._worker.stop()
         self.rescorer.rescoring.close()
+        self.checks.close()
+        self.profiler.close()
         self.studio.close()
         self.past_saver.close()
         self._background.end()
@@ -404,6 +426,7 @@ class Session:
         with self._lock:
             s = self._state
             restored, stale = self.versions.version_loaded(event.task)
+            before = s.now.task
             what_to_do = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
             rescored = None
             if what_to_do == "rescore" and s.timeline is not None:
@@ -411,12 +434,15 @@ class Session:
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)
+        load = self.versions.running_load()
+        assert load is not None
         if rescored is not None:
-            load = self.versions.running_load()
-            assert load is not None
             self.rescorer.rescore(load, rescored)
         elif what_to_do == "forget":
             self.rescorer.forget()
+        # After the rescoring was begun: of two jobs for which nobody waits, the later comes first.
+        self.checks.loaded(load, before is not None and before.env_id == event.task.env_id)
+        self.profiler.loaded()
         self.versions.follow(event.task, stale)
         self._send_settings()
         self.studio.send_placements(placed)
@@ -445,6 +471,7 @@ class Session:
 
     def _on_save(self) -> None:
         self.rescorer.stop(StoppedBy.SAVE)
+        self.checks.stop(StoppedBy.SAVE)
         self.studio.interrupted()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:

@@ -11,6 +11,8 @@ from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioView
+from workbench.session.checks.checks import ChecksView
+from workbench.session.checks.profile import ProfileView
 from workbench.session.history.curves import Curves
 from workbench.session.live.timeline import TimelineView
 from workbench.session.process.captured_output import NOTHING_PRINTED, Printed
@@ -121,6 +123,10 @@ class SessionView:
     """Memory of the processes."""
     rescored: RescoreView = RescoreView()
     """The history rescored with the new code."""
+    checks: ChecksView = ChecksView()
+    """The rules of the running version, checked in the background."""
+    profile: ProfileView = ProfileView()
+    """Where a control step goes."""
     studio: StudioView = StudioView()
     """The camera studio."""
 

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from workbench.core.camera_data import CameraKey
 from workbench.machine.processes.family import describe_exit
@@ -91,8 +91,11 @@ class GaveWay(Exception):
     """A job of higher priority needs the process: ask again in another turn."""
 
 
-_Rank = tuple[bool, int]
-"""Whether a person waits for the job, and its number: the highest comes first."""
+Priority = Literal["person", "low", "lowest"]
+"""Whether a person waits for the job; else whether its results are wanted soon."""
+_ORDER: dict[Priority, int] = {"person": 2, "low": 1, "lowest": 0}
+_Rank = tuple[int, int]
+"""The place of its priority, and the job's number: the highest comes first."""
 
 
 class Background(Asker):
@@ -134,17 +137,14 @@ class Background(Asker):
         return None if process is None else process.pid
 
     @contextmanager
-    def turn(self, job: Job, low_priority: bool = False) -> Iterator[None]:
+    def turn(self, job: Job, priority: Priority = "person") -> Iterator[None]:
         """Hold the process for a job. Waits while another job has it, or one of higher priority waits; where such a job
         comes during the turn, `ask` raises GaveWay.
-
-        Args:
-            low_priority: lowest priority, since no person waits for this job.
 
         Raises:
             Stopped: the job was stopped.
         """
-        self._begin_turn(job, (not low_priority, job.number))
+        self._begin_turn(job, (_ORDER[priority], job.number))
         try:
             yield
         finally:
@@ -154,11 +154,11 @@ class Background(Asker):
                 self._end_when_idle()
                 self._turns.notify_all()
 
-    def in_turns(self, job: Job, work: Callable[[], Value], low_priority: bool = False) -> Value:
+    def in_turns(self, job: Job, work: Callable[[], Value], priority: Priority = "person") -> Value:
         """Run `work` in a turn, again after each time it gave way; the envs are elsewhere then."""
         while True:
             try:
-                with self.turn(job, low_priority):
+                with self.turn(job, priority):
                     return work()
             except GaveWay:
                 job.report(0, 0, WAITING)

@@ -1,4 +1,4 @@
-"""Questions to a worker about cameras, past moments and recordings, with the types of their answers."""
+"""Questions to a worker about cameras, rules, past moments and recordings, with the types of their answers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import Problem
+from workbench.checks.results import RuleResult, StepProfile
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.report import CameraReport, OfferedPlacement, SearchSpace
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Degree
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.jobs.verdict import Rescore
 from workbench.machine.processes.wire import Question
@@ -74,6 +76,40 @@ class RunCameras(Question[HookCameras]):
 
 
 CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras
+
+
+# --- checks ------------------------------------------------------------------------------------------
+# Only for a worker that does not play: a check makes envs of its own and steps them. What it saw is kept for the next group.
+
+
+@dataclass(frozen=True)
+class CheckedGroup:
+    """A group was checked; its results came before."""
+
+    groups: int
+    """How many groups there are."""
+    rules: int
+    """How many rules of all groups are not off."""
+    next: str
+    """What the group after this one looks at; empty for the last."""
+
+
+@dataclass(frozen=True)
+class CheckGroup(Question[CheckedGroup]):
+    """Check the rules of one group on the loaded version. Any request behind it ends it."""
+
+    part: ClassVar[Any] = RuleResult
+    group: int
+    """From 0, in the order of what people meet most."""
+    degrees: Mapping[str, Degree]
+    """Of each rule."""
+    known: tuple[str, ...] = ()
+    """Rules of the group that were checked before a job of higher priority came."""
+
+
+@dataclass(frozen=True)
+class ProfileStep(Question[StepProfile]):
+    """Time the hooks and lines of a control step on envs of its own. Any request behind it ends it."""
 
 
 # --- moments of the past -----------------------------------------------------------------------------
@@ -189,7 +225,7 @@ class DrawTask(Question[TaskPicture]):
 
 
 QUESTIONS = (
-    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), RescoreMoments, CaptureMoment, Rescore, MakeScene,
-    ListTasks, DrawTask,
+    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), CheckGroup, ProfileStep, RescoreMoments, CaptureMoment,
+    Rescore, MakeScene, ListTasks, DrawTask,
 )  # fmt: skip
 """All types that a `Call` may hold."""

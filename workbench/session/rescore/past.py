@@ -316,7 +316,7 @@ class PastRescorer:
 
         try:
             for rows in rescored.runs():
-                self._process.in_turns(job, partial(rescore_rows, rows), low_priority=True)
+                self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
         finally:
             with self._lock:
                 rescored.release()

@@ -22,7 +22,7 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import ActionChooser
 from workbench.jobs.open_task import OpenedTask, Opening, warm_up
-from workbench.jobs.task import Restored
+from workbench.jobs.task import Restored, TaskOptions
 from workbench.jobs.verdict import Rescore
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.processes.debugger import (
@@ -64,13 +64,16 @@ from workbench.session.protocol.messages import (
 from workbench.session.protocol.questions import (
     CameraQuestion,
     CaptureMoment,
+    CheckGroup,
     DrawTask,
     ListTasks,
     MakeScene,
+    ProfileStep,
     RescoreMoments,
     RunCameras,
 )
 from workbench.session.worker.cameras import WorkerCameras
+from workbench.session.worker.checks import WorkerChecks
 from workbench.session.worker.go_back import (
     enter_recording,
     entering_text,
@@ -105,6 +108,7 @@ class Worker:
         self._steps = StepEvents()
         self._task = GuardedTask(self._line, self._interrupts, heartbeat, self._steps, self._pause)
         self._cameras = WorkerCameras(self._task, self._on_first_picture)
+        self._checks = WorkerChecks(self._line.waits)
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
@@ -210,6 +214,9 @@ class Worker:
             return rescore_moments(opened, question)
         if isinstance(question, CaptureMoment):
             return self._cameras.capture(opened, question)
+        if isinstance(question, CheckGroup | ProfileStep):
+            options = TaskOptions() if self._loaded_by is None else self._loaded_by.options
+            return self._checks.answer(opened, options, question, report)
         assert isinstance(question, Rescore)
         # Imported late: rerun and the readers take a third of a second.
         from workbench.jobs import rescore_run
@@ -265,6 +272,7 @@ class Worker:
     def _replace_task(
         self, opened: OpenedTask, report: ReloadReport | None, request: Load, send: Callable[[Loaded], None]
     ) -> None:
+        self._checks.close()
         before, self._task.opened = self._task.opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):

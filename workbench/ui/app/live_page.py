@@ -15,6 +15,9 @@ from workbench.session.live.view import SessionView
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.cameras.studio import StudioPanel
+from workbench.ui.checks.panel import TAB as CHECKS
+from workbench.ui.checks.panel import ChecksMark, ChecksPanel
+from workbench.ui.checks.step_profile import StepProfilePanel
 from workbench.ui.live.banners import INTERRUPT, NEW_WORKER, RELOAD, RESTART, Banner, BusyBanner
 from workbench.ui.live.env_panel import EnvPanel
 from workbench.ui.live.episodes_panel import RECORD, SAVE, STOP, RecordPanel
@@ -23,7 +26,7 @@ from workbench.ui.live.log_panel import LogPanel
 from workbench.ui.live.rescored import PastRescorePanel, RescoredAbove
 from workbench.ui.live.reward import CurvesPanel, NumbersPanel
 from workbench.ui.live.run_panel import NEXT, PREVIOUS, RESET_ALL, RESET_THIS, STEP, RunPanel
-from workbench.ui.live.status_line import RulesMark, StatusLine
+from workbench.ui.live.status_line import StatusLine
 from workbench.ui.live.timeline import GO_ON, LIVE, UNDO, TimelinePanel
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.live.version_panel import AS_NEEDED, VersionPanel
@@ -38,7 +41,7 @@ from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
 
-PANEL_WIDTH = 340
+PANEL_WIDTH = 372
 ENVS_WIDTH = 520
 
 
@@ -93,7 +96,7 @@ class Page:
         status = StatusLine(
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
         )
-        self._rules = RulesMark(server, self._link)
+        self._findings = ChecksMark(server)
         self._opening = None if chooser is None else OpenDialog(server, chooser, clock=clock)
         if self._opening is not None:
             self._opening.add_button()
@@ -107,7 +110,7 @@ class Page:
         busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
-        self._parts = Parts((status, self._rules, *in_tabs, *floating, *opening), clock)
+        self._parts = Parts((status, self._findings, *in_tabs, *floating, *opening), clock)
 
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
@@ -151,10 +154,13 @@ class Page:
             self._record = RecordPanel(server, session)
             review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS, color="gray")
             review.on_click(lambda _: on_review())
+        with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
+            checks = ChecksPanel(server, session, checks_tab, self._link)
+            profile = StepProfilePanel(server, session, self._link)
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
-        on_run = self._run, self._view_panel, version, options
-        return run_tab, [*on_run, self._studio, *reward, self._rescored, self._inspect, self._record, log]
+        parts = [self._run, self._view_panel, version, options, self._studio, *reward, self._rescored]
+        return run_tab, [*parts, self._inspect, self._record, checks, profile, log]
 
     def _add_table_of_envs(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
@@ -321,7 +327,7 @@ class Page:
             Command("Frame the scene", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C", buttons=(RECORD, STOP)),
             Command("Save what I just saw", self._record.save, "C", "shift", (SAVE,)),
-            Command("Open or close the list of broken rules", self._rules.toggle, "W"),
+            Command("Show the checks", self._findings.show, "W"),
             Command("Reload the file", session.versions.reload, "L", buttons=(AS_NEEDED, RELOAD)),
             Command("Interrupt the task", session.interrupt, "I", buttons=(INTERRUPT,)),
             Command(

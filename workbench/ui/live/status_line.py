@@ -1,4 +1,4 @@
-"""The status line above the tabs, the mark of flagged envs, and the mark of broken rules."""
+"""The status line above the tabs, and the mark of flagged envs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,14 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from workbench.core.rules import RULES
 from workbench.jobs.task import TaskDescription
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
-from workbench.session.protocol.messages import RulesBroken
 from workbench.ui.live.env_panel import first_flagged, mask
 from workbench.ui.live.timeline import step_in_words
 from workbench.ui.live.version_panel import took
 from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import counted, place, render
 
@@ -169,49 +166,3 @@ def _news(view: SessionView) -> str:
     if report is None:
         return f"new version in {seconds}"
     return f"{report.level} in {seconds}" + (f": {report.reason}" if report.reason else "")
-
-
-class RulesMark(PagePart[SessionView]):
-    """The mark of broken rules below the status line; a press opens the list.
-
-    A broken rule that only warns stops nothing, so the mark stays until the file is fixed.
-    """
-
-    def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
-        self._link = link
-        self._html = server.gui.add_html("", visible=False)
-        # Not in a folder: viser draws a folder without a label as if its parts stood in the container, and all that
-        # follows the hidden buttons, the tabs too, would be hidden.
-        self._press = Presses(server).id_of("open", lambda _: self.toggle())
-        self._open = False
-
-    def draw(self, view: SessionView) -> None:
-        if view.rules is None:
-            self._open = False
-            self._html.visible = False
-            return
-        # Equal content is not sent: an open list keeps its scroll position.
-        self._html.content = rules_html(view.rules, self._open, self._press, self._link)
-        self._html.visible = True
-
-    def toggle(self) -> None:
-        """Open or close the list."""
-        self._open = not self._open
-
-
-def rules_html(rules: RulesBroken, open: bool, press_id: str, link: LinkTo = no_links) -> str:
-    """The mark, and the list if it is open."""
-    newest = next((place(row) for row in rules.rows if row.file), "")
-    if newest and len(rules.rows) > 1:
-        newest += f" and {len(rules.rows) - 1} more"
-    known = {"RULES": RULES, "times": times, "link": link}
-    return render("rules", open=open, press_id=press_id, newest=newest, rules=rules, **known)
-
-
-def times(count: int) -> str:
-    """``once``, ``7 times``, ``300 times and more``: only the first digit of large counts, or the list would change at
-    each step."""
-    if count < 10:
-        return "once" if count == 1 else f"{count} times"
-    scale = 10 ** (len(str(count)) - 1)
-    return f"{count // scale * scale:,} times and more".replace(",", " ")

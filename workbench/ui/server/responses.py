@@ -237,6 +237,7 @@ HANDLERS = (
     "wb.copy(event)",
     "wb.intoSight(this)",
     "wb.follow(this)",
+    "wb.openTab(this)",
 )
 """Every handler in ``web_assets/panels``, defined in ``web_assets/pressed.js``."""
 

@@ -66,6 +66,7 @@ PRIVATE_NAMES = (
     "messages.Message",
     *(f"messages.{name}" for name in (*sorted(KINDS), *REFUSED_FROM_CLIENTS)),
     "gui.AssignablePropsBase._queue_update",
+    "gui.GuiTabGroupHandle._rebuild_tab_props",
 )
 """Names that this module relies on.
 
@@ -102,6 +103,13 @@ def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
     """The control's id in the page; for a button or a number also the ``id`` of its element (viser's ``Button.tsx``,
     ``NumberInput.tsx``)."""
     return handle._impl.uuid
+
+
+def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
+    """Change what is written on a tab; viser has this for icons alone."""
+    if tab._label != label:
+        tab._label = label
+        tab._parent._rebuild_tab_props()
 
 
 def send_lines(

@@ -1,0 +1,252 @@
+"""The rules of a running version, on a background process that answers what a test tells it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from tests.drive.session import live_session, wait_until
+from tests.drive.waiting import until
+from workbench.authoring.problem import Problem
+from workbench.checks.results import RuleResult
+from workbench.core.rules import Finding
+from workbench.jobs.task import TaskOptions
+from workbench.session.checks.checks import RUNNING, Checks, ChecksView
+from workbench.session.process.askers import GaveWay
+from workbench.session.process.job_lane import Job, JobFailed
+from workbench.session.protocol.messages import Load
+from workbench.session.protocol.questions import CheckedGroup, CheckGroup
+from workbench.session.rescore.background import StoppedBy
+
+FIRST, SECOND = "success-at-reset", "reward-changes"
+GROUPS = ((FIRST,), (SECOND,))
+LOAD = Load("push.py", TaskOptions(), {"push.py": "version 1"})
+NEXT = replace(LOAD, source={"push.py": "version 2"})
+
+
+def finding(rule: str, line: int = 7) -> Finding:
+    return Finding(rule, "stop", f"{rule} is broken", "/home/me/push.py", line, "return 1", "evaluate", 8, 0)
+
+
+def broken(rule: str) -> RuleResult:
+    return RuleResult(rule, "broken", (finding(rule),))
+
+
+class ScriptedBackground:
+    """Answers each group with its results, once it is let."""
+
+    def __init__(self) -> None:
+        self.comes_to: dict[str, RuleResult] = {}
+        self.asked: list[CheckGroup] = []
+        self.priorities: list[str] = []
+        self.loads: list[Load] = []
+        self.give_way_after = 99
+        """Results of a group after which a job of higher priority comes, once."""
+        self.fails: JobFailed | None = None
+        self.let = threading.Semaphore(1000)
+
+    def hold(self) -> None:
+        self.let = threading.Semaphore(0)
+
+    def ensure(self, job: Job, load: Load, or_else: Load | None = None) -> int:
+        if self.fails is not None:
+            raise self.fails
+        self.loads.append(load)
+        return 1
+
+    def in_turns(self, job: Job, work: Callable[[], Any], priority: str) -> Any:
+        self.priorities.append(priority)
+        while True:
+            try:
+                return work()
+            except GaveWay:
+                continue
+
+    def ask(
+        self, check: Callable[[], None], question: CheckGroup, on_progress: Callable[..., None]
+    ) -> CheckedGroup:
+        self.asked.append(question)
+        for done, rule in enumerate(GROUPS[question.group], 1):
+            while not self.let.acquire(timeout=0.01):
+                check()
+            check()
+            if rule not in question.known:
+                on_progress(done, 2, self.comes_to.get(rule, RuleResult(rule, "kept")))
+            if done >= self.give_way_after:
+                self.give_way_after = 99
+                raise GaveWay
+        following = question.group + 1
+        return CheckedGroup(2, 2, "rewards" if following < 2 else "")
+
+
+@pytest.fixture
+def background() -> ScriptedBackground:
+    return ScriptedBackground()
+
+
+@pytest.fixture
+def checks(background: ScriptedBackground) -> Iterator[Checks]:
+    made = Checks(lambda: None, cast(Any, background), after_each_save=True)
+    yield made
+    made.close()
+
+
+def ended(checks: Checks) -> ChecksView:
+    until(lambda: checks.view.state not in RUNNING, "the end of the checks", seen=lambda: checks.view)
+    return checks.view
+
+
+def rules_of(view: ChecksView) -> list[str]:
+    return [result.rule for result in view.results]
+
+
+def test_each_load_is_checked_group_by_group_with_the_degree_of_each_rule(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.comes_to = {SECOND: broken(SECOND)}
+    checks.loaded(LOAD, same_task=True)
+    view = ended(checks)
+    assert (view.state, view.total, rules_of(view)) == ("done", 2, [FIRST, SECOND])
+    assert view.findings == (finding(SECOND),)
+    assert [question.group for question in background.asked] == [0, 1]
+    assert background.asked[0].degrees[FIRST] == "stop" and background.asked[0].degrees[SECOND] == "warn"
+    assert background.loads[0] is LOAD
+
+
+def test_the_same_version_is_not_checked_twice(checks: Checks, background: ScriptedBackground) -> None:
+    for _ in range(2):
+        checks.loaded(LOAD, same_task=True)
+        ended(checks)
+    assert len(background.asked) == 2
+    checks.check(LOAD)
+    ended(checks)
+    assert len(background.asked) == 4
+
+
+def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.comes_to = {FIRST: broken(FIRST), SECOND: broken(SECOND)}
+    checks.loaded(LOAD, same_task=True)
+    ended(checks)
+    background.comes_to = {SECOND: broken(SECOND)}
+    background.hold()
+    checks.stop(StoppedBy.SAVE)
+    checks.loaded(NEXT, same_task=True)
+    assert [one.rule for one in checks.view.before] == [FIRST, SECOND] and checks.view.findings == ()
+    background.let.release()
+    until(lambda: len(checks.view.results) == 1, "the first rule")
+    assert [one.rule for one in checks.view.before] == [SECOND]
+    background.let.release()
+    view = ended(checks)
+    assert view.before == () and [one.rule for one in view.findings] == [SECOND]
+
+
+def test_another_task_has_no_findings_of_the_one_before(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.comes_to = {FIRST: broken(FIRST)}
+    checks.loaded(LOAD, same_task=True)
+    ended(checks)
+    background.hold()
+    checks.loaded(replace(LOAD, task="pull.py"), same_task=False)
+    assert checks.view.before == () and checks.view.findings == ()
+
+
+def test_a_save_stops_it_and_what_is_known_stays(checks: Checks, background: ScriptedBackground) -> None:
+    background.hold()
+    checks.loaded(LOAD, same_task=True)
+    background.let.release()
+    until(lambda: len(checks.view.results) == 1, "the first rule")
+    checks.stop(StoppedBy.SAVE)
+    assert (checks.view.state, checks.view.stopped_by) == ("stopped", StoppedBy.SAVE)
+    assert rules_of(checks.view) == [FIRST]
+    # The same text again, or what could not be loaded taken back.
+    background.let = threading.Semaphore(10)
+    checks.loaded(LOAD, same_task=True)
+    assert ended(checks).state == "done"
+
+
+def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.give_way_after = 1
+    checks.loaded(LOAD, same_task=True)
+    assert ended(checks).state == "done"
+    assert [question.group for question in background.asked] == [0, 0, 1]
+    assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
+
+
+def test_it_comes_before_the_rescoring_for_the_first_seconds_alone(
+    checks: Checks, background: ScriptedBackground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.session.checks.checks.AHEAD", 0.0)
+    checks.loaded(LOAD, same_task=True)
+    ended(checks)
+    assert background.priorities == ["low", "lowest"]
+
+
+def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.comes_to = {FIRST: broken(FIRST)}
+    checks.loaded(LOAD, same_task=True)
+    ended(checks)
+    checks.check_after_each_save(False)
+    checks.loaded(NEXT, same_task=True)
+    view = checks.view
+    assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
+    assert len(background.asked) == 2
+
+
+def test_with_every_rule_off_nothing_is_asked(checks: Checks, background: ScriptedBackground) -> None:
+    checks.loaded(replace(LOAD, options=TaskOptions(rules="off")), same_task=True)
+    assert checks.view.state == "off" and background.asked == []
+
+
+def test_a_version_that_cannot_be_loaded_there_is_told_with_its_problem(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    problem = Problem("build", "KeyError: 'x'", "/home/me/push.py", 3, "x", "")
+    background.fails = JobFailed("the task failed", problem)
+    checks.loaded(LOAD, same_task=True)
+    view = ended(checks)
+    assert view.state == "failed" and view.problem == problem and "could not be loaded" in view.why
+
+
+# --- with processes -----------------------------------------------------------------------------------
+
+
+def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_clears_it(
+    child_process: None, task_file: Path
+) -> None:
+    text = task_file.read_text()
+    good, bad = "(distance < GOAL_RADIUS)", "(distance < 1)"
+    line = text[: text.index(good)].count("\n") + 1
+    with live_session(task_file, task_file.parent / "recordings") as session:
+        session.checks.check_after_each_save(True)
+        session.play()
+        task_file.write_text(text.replace(good, bad))
+
+        def found(rule: str) -> Callable[[Any], bool]:
+            return lambda view: any(one.rule == rule for one in view.checks.findings)
+
+        view = wait_until(session, found(FIRST), "the finding")
+        (one,) = (each for each in view.checks.findings if each.rule == FIRST)
+        assert (one.file, one.line, one.degree) == (str(task_file), line, "stop") and bad in one.code
+        assert view.playing
+        # Somebody waits for this: the checks give way, and go on.
+        session.save_past((0,))
+        wait_until(session, lambda view: view.recording.saving.message != "", "the saved episode")
+        task_file.write_text(text)
+        wait_until(
+            session,
+            lambda view: FIRST in rules_of(view.checks) and not found(FIRST)(view),
+            "the rule checked anew",
+        )
+        assert all(one.rule != FIRST for one in session.view().checks.before)

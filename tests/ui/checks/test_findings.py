@@ -1,0 +1,94 @@
+"""What the Checks tab lists, and in which order."""
+
+from __future__ import annotations
+
+import pytest
+
+from workbench.checks.results import RuleResult
+from workbench.core.rules import Degree, Finding
+from workbench.session.checks.checks import ChecksView
+from workbench.session.protocol.messages import RulesBroken
+from workbench.ui.checks.findings import cards, count, summary, times
+from workbench.ui.checks.rule_pages import as_html, rule_page, sections
+
+
+def finding(
+    rule: str, degree: Degree = "warn", line: int = 24, count: int = 12, first_step: int = 3
+) -> Finding:
+    return Finding(
+        rule, degree, "a message", "/home/me/task.py", line, f"code {line}", "lift", count, first_step
+    )
+
+
+STOPS, WARNS, PLAYED = finding("success-at-reset", "stop"), finding("reward-changes"), finding("not-applied")
+DONE = ChecksView(
+    "done",
+    results=(
+        RuleResult("reward-changes", "broken", (WARNS, finding("reward-changes", line=30))),
+        RuleResult("success-at-reset", "broken", (STOPS,)),
+        RuleResult("entry-name", "kept"),
+        RuleResult("camera-sees", "skipped", why="it has no camera"),
+    ),
+)
+
+
+def test_what_stops_comes_first_and_the_findings_of_a_rule_are_together() -> None:
+    shown = cards(DONE, RulesBroken((PLAYED,)))
+    assert [card.rule.id for card in shown] == ["success-at-reset", "reward-changes", "not-applied"]
+    assert [len(card.rows) for card in shown] == [1, 2, 1] and count(shown) == 4
+    assert summary(DONE, shown) == "1 stop, 3 warn, 1 kept, 1 not applicable"
+
+
+def test_what_was_seen_while_playing_says_how_often_and_since_when_and_is_no_second_row() -> None:
+    (played,) = cards(ChecksView(), RulesBroken((PLAYED,)))
+    assert played.rows[0].played == "while playing 10 times and more, first at step 3"
+    of_check = ChecksView("done", results=(RuleResult("not-applied", "broken", (PLAYED,)),))
+    (both,) = cards(of_check, RulesBroken((PLAYED,)))
+    assert len(both.rows) == 1 and both.rows[0].played
+
+
+def test_a_rule_that_is_broken_while_playing_is_not_counted_as_kept() -> None:
+    kept = ChecksView("done", results=(RuleResult("not-applied", "kept"), RuleResult("entry-name", "kept")))
+    assert summary(kept, cards(kept, RulesBroken((PLAYED,)))) == "1 warn, 1 kept"
+
+
+def test_findings_of_the_version_before_come_last_and_count() -> None:
+    view = ChecksView(
+        "checking", before=(STOPS,), results=(RuleResult("reward-changes", "broken", (WARNS,)),)
+    )
+    shown = cards(view, None)
+    assert [(card.rule.id, card.old) for card in shown] == [
+        ("reward-changes", False),
+        ("success-at-reset", True),
+    ]
+    assert count(shown) == 2 and summary(view, shown) == "1 warn, 1 of the version before"
+
+
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [
+        (1, "once"),
+        (2, "2 times"),
+        (9, "9 times"),
+        (19, "10 times and more"),
+        (12345, "10 000 times and more"),
+    ],
+)
+def test_large_counts_are_said_by_their_first_digit(count: int, said: str) -> None:
+    assert times(count) == said
+
+
+def test_the_parts_of_a_page_are_read_by_their_headings() -> None:
+    parts = sections(
+        "# a-rule\n\nIt asks.\n\n## Why\nBecause.\n\n## Mend\nSo:\n\n```python fragment\nx = 1\n```\n"
+    )
+    assert parts["Why"] == "Because." and parts["Mend"].endswith("x = 1\n```")
+
+
+def test_a_page_shows_no_tag_of_its_text_and_links_to_help() -> None:
+    html = as_html("<b>bold</b> and [more](../batched_env.md#resets)")
+    assert "&lt;b&gt;" in html and 'href="/help/batched_env#resets"' in html and 'target="_blank"' in html
+
+
+def test_a_name_that_is_no_rule_s_reads_no_file() -> None:
+    assert rule_page("../safety") is None and rule_page("no-such-rule") is None

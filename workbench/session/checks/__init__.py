@@ -1,0 +1,1 @@
+"""Checks the rules of the running version in the background, and times a step of it."""

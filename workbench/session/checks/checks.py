@@ -1,0 +1,220 @@
+"""The rules of the running version, checked a group at a time in the background process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+from workbench.authoring.problem import Problem
+from workbench.checks.results import RuleResult, by_rule
+from workbench.checks.rules import degree_of_each
+from workbench.core.rules import Finding
+from workbench.session.process.askers import WAITING, Background, Priority
+from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.protocol.messages import Load
+from workbench.session.protocol.questions import CheckedGroup, CheckGroup
+from workbench.session.rescore.background import StoppedBy
+
+AHEAD = 2.0
+"""Seconds of checking before the history is rescored, which a person waits for more than for the last rule."""
+ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
+RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
+
+
+@dataclass(frozen=True)
+class ChecksView:
+    """What the rules came to so far."""
+
+    state: ChecksState = "none"
+    """``loading`` the version in the background process; ``off``: every rule is off."""
+    serial: int = 0
+    """Grows with every change."""
+    results: tuple[RuleResult, ...] = ()
+    """One a rule, in the order in which they came."""
+    before: tuple[Finding, ...] = ()
+    """Findings of an earlier version, of rules that are not checked anew."""
+    total: int = 0
+    """Rules that are checked in all; 0 while unknown."""
+    looks_at: str = ""
+    """What the running group looks at."""
+    waits: bool = False
+    """Another job has the background process."""
+    stopped_by: StoppedBy | None = None
+    why: str = ""
+    """Why it stopped or failed, as text."""
+    problem: Problem | None = None
+    """What the code raised when it was loaded."""
+    seconds: float = 0.0
+    """Since the version was loaded in the background process."""
+    after_each_save: bool = True
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Of the running version."""
+        return tuple(finding for result in self.results for finding in result.findings)
+
+
+class Checks:
+    """Checks the version that runs, and keeps what the version before came to until each rule is checked anew.
+
+    Nothing of it runs in the worker that plays. The process gives way to whatever a person waits for; a group that was cut
+    short is asked again without the rules that are known. All methods but `close` return at once.
+    """
+
+    def __init__(self, on_change: Callable[[], None], process: Background, after_each_save: bool) -> None:
+        """
+        Args:
+            on_change: called when `view` has changed.
+            process: where it runs; other jobs come first.
+            after_each_save: whether `loaded` begins to check.
+        """
+        self._on_change, self._process = on_change, process
+        self._lock = threading.Lock()
+        """Of `view`: updates of a stopped job are dropped under it."""
+        self._view = ChecksView(after_each_save=after_each_save)
+        self._of: object = None
+        """The version that `view` belongs to."""
+        self._lane = JobLane("checks", on_change, self._failed)
+
+    @property
+    def view(self) -> ChecksView:
+        progress = self._lane.progress
+        return replace(self._view, waits=progress is not None and progress.what == WAITING)
+
+    def loaded(self, load: Load, same_task: bool) -> None:
+        """A version runs in the worker that plays.
+
+        Args:
+            load: loads it.
+            same_task: whether it is another version of the task that ran.
+        """
+        if not same_task:
+            self._change(before=(), results=())
+        if self._of == _version(load) and self._view.state in ("done", "off"):
+            return
+        if self._view.after_each_save:
+            self.check(load)
+        else:
+            self._lane.stop()
+            self._begin(load, "none")
+
+    def check(self, load: Load) -> None:
+        """Check this version; a running check ends."""
+        if all(degree == "off" for degree in degree_of_each(choice=load.options.rules).values()):
+            self._lane.stop()
+            self._begin(load, "off")
+            return
+        with self._lock:
+            # Under the lock, or the job's first update might come before the view.
+            self._lane.start("checks", lambda job: self._check(job, load))
+            self._set_begun(load, "loading")
+        self._on_change()
+
+    def check_after_each_save(self, wanted: bool) -> None:
+        """Whether `loaded` begins to check, from now on."""
+        self._change(after_each_save=wanted)
+
+    def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
+        """End the check; results so far stay."""
+        with self._lock:
+            self._lane.stop()
+            if self._view.state not in RUNNING:
+                return
+            self._set(state="stopped", stopped_by=why, why=why.value, looks_at="")
+        self._on_change()
+
+    def close(self) -> None:
+        """Stop; returns when the thread has ended."""
+        self.stop(StoppedBy.CLOSING)
+        self._lane.close()
+
+    # --- on the lane ---------------------------------------------------------------------------------
+
+    def _check(self, job: Job, load: Load) -> None:
+        degrees = degree_of_each(choice=load.options.rules)
+        began: float | None = None
+
+        def ask(group: int) -> CheckedGroup:
+            nonlocal began
+            load_version(self._process, job, load)
+            began = began or time.monotonic()
+            self._update(job, state="checking")
+            known = tuple(result.rule for result in self._view.results)
+            question = CheckGroup(group, degrees, known)
+            return self._process.ask(job.check, question, partial(self._take, job, began))
+
+        group, groups = 0, 1
+        while group < groups:
+            ahead = began is None or time.monotonic() - began < AHEAD
+            priority: Priority = "low" if ahead else "lowest"
+            answer = self._process.in_turns(job, partial(ask, group), priority)
+            group, groups = group + 1, answer.groups
+            self._update(job, total=answer.rules, looks_at=answer.next)
+        self._update(job, state="done", before=(), looks_at="")
+
+    def _take(self, job: Job, began: float, done: int, total: int, result: RuleResult) -> None:
+        results = by_rule((*self._view.results, result))
+        before = tuple(finding for finding in self._view.before if finding.rule != result.rule)
+        seconds = time.monotonic() - began
+        self._update(job, results=tuple(results.values()), before=before, total=total, seconds=seconds)
+
+    def _failed(self, job: Job, failure: JobFailed) -> None:
+        self._update(job, state="failed", why=str(failure), problem=failure.problem, looks_at="")
+
+    # --- the view ------------------------------------------------------------------------------------
+
+    def _begin(self, load: Load, state: ChecksState) -> None:
+        with self._lock:
+            self._set_begun(load, state)
+        self._on_change()
+
+    def _set_begun(self, load: Load, state: ChecksState) -> None:
+        """Nothing is known of this version yet."""
+        self._of, view = _version(load), self._view
+        before = {finding.key: finding for finding in (*view.before, *view.findings)}
+        self._view = ChecksView(
+            state,
+            view.serial + 1,
+            before=() if state == "off" else tuple(before.values()),
+            total=view.total,
+            after_each_save=view.after_each_save,
+        )
+
+    def _update(self, job: Job, **values: Any) -> None:
+        with self._lock:
+            if job.stopped:
+                return
+            self._set(**values)
+        self._on_change()
+
+    def _change(self, **values: Any) -> None:
+        with self._lock:
+            self._set(**values)
+        self._on_change()
+
+    def _set(self, **values: Any) -> None:
+        self._view = replace(self._view, serial=self._view.serial + 1, **values)
+
+
+def load_version(process: Background, job: Job, load: Load) -> None:
+    """Load a version in the background process, if it is not loaded.
+
+    Raises:
+        JobFailed: it cannot be loaded there.
+    """
+    try:
+        # Where the process stands, at some moment of a job before, the new code may raise: then it is built anew.
+        process.ensure(job, load, or_else=replace(load, level="rebuilt"))
+    except JobFailed as failure:
+        if failure.problem is None:
+            raise
+        raise JobFailed("the version could not be loaded to be checked", failure.problem) from failure
+
+
+def _version(load: Load) -> object:
+    """What results depend on."""
+    return str(load.task), load.source, load.options.env_kwargs, load.options.rules

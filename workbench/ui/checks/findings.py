@@ -1,0 +1,116 @@
+"""What the Checks tab lists: findings of the checks and those seen while playing, a card a rule."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from workbench.checks.results import RuleResult, counts
+from workbench.checks.rules import RULES
+from workbench.core.rules import DEGREES, Degree, Finding, Rule
+from workbench.session.checks.checks import ChecksView
+from workbench.session.protocol.messages import RulesBroken
+from workbench.ui.checks.rule_pages import RulePage, rule_page
+
+MOST_SHOWN = 5
+"""Findings of one rule."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A finding."""
+
+    finding: Finding
+    played: str = ""
+    """How often it was seen while playing; empty for a finding of the checks alone."""
+    old: bool = False
+    """Of an earlier version: its rule is not checked anew."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """The findings of one rule."""
+
+    rule: Rule
+    degree: Degree
+    """The worst of its findings."""
+    rows: tuple[Row, ...]
+
+    @property
+    def old(self) -> bool:
+        return all(row.old for row in self.rows)
+
+    @property
+    def page(self) -> RulePage | None:
+        return rule_page(self.rule.id)
+
+    @property
+    def silence(self) -> str:
+        """The comment that silences it; without a reason after it it silences nothing."""
+        return f"# workbench: off[{self.rule.id}] "
+
+
+def cards(checks: ChecksView, played: RulesBroken | None) -> list[Card]:
+    """What stops first, then what warns, then findings of an earlier version."""
+    rows = {finding.key: Row(finding) for finding in checks.findings}
+    for finding in () if played is None else played.rows:
+        known = rows.get(finding.key)
+        rows[finding.key] = Row(finding if known is None else known.finding, _played(finding))
+    for finding in checks.before:
+        # Rules of GPU simulation are checked last, and seen while playing at once.
+        rows.setdefault(finding.key, Row(finding, old=True))
+    together: dict[str, list[Row]] = {}
+    for row in rows.values():
+        if row.finding.rule in RULES:
+            together.setdefault(row.finding.rule, []).append(row)
+    found = [Card(RULES[rule], _worst(row.finding for row in of), tuple(of)) for rule, of in together.items()]
+    return sorted(found, key=lambda card: (card.old, DEGREES.index(card.degree)))
+
+
+def count(shown: Iterable[Card]) -> int:
+    """How many findings there are; those of an earlier version count until their rule is checked anew."""
+    return sum(len(card.rows) for card in shown)
+
+
+def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
+    """Results of the rules that have no finding: a rule that the checks kept may be broken while playing."""
+    broken = {card.rule.id for card in shown if not card.old}
+    return [result for result in checks.results if result.rule not in broken]
+
+
+def summary(checks: ChecksView, shown: list[Card]) -> str:
+    """``2 stop, 3 warn, 50 kept, 3 not applicable``: findings by degree, then rules."""
+    by_degree = dict.fromkeys(DEGREES, 0)
+    for card in shown:
+        for row in card.rows:
+            by_degree[row.finding.degree] += not row.old
+    states = counts(without_finding(checks, shown))
+    old = sum(row.old for card in shown for row in card.rows)
+    told = (
+        *((by_degree[degree], degree) for degree in DEGREES),
+        (states["kept"], "kept"),
+        (states["silenced"], "silenced"),
+        (states["skipped"], "not applicable"),
+        (states["failed"], "not known"),
+        (old, "of the version before"),
+    )
+    return ", ".join(f"{number} {what}" for number, what in told if number)
+
+
+def times(count: int) -> str:
+    """``once``, ``7 times``, ``300 times and more``: only the first digit of large counts, or the list would change at
+    each step."""
+    if count < 10:
+        return "once" if count == 1 else f"{count} times"
+    scale = 10 ** (len(str(count)) - 1)
+    return f"{count // scale * scale:,} times and more".replace(",", " ")
+
+
+def _played(finding: Finding) -> str:
+    since = f"first at step {finding.first_step}" if finding.first_step else "from the start"
+    return f"while playing {times(finding.count)}, {since}"
+
+
+def _worst(findings: Iterable[Finding]) -> Degree:
+    degrees: list[Degree] = [finding.degree for finding in findings]
+    return min(degrees, key=DEGREES.index)

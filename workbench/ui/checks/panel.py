@@ -1,0 +1,163 @@
+"""The Checks tab, and the mark of findings below the status line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import viser
+
+from workbench.checks.rules import RULES
+from workbench.machine.kept_choices import keep_check_after_save
+from workbench.session.checks.checks import RUNNING, ChecksView
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary, without_finding
+from workbench.ui.server.viser_private import set_tab_label
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.editor import LinkTo, no_links
+from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import place, render
+
+TAB = "Checks"
+CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
+AFTER_SAVE = "After each save"
+REST = "rest"
+"""Key of the fold of rules without a finding."""
+
+
+class ChecksPanel(PagePart[SessionView]):
+    """Findings of the checks and of what was played, worst first, each with its line.
+
+    Args:
+        server: The page.
+        session: The session.
+        tab: The tab that it is in: its label has the number of findings.
+        link: Links the lines of the author's files.
+    """
+
+    every = 0.25
+
+    def __init__(
+        self, server: viser.ViserServer, session: Session, tab: viser.GuiTabHandle, link: LinkTo = no_links
+    ) -> None:
+        self._session, self._tab, self._link = session, tab, link
+        self._open: set[str] = set()
+        """Ids of rules, and `REST`, that are folded out."""
+        self._status = server.gui.add_html("")
+        self._now = server.gui.add_button(CHECK_NOW, icon=viser.Icon.CHECKLIST)
+        self._stop = server.gui.add_button(
+            STOP_CHECKS, icon=viser.Icon.PLAYER_STOP, color="gray", visible=False
+        )
+        self._after_save = Control(
+            server.gui.add_checkbox(
+                AFTER_SAVE,
+                True,
+                hint="Check each version that loads. In a process of its own at low priority: playing goes first.",
+            ),
+            send=self._check_after_save,
+        )
+        self._list = server.gui.add_html("", visible=False)
+        self._presses = Presses(server)
+        self._now.on_click(lambda _: session.check_now())
+        self._stop.on_click(lambda _: session.checks.stop())
+
+    def key(self, view: SessionView) -> object:
+        checks = view.checks
+        return checks.serial, checks.waits, view.rules_serial, tuple(sorted(self._open)), view.task_serial
+
+    def draw(self, view: SessionView) -> None:
+        checks = view.checks
+        found = cards(checks, view.rules)
+        set_tab_label(self._tab, f"{TAB} {count(found)}" if found else TAB)
+        self._status.content = status_html(checks, found, self._link)
+        self._stop.visible = checks.state in RUNNING
+        self._now.visible = checks.state not in RUNNING and view.task is not None
+        self._after_save.show(checks.after_each_save)
+        more = 0 if view.rules is None else view.rules.more
+        self._list.visible = bool(found or checks.results)
+        self._list.content = list_html(checks, found, more, self._open, self._press, self._link)
+
+    def _press(self, key: str) -> str:
+        """The id of the button that folds a part out and in."""
+        return self._presses.id_of(("fold", key), lambda _: self._open.symmetric_difference_update({key}))
+
+    def _check_after_save(self, wanted: bool) -> None:
+        keep_check_after_save(wanted)
+        self._session.checks.check_after_each_save(wanted)
+        if wanted and self._session.checks.view.state == "none":
+            self._session.check_now()
+
+
+class ChecksMark(PagePart[SessionView]):
+    """The number of findings below the status line, whichever tab is open; a press opens the Checks tab."""
+
+    every = 0.25
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._html = server.gui.add_html("", visible=False)
+        # Not in a folder: viser draws a folder without a label as if its parts stood in the container, and all that
+        # follows the hidden buttons, the tabs too, would be hidden.
+        self._press = Presses(server).id_of("open", lambda client: self._show_at(client))
+        self._opening: dict[int, viser.GuiHtmlHandle] = {}
+        """By page: the element that opened the tab last."""
+
+    def key(self, view: SessionView) -> object:
+        return view.checks.serial, view.rules_serial
+
+    def draw(self, view: SessionView) -> None:
+        found = cards(view.checks, view.rules)
+        self._html.visible = bool(found)
+        if found:
+            self._html.content = mark_html(found, self._press)
+
+    def show(self) -> None:
+        """Open the Checks tab on every page: a key does not tell on which one it was pressed."""
+        for client in self._server.get_clients().values():
+            self._show_at(client)
+
+    def _show_at(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        before = self._opening.pop(client.client_id, None)
+        if before is not None:
+            before.remove()
+        self._opening[client.client_id] = client.gui.add_html(render("open_tab", tab=TAB))
+
+
+def mark_html(found: list[Card], press_id: str) -> str:
+    """The mark: number of findings, and where the worst is."""
+    rows = [row.finding for card in found for row in card.rows]
+    newest = next((place(finding) for finding in rows if finding.file), "")
+    if newest and len(rows) > 1:
+        newest += f" and {len(rows) - 1} more"
+    stops = any(finding.degree == "stop" for finding in rows)
+    return render("checks_mark", press_id=press_id, count=len(rows), newest=newest, stops=stops)
+
+
+def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) -> str:
+    """How far the checks are, and what they came to."""
+    return render("checks_status", checks=checks, told=summary(checks, found), link=link)
+
+
+def list_html(
+    checks: ChecksView,
+    found: list[Card],
+    more: int,
+    opened: set[str],
+    press: Callable[[str], str],
+    link: LinkTo = no_links,
+) -> str:
+    """The findings, and the rules without one if that is folded out.
+
+    Args:
+        more: breaches seen while playing at lines that are not listed.
+        opened: what is folded out.
+        press: the id of the button that folds a part.
+    """
+    known = {"found": found, "more": more, "opened": opened, "id_of": press, "link": link, "most": MOST_SHOWN}
+    rest = without_finding(checks, found)
+    kept = [result.rule for result in rest if result.state == "kept" and not result.notes]
+    told = [result for result in rest if result.rule not in kept]
+    return render("checks", **known, rest=len(rest), told=told, kept=kept, REST=REST, RULES=RULES)
