@@ -41,11 +41,11 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
 def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     """Over a few steps."""
     uses = checkup.tensor_uses
-    for (place, written), count in uses.copies.items():
+    for place, count in uses.copies.items():
         a_step = count / uses.steps
         times = "for each env" if a_step >= NUM_ENVS else "once" if a_step <= 1 else f"{a_step:.3g} times"
         yield Found(
-            f"{place[2]}() copies a tensor to the host {times} in a step ({written}): a GPU stops there each time. Stay "
+            f"{place[2]}() copies a tensor to the host {times} in a step ({uses.written[place]}): a GPU stops there each time. Stay "
             "in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for rows.",
             place,
             count,

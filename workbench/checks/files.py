@@ -40,6 +40,8 @@ class NamedFile:
     place: Place
     relative: bool
     """Found from the folder of the process only."""
+    always: bool
+    """In no branch of an ``if``."""
 
 
 def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
@@ -70,13 +72,14 @@ def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
             declared.update(assets.expand_data_group_into_individual_data_source_ids(name))
     needed: dict[str, Place] = {}
     for named in _named_files(checkup):
-        names = assets_at(named.path) if ASSET_DIR in named.path.parents else []
+        names = assets_at(named.path) if named.always and ASSET_DIR in named.path.parents else []
         if names and declared.isdisjoint(names):
             needed.setdefault(names[-1], named.place)
     for module, function in checkup.places.reached_from(*HOOKS):
+        branches = _branches(function)
         for node in ast.walk(function):
             for prefix, name in _DATASET_IDS.items():
-                text = node.value if isinstance(node, ast.Constant) else None
+                text = node.value if isinstance(node, ast.Constant) and node not in branches else None
                 if isinstance(text, str) and text.startswith(prefix) and name not in declared:
                     needed.setdefault(name, module.place(node, function.name))
     for name, place in needed.items():
@@ -95,24 +98,37 @@ def _named_files(checkup: Checkup) -> Iterator[NamedFile]:
         if not _WRITES_OR_ASKS.isdisjoint(getattr(each, "attr", getattr(each, "id", "")) for each in calls):
             continue  # it makes the files, or can do without
         values = _Values(checkup, module, function)
-        yield from _paths_in(function, values, module, function.name)
+        branches = _branches(function)
+        for node, path in _paths_in(function, values):
+            place = module.place(node, function.name)
+            yield NamedFile(path, place, not path.is_absolute(), node not in branches)
 
 
-def _paths_in(node: ast.AST, values: _Values, module: Module, function: str) -> Iterator[NamedFile]:
+def _branches(function: ast.FunctionDef) -> set[ast.AST]:
+    """What runs under a condition."""
+    return {
+        part
+        for node in ast.walk(function)
+        if isinstance(node, (ast.If, ast.IfExp, ast.Try))
+        for part in ast.walk(node)
+    }
+
+
+def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
     """The longest expressions that are paths."""
     if isinstance(node, ast.Call):
-        yield from _loaded_by(node, values, module, function)
+        yield from _loaded_by(node, values)
     value = values.of(node) if isinstance(node, ast.expr) and not isinstance(node, (ast.Name, ast.Constant)) else None
     if isinstance(value, (str, Path)):
         path = Path(value)
         if path.is_absolute() and (isinstance(value, Path) or path.suffix.lower() in _SUFFIXES):
-            yield NamedFile(path, module.place(node, function), False)
+            yield node, path
         return
     for child in ast.iter_child_nodes(node):
-        yield from _paths_in(child, values, module, function)
+        yield from _paths_in(child, values)
 
 
-def _loaded_by(call: ast.Call, values: _Values, module: Module, function: str) -> Iterator[NamedFile]:
+def _loaded_by(call: ast.Call, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
     """What a call reads: its first argument or ``filename=``, where it is a name, a constant or relative."""
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
     if name not in _LOADS and not name.endswith("_from_file"):
@@ -127,7 +143,7 @@ def _loaded_by(call: ast.Call, values: _Values, module: Module, function: str) -
             continue
         path = Path(value)
         if isinstance(node, (ast.Name, ast.Constant)) or not path.is_absolute():
-            yield NamedFile(path, module.place(node, function), not path.is_absolute())
+            yield node, path
 
 
 class _Values:

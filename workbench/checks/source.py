@@ -84,7 +84,7 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
     supported = cls.SUPPORTED_ROBOTS
     if supported is None:
         if robot is None or robot in ("none", ()):
-            raise CannotCheck("it names no robot")
+            raise CannotCheck("its constructor names no robot")
         yield Found(
             f"the class does not say which robots it is for. Write SUPPORTED_ROBOTS = [{_named(robot)}].",
             checkup.places.task,
@@ -263,12 +263,14 @@ def _as_tuple(robot: Any) -> Any:
 
 
 def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
+    """Those of its reward modes that it has."""
     have = [
         mode
-        for mode in ("normalized_dense", "dense")
-        if getattr(cls, REWARD_HOOKS[mode]) is not getattr(BaseEnv, REWARD_HOOKS[mode])
+        for mode in cls.SUPPORTED_REWARD_MODES
+        if mode in ("sparse", "none")
+        or (mode in REWARD_HOOKS and getattr(cls, REWARD_HOOKS[mode]) is not getattr(BaseEnv, REWARD_HOOKS[mode]))
     ]
-    return (*have, "sparse", "none")
+    return tuple(have) or ("none",)
 
 
 def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:

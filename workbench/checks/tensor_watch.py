@@ -28,7 +28,7 @@ _FACTORIES: frozenset[Any] = frozenset(
         torch.tril_indices, torch.triu_indices, torch.zeros,
     }
 )  # fmt: skip
-_MOVES = {"to", "cuda", "type_as"}
+_MOVES = {"to", "cpu", "cuda", "type_as"}
 _MIXES = {"copy_", "type_as", "to", "expand_as", "view_as", "reshape_as", "set_", "is_set_to"}
 """They take tensors of two devices."""
 _COPIES = {
@@ -61,8 +61,10 @@ class TensorUses:
 
     steps: int = 0
     """Control steps that were watched."""
-    copies: Counter[tuple[Place, str]] = field(default_factory=Counter)
-    """Copies to the host in these steps, by line and what was written."""
+    copies: Counter[Place] = field(default_factory=Counter)
+    """Copies to the host in these steps."""
+    written: dict[Place, str] = field(default_factory=dict)
+    """How these lines copy."""
     iterated: Counter[Place] = field(default_factory=Counter)
     """Iterations over the rows of a tensor of `NUM_ENVS` rows in these steps."""
     mixes: dict[Place, Mix] = field(default_factory=dict)
@@ -124,15 +126,13 @@ class TensorWatch(TorchFunctionMode):
         author = frame is not None and frame.f_code.co_filename in self._files
         if self._in_step:
             self._note_step(name, tensors, hosts, frame)
-        result = func(*args, **kwargs)
-        if not isinstance(result, (torch.Tensor, tuple, list)):
-            return result
         state = self._state(func, name, args, kwargs, tensors, hosts, frame, author)
+        result = func(*args, **kwargs)
         for made in _tensors((result,)):
             if any(made is each for each in tensors):
-                if state != _OWN or getattr(made, _STATE, _OWN) == _OWN or name not in _MOVES:
+                if name not in _MOVES or getattr(made, _STATE, _OWN) == state:
                     continue
-                # Where there is nothing to move, torch returns the tensor itself, and the one that was moved stays on the host.
+                # Where there is nothing to move torch returns the tensor itself, which a GPU leaves where it is.
                 result = made = made.view(made.shape)
             if state is None:
                 continue
@@ -161,17 +161,17 @@ class TensorWatch(TorchFunctionMode):
     ) -> Any:
         """The state of what the operation gives."""
         device = _device_of(args, kwargs) if name in ("to", "new_tensor") or "device" in kwargs else None
+        follows = frame is not None and (
+            author or frame.f_globals.get("__name__", "").startswith("mani_skill.")
+        )
         if not tensors:
-            if func not in _FACTORIES or frame is None or device == "own" or _in_device_context():
+            if func not in _FACTORIES or not follows or device == "own" or _in_device_context():
                 return _OWN
-            # ManiSkill's to_tensor() chooses the GPU by itself if there is one.
-            follows = author or frame.f_globals.get("__name__", "").startswith("mani_skill.")
-            chooses = frame.f_code.co_name == "to_tensor" and device is None
-            return _place(frame) if follows and not chooses else _OWN
+            return _place(frame)
         if device is not None:
             return _OWN if device == "own" else _place_of(hosts, frame)
         if name == "cpu":
-            return _place_of(hosts, frame) if author else _OWN
+            return _place_of(hosts, frame) if follows else _OWN
         if name == "type_as" and len(tensors) == 2:
             return getattr(tensors[1], _STATE, None)
         if name == "cuda":
@@ -219,7 +219,8 @@ class TensorWatch(TorchFunctionMode):
             while line is not None and line.f_globals.get("__name__") in _PASSED_THROUGH:
                 line = line.f_back
             if line is not None and line.f_code.co_filename in self._files:
-                self.uses.copies[_place(line), _COPIES[name]] += 1
+                self.uses.copies[_place(line)] += 1
+                self.uses.written.setdefault(_place(line), _COPIES[name])
         elif name == "unbind" and frame.f_code.co_filename in self._files:
             inner = sys._getframe(2)
             if inner.f_code.co_name == "__iter__" and len(tensors[0]) == NUM_ENVS:
