@@ -65,7 +65,10 @@ def test_a_reward_mode_without_its_method(checked: Checked) -> None:
 
 
 def test_a_typo_on_a_builder(checked: Checked) -> None:
-    typo = "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE", "builder.inital_pose = sapien.Pose(p=[0, 0, CUBE"
+    typo = (
+        "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE",
+        "builder.inital_pose = sapien.Pose(p=[0, 0, CUBE",
+    )
     finding = the_finding(checked("unknown-name", typo))
     assert finding.code.startswith("builder.inital_pose") and "Write 'initial_pose'." in finding.message
 
@@ -78,7 +81,10 @@ def test_an_attribute_of_a_builder_that_the_task_reads_is_no_typo(checked: Check
 def test_methods_that_do_not_exist(checked: Checked) -> None:
     calls = "        if self.num_envs > 99:\n            self.{}\n"
     for call, write in (
-        ("get_pairwise_contact_forces(self.cube, self.goal)", "Write self.scene.get_pairwise_contact_forces()."),
+        (
+            "get_pairwise_contact_forces(self.cube, self.goal)",
+            "Write self.scene.get_pairwise_contact_forces().",
+        ),
         ("evalute()", "Write self.evaluate()."),
         ("scene.create_actor_bulder()", "Write self.scene.create_actor_builder()."),
     ):
@@ -102,7 +108,9 @@ def test_random_numbers_that_no_seed_reaches(checked: Checked) -> None:
         finding = the_finding(checked("unseeded-random", (RESET, f"{RESET}            {line}\n")))
         assert finding.message.startswith(drawn) and "torch.rand" in finding.message
         assert finding.function == "_initialize_episode"
-    finding = the_finding(checked("unseeded-random", (BUILT, f"{BUILT}        self.size = np.random.rand()\n")))
+    finding = the_finding(
+        checked("unseeded-random", (BUILT, f"{BUILT}        self.size = np.random.rand()\n"))
+    )
     assert "_batched_episode_rng" in finding.message
 
 
@@ -126,7 +134,9 @@ def test_calls_of_one_backend(checked: Checked) -> None:
 
 def test_calls_of_one_backend_behind_its_condition(checked: Checked) -> None:
     below = "        if self.gpu_sim_enabled:\n            self.scene._gpu_apply_all()\n"
-    after = "        if not self.gpu_sim_enabled:\n            return {}\n        self.scene._gpu_fetch_all()\n"
+    after = (
+        "        if not self.gpu_sim_enabled:\n            return {}\n        self.scene._gpu_fetch_all()\n"
+    )
     at_load = "        self.first = self.cube._objs[0].pose\n"
     edits = (EVALUATE, EVALUATE + below + after), (BUILT, BUILT + at_load)
     assert checked("backend-only-call", *edits).state == "kept"
@@ -139,7 +149,10 @@ def test_a_file_that_is_missing(checked: Checked) -> None:
         ('builder.add_visual_from_file(filename=str(Path(__file__).parent / "cup.glb"))', "/cup.glb"),
         ('folder = os.path.dirname(__file__); x = os.path.join(folder, f"{MESH}.obj")', "/bowl.obj"),
     ):
-        imports = ("import numpy as np", 'import os\nfrom pathlib import Path\nimport numpy as np\nMESH = "bowl"')
+        imports = (
+            "import numpy as np",
+            'import os\nfrom pathlib import Path\nimport numpy as np\nMESH = "bowl"',
+        )
         finding = the_finding(checked("missing-file", imports, (at, f"        {written}\n{at}")))
         assert named in finding.message and finding.degree == "stop" and finding.function == "_load_scene"
 

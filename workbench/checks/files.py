@@ -23,7 +23,18 @@ _SUFFIXES = {
     ".urdf", ".xml", ".mjcf", ".srdf", ".glb", ".gltf", ".obj", ".stl", ".ply", ".dae", ".usd", ".png", ".jpg", ".jpeg",
     ".hdr", ".exr", ".ktx", ".json", ".yaml", ".yml", ".npz", ".npy", ".pt", ".pth", ".pkl", ".h5", ".csv", ".svg",
 }  # fmt: skip
-_LOADS = {"load", "parse", "open", "load_json", "load_yaml", "load_npz", "read_text", "read_bytes", "loadtxt", "imread"}
+_LOADS = {
+    "load",
+    "parse",
+    "open",
+    "load_json",
+    "load_yaml",
+    "load_npz",
+    "read_text",
+    "read_bytes",
+    "loadtxt",
+    "imread",
+}
 _WRITES_OR_ASKS = {
     "mkdir", "makedirs", "exists", "is_file", "is_dir", "isfile", "isdir", "write_text", "write_bytes", "save", "savez",
     "savez_compressed", "savetxt", "dump", "export", "imwrite", "to_csv", "glob", "listdir", "iterdir",
@@ -118,7 +129,11 @@ def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
     """The longest expressions that are paths."""
     if isinstance(node, ast.Call):
         yield from _loaded_by(node, values)
-    value = values.of(node) if isinstance(node, ast.expr) and not isinstance(node, (ast.Name, ast.Constant)) else None
+    value = (
+        values.of(node)
+        if isinstance(node, ast.expr) and not isinstance(node, (ast.Name, ast.Constant))
+        else None
+    )
     if isinstance(value, (str, Path)):
         path = Path(value)
         if path.is_absolute() and (isinstance(value, Path) or path.suffix.lower() in _SUFFIXES):
@@ -136,7 +151,10 @@ def _loaded_by(call: ast.Call, values: _Values) -> Iterator[tuple[ast.AST, Path]
     mode = [values.of(each) for each in call.args[1:2]] if name == "open" else []
     if any(isinstance(each, str) and not each.startswith("r") for each in mode):
         return
-    given = [*call.args[:1], *(each.value for each in call.keywords if each.arg in ("filename", "path", "file"))]
+    given = [
+        *call.args[:1],
+        *(each.value for each in call.keywords if each.arg in ("filename", "path", "file")),
+    ]
     for node in given:
         value = values.of(node)
         if not isinstance(value, (str, Path)) or Path(value).suffix.lower() not in _SUFFIXES:
@@ -153,12 +171,20 @@ class _Values:
         self._cls = checkup.loaded.cls
         self._file = module.file
         self._globals = next(
-            (vars(each) for each in list(sys.modules.values()) if getattr(each, "__file__", None) == module.file),
+            (
+                vars(each)
+                for each in list(sys.modules.values())
+                if getattr(each, "__file__", None) == module.file
+            ),
             {},
         )
         stored: dict[str, list[ast.expr]] = {}
         for node in ast.walk(function):
-            if isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name):
+            if (
+                isinstance(node, ast.Assign)
+                and len(node.targets) == 1
+                and isinstance(node.targets[0], ast.Name)
+            ):
                 stored.setdefault(node.targets[0].id, []).append(node.value)
             elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
                 stored.setdefault(node.id, [])
@@ -173,8 +199,12 @@ class _Values:
         if isinstance(node, ast.Name):
             return self._name(node.id)
         if isinstance(node, ast.JoinedStr):
-            parts = [self.of(each.value if isinstance(each, ast.FormattedValue) else each) for each in node.values]
-            plain = all(not isinstance(each, ast.FormattedValue) or each.format_spec is None for each in node.values)
+            parts = [
+                self.of(each.value if isinstance(each, ast.FormattedValue) else each) for each in node.values
+            ]
+            plain = all(
+                not isinstance(each, ast.FormattedValue) or each.format_spec is None for each in node.values
+            )
             known = plain and all(isinstance(each, (str, Path, int)) for each in parts)
             return "".join(map(str, parts)) if known else None
         if isinstance(node, ast.BinOp):
@@ -188,7 +218,11 @@ class _Values:
             return self._attribute(node)
         if isinstance(node, ast.Subscript):
             parents, index = self.of(node.value), self.of(node.slice)
-            is_known = isinstance(parents, tuple) and isinstance(index, int) and -len(parents) <= index < len(parents)
+            is_known = (
+                isinstance(parents, tuple)
+                and isinstance(index, int)
+                and -len(parents) <= index < len(parents)
+            )
             return parents[index] if is_known else None
         return self._call(node) if isinstance(node, ast.Call) else None
 
@@ -227,7 +261,11 @@ class _Values:
                 return getattr(owner, name)()
             if isinstance(owner, Path) and name == "joinpath":
                 return owner.joinpath(*given)
-            if owner is os.path and name in ("join", "dirname", "abspath", "realpath", "expanduser") and given:
+            if (
+                owner is os.path
+                and name in ("join", "dirname", "abspath", "realpath", "expanduser")
+                and given
+            ):
                 return getattr(os.path, name)(*given)
         if name == "Path" and given:
             return Path(*given)

@@ -22,7 +22,9 @@ from workbench.checks.reward import REWARD_HOOKS
 from workbench.core.broken_rule import Place
 from workbench.core.env.assets import robots_of
 
-HOOKS = tuple(name for name, member in vars(BaseEnv).items() if callable(member) or isinstance(member, property))
+HOOKS = tuple(
+    name for name, member in vars(BaseEnv).items() if callable(member) or isinstance(member, property)
+)
 AT_RESETS = ("_initialize_episode", "reset", *EVERY_STEP)
 """Hooks that run after the GPU's simulation has begun."""
 _BUILDERS = {"create_actor_builder": ActorBuilder, "create_articulation_builder": ArticulationBuilder}
@@ -31,7 +33,15 @@ _SEEDED = {"RandomState", "default_rng", "Generator", "SeedSequence", "PCG64", "
 _NO_DRAW = {"seed", "get_state", "set_state", "getstate", "setstate"}
 _GPU_CALLS = {"_gpu_apply_all", "_gpu_fetch_all"}
 _STATE = re.compile(r"(get_|set_)?(\w+_)?(pose|qpos|qvel|velocity|global_pose)$")
-_GUARDS = {"gpu_sim_enabled", "is_cuda", "is_gpu_enabled", "backend", "sim_backend", "_sim_device", "device_type"}
+_GUARDS = {
+    "gpu_sim_enabled",
+    "is_cuda",
+    "is_gpu_enabled",
+    "backend",
+    "sim_backend",
+    "_sim_device",
+    "device_type",
+}
 
 
 # --- the class and its registration --------------------------------------------------------------------
@@ -41,7 +51,7 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     """In ManiSkill's table."""
     if _spec(checkup) is None:
         yield Found(
-            f"{checkup.loaded.class_name} has no id: write @register_env(\"{_suggested_id(checkup)}\", "
+            f'{checkup.loaded.class_name} has no id: write @register_env("{_suggested_id(checkup)}", '
             "max_episode_steps=100) above the class.",
             checkup.places.task,
         )
@@ -268,7 +278,10 @@ def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
         mode
         for mode in cls.SUPPORTED_REWARD_MODES
         if mode in ("sparse", "none")
-        or (mode in REWARD_HOOKS and getattr(cls, REWARD_HOOKS[mode]) is not getattr(BaseEnv, REWARD_HOOKS[mode]))
+        or (
+            mode in REWARD_HOOKS
+            and getattr(cls, REWARD_HOOKS[mode]) is not getattr(BaseEnv, REWARD_HOOKS[mode])
+        )
     ]
     return tuple(have) or ("none",)
 
@@ -390,7 +403,9 @@ def _ends_in(node: ast.expr, name: str) -> bool:
 
 def _is_one_object(node: ast.expr) -> bool:
     """``self.cube._objs[0]``."""
-    return isinstance(node, ast.Subscript) and (_ends_in(node.value, "_objs") or _ends_in(node.value, "_bodies"))
+    return isinstance(node, ast.Subscript) and (
+        _ends_in(node.value, "_objs") or _ends_in(node.value, "_bodies")
+    )
 
 
 CHECKS: Mapping[str, Check] = {
