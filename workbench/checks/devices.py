@@ -32,8 +32,8 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
             found.setdefault(place[:2], place)
     for place in found.values():
         yield Found(
-            f"{place[2]}() goes through the envs one by one in Python, at every step. Write it once for the whole batch: "
-            "pose.p is (N, 3), torch.linalg.norm(x, dim=1) gives (N,), torch.where(mask, a, b) chooses by env.",
+            f"{place[2]}() goes through the envs one by one in Python, at every step. Write it once for the whole "
+            "batch: pose.p is (N, 3), torch.linalg.norm(x, dim=1) gives (N,), torch.where(mask, a, b) chooses by env.",
             place,
         )
 
@@ -43,10 +43,11 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     uses = checkup.tensor_uses
     for place, count in uses.copies.items():
         a_step = count / uses.steps
+        written = uses.written[place]
         times = "for each env" if a_step >= NUM_ENVS else "once" if a_step <= 1 else f"{a_step:.3g} times"
         yield Found(
-            f"{place[2]}() copies a tensor to the host {times} in a step ({uses.written[place]}): a GPU stops there each time. Stay "
-            "in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for rows.",
+            f"{place[2]}() copies a tensor to the host {times} in a step ({written}): a GPU stops there each time. "
+            "Stay in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for rows.",
             place,
             count,
         )
@@ -60,8 +61,8 @@ def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:
         if mix.made[0] != place[0]:
             here = f"in {mix.made[0]}:{mix.made[1]}"
         yield Found(
-            f"a tensor that was made {here} without a device meets one that is on self.device ({mix.operation}). On a GPU "
-            "this raises. Make it with device=self.device, or within `with torch.device(self.device):`.",
+            f"a tensor that was made {here} without a device meets one that is on self.device ({mix.operation}). "
+            "On a GPU this raises. Make it with device=self.device, or within `with torch.device(self.device):`.",
             place,
         )
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from types import CodeType
 from typing import Any
 
-from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 
 from workbench.authoring.loading import registry
@@ -70,8 +70,8 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
     _needs_id(checkup)
     if checkup.loaded.max_episode_steps is None:
         yield Found(
-            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), as many control "
-            "steps as a slow success needs.",
+            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), as many "
+            "control steps as a slow success needs.",
             _decorator(checkup),
         )
 
@@ -81,8 +81,8 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
     _needs_id(checkup)
     for env_id in checkup.loaded.replaced_ids:
         yield Found(
-            f"{env_id} is another task's: plain ManiSkill skips this class, and gym.make({env_id!r}) makes the other. "
-            "Choose an id that no task has.",
+            f"{env_id} is another task's: plain ManiSkill skips this class, and gym.make({env_id!r}) makes the "
+            "other. Choose an id that no task has.",
             _decorator(checkup),
         )
 
@@ -101,8 +101,8 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
         )
     elif robot is not None and robot not in supported and _as_tuple(robot) not in supported:
         yield Found(
-            f"the default of robot_uids, {_named(robot)}, is not in SUPPORTED_ROBOTS: ManiSkill warns about each env. "
-            "Add it there.",
+            f"the default of robot_uids, {_named(robot)}, is not in SUPPORTED_ROBOTS: ManiSkill warns about each "
+            "env. Add it there.",
             _class_value(checkup, "SUPPORTED_ROBOTS"),
         )
 
@@ -214,8 +214,8 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
                 )
             elif function in after_begin and _STATE.match(node.attr) and _is_one_object(node.value):
                 yield Found(
-                    f"{node.attr} of a SAPIEN object is the state of one env in the CPU simulation only: a GPU does not "
-                    "update it. Use the ManiSkill object itself, whose pose.p is (N, 3).",
+                    f"{node.attr} of a SAPIEN object is the state of one env in the CPU simulation only: a GPU "
+                    "does not update it. Use the ManiSkill object itself, whose pose.p is (N, 3).",
                     place,
                 )
 
@@ -312,8 +312,8 @@ def _methods_of_task(checkup: Checkup) -> Iterator[tuple[Module, ast.FunctionDef
 
 
 def _names_of(checkup: Checkup, cls: type) -> set[str]:
-    """All names that an object of this class may have: of its classes, those that the author's files assign or ask for by
-    ``hasattr``, and those that code outside these files reads or sets."""
+    """All names that an object of this class may have: of its classes, those that the author's files assign or ask for
+    by ``hasattr``, and those that code outside these files reads or sets."""
     own = {module.file for module in checkup.places.modules}
     names = set(dir(cls))
     for module in checkup.places.modules:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import linecache
 import sys
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import FrameType
@@ -117,13 +117,13 @@ def _profile_of(checkup: Checkup, clock: _Clock, num_envs: int, steps: int, own:
         HookTime(
             name, 1e3 * seconds / timed, seconds / total, checkup.places.hook(name) if name in own else None
         )
-        for name, seconds in clock.hooks.most_common()
+        for name, seconds in sorted(clock.hooks.items(), key=lambda hook: -hook[1])
     ]
-    by_hook: Counter[str] = Counter()
+    by_hook: defaultdict[str, float] = defaultdict(float)
     for (hook, _, _), seconds in clock.lines.items():
         by_hook[hook] += seconds
     lines = []
-    for (hook, file, line), seconds in clock.lines.most_common():
+    for (hook, file, line), seconds in clock.lines.items():
         part = seconds / by_hook[hook] * clock.hooks[hook]
         code = linecache.getline(file, line).strip()
         lines.append(LineTime(hook, file, line, code, 1e3 * part / timed, part / total))
@@ -135,9 +135,9 @@ class _Clock:
     """Adds up the time of wrapped functions, each without those that it calls, and of lines."""
 
     def __init__(self, files: set[str]) -> None:
-        self.hooks: Counter[str] = Counter()
+        self.hooks: defaultdict[str, float] = defaultdict(float)
         """Seconds in the steps without a tracer."""
-        self.lines: Counter[tuple[str, str, int]] = Counter()
+        self.lines: defaultdict[tuple[str, str, int], float] = defaultdict(float)
         """Seconds by hook, file and line in the steps with one."""
         self.timed_steps = 0
         self._files = files

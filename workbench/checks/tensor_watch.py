@@ -23,8 +23,8 @@ NUM_ENVS = 5
 _TORCH = f"{Path(torch.__file__).parent}/"
 _FACTORIES: frozenset[Any] = frozenset(
     {
-        torch.arange, torch.as_tensor, torch.asarray, torch.empty, torch.eye, torch.full, torch.linspace, torch.logspace,
-        torch.ones, torch.rand, torch.randint, torch.randn, torch.randperm, torch.scalar_tensor, torch.tensor,
+        torch.arange, torch.as_tensor, torch.asarray, torch.empty, torch.eye, torch.full, torch.linspace,
+        torch.logspace, torch.ones, torch.rand, torch.randint, torch.randn, torch.randperm, torch.scalar_tensor, torch.tensor,
         torch.tril_indices, torch.triu_indices, torch.zeros,
     }
 )  # fmt: skip
@@ -40,8 +40,8 @@ _PASSED_THROUGH = ("mani_skill.utils.common", "mani_skill.utils.structs.pose")
 """A copy that these make is made by the line that calls them: ``pose.sp``, ``common.to_numpy(x)``."""
 _STATE = "_workbench_device"
 _OWN = "own"
-"""State of a tensor that is on the env's device. Of one that would stay on the host: the `Place` that made it. Of one whose
-origin was not seen (``torch.Tensor([1])``): no state."""
+"""State of a tensor that is on the env's device. Of one that would stay on the host: the `Place` that made it. Of one
+whose origin was not seen (``torch.Tensor([1])``): no state."""
 _HOST = torch.device("cpu", 0)
 """The device that a host tensor says, so that a tensor made on it is a host tensor too; the env's has no number."""
 
@@ -74,8 +74,8 @@ class TensorUses:
 class TensorWatch(TorchFunctionMode):
     """A context in which `uses` is filled.
 
-    On the CPU all tensors are on one device. Which of them a GPU would have on the host is followed from where they are made:
-    without a device, they stay on the host until they are moved.
+    On the CPU all tensors are on one device. Which of them a GPU would have on the host is followed from where they are
+    made: without a device, they stay on the host until they are moved.
     """
 
     def __init__(self, files: Collection[str]) -> None:
@@ -165,9 +165,8 @@ class TensorWatch(TorchFunctionMode):
             author or frame.f_globals.get("__name__", "").startswith("mani_skill.")
         )
         if not tensors:
-            if func not in _FACTORIES or not follows or device == "own" or _in_device_context():
-                return _OWN
-            return _place(frame)
+            stays = follows and func in _FACTORIES and device != "own" and not _in_device_context()
+            return _place_of([], frame) if stays else _OWN
         if device is not None:
             return _OWN if device == "own" else _place_of(hosts, frame)
         if name == "cpu":
