@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+from workbench.core.env.actions import hold_action
 
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 FLICKER_SHARE = 0.25
@@ -84,6 +85,20 @@ def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
                 )
 
 
+def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
+    """After a reset and after a step."""
+    task = checkup.task
+    others = checkup.reset(task, checkup.seeds[0]).others
+    others = {**others, **checkup.step(task, hold_action(task.parts, task.num_envs)).others}
+    for name, entry in others.items():
+        if not entry.per_env:
+            yield Found(
+                f"the entry {name!r} of evaluate() is a {entry.what} for all {task.num_envs} envs together. Give it a row "
+                "for each env, or leave it out: what only people read can be logged elsewhere.",
+                checkup.places.entry(name.rpartition("/")[2]),
+            )
+
+
 def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
     """(T + 1, K)"""
     rows = episodes.evaluate.get(name)
@@ -106,6 +121,7 @@ CHECKS: Mapping[str, Check] = {
     "success-at-reset": success_at_reset,
     "success-stays-possible": success_stays_possible,
     "entry-name": entry_name,
+    "info-rows": info_rows,
     "success-and-fail": success_and_fail,
     "success-flickers": success_flickers,
 }

@@ -306,6 +306,13 @@ _TABLE = (
         "Policies learn to avoid success.",
         "compute_dense_reward",
     ),
+    Rule(
+        "reward-needs-success",
+        "warn",
+        "The largest normalized reward is given at success only.",
+        "Policies learn to wait where they earn as much as at success.",
+        "compute_dense_reward",
+    ),
     # --- reproducibility -------------------------------------------------------------------------------------
     Rule(
         "same-seed",
@@ -395,8 +402,8 @@ _TABLE = (
     Rule(
         "camera-names",
         "warn",
-        "Cameras of task, robot and people have different names.",
-        "One of them is replaced silently, or its override fails.",
+        "Sensor cameras of the task and of its robot have different names.",
+        "The last one of a name replaces the others silently.",
         "_default_sensor_configs",
     ),
     Rule(
