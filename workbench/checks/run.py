@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from workbench.authoring.problem import TaskError
-from workbench.checks import evaluate, reward
+from workbench.checks import cameras, evaluate, observation, reward
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.rules import Degree, Finding, reason_of_silence
@@ -49,6 +49,8 @@ class Group:
 GROUPS: tuple[Group, ...] = (
     Group("success", evaluate.CHECKS),
     Group("rewards", reward.CHECKS),
+    Group("observations", observation.CHECKS),
+    Group("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"
