@@ -18,13 +18,13 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
 from workbench.checks.places import Places
+from workbench.core.backends import find_renderer
 from workbench.core.broken_rule import Place
 from workbench.core.capture.inspect_env import list_contacts
 from workbench.core.env import actions
 from workbench.core.env.evaluate_entries import flat_entries
 from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
-from workbench.core.backends import find_renderer
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.scene_index import scene_index

@@ -94,7 +94,7 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     size = float(np.abs(dense[finite]).max(initial=0))
     telling = finite & (np.abs(dense) > TELLING * size)
     if not telling.any():
-        raise CannotCheck("its dense reward is 0 in all states that were tried")
+        raise CannotCheck("its dense reward is 0 or not finite in all states that were tried")
     constant = float(np.median(normalized[telling] / dense[telling]))
     wrong = np.abs(normalized - constant * dense)
     off = finite & (wrong > SAME_RATIO * np.abs(normalized[finite]).max())
