@@ -75,3 +75,9 @@ def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:
     assert (
         checked("success-at-reset", (edit, f"{easy}  # workbench: off[reward-rows] {why}")).state == "broken"
     )
+
+
+def test_an_entry_for_all_envs_together(checked: Checked) -> None:
+    finding = the_finding(checked("info-rows", ('"cube_height": height', '"cube_height": height.mean()')))
+    assert "'cube_height'" in finding.message and finding.code.startswith('"cube_height"')
+    assert checked("info-rows").state == "kept"
