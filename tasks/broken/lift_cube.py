@@ -21,7 +21,7 @@ HEIGHT = 0.15
 
 @register_env("BrokenLiftCube-v1", max_episode_steps=50)
 class LiftCubeEnv(BaseEnv):
-    """Success: the cube is held above `HEIGHT`. Fail: it was pushed out of reach."""
+    """Success: the cube is held above `HEIGHT`."""
 
     SUPPORTED_ROBOTS = ["panda"]
     SUPPORTED_REWARD_MODES = ("sparse", "none")
@@ -60,7 +60,6 @@ class LiftCubeEnv(BaseEnv):
         held = self.agent.is_grasping(self.cube)
         return {
             "succes": held & (cube[:, 2] > HEIGHT),
-            "fail": torch.linalg.norm(cube[:, :2], dim=1) > 0.6,
             "height": cube[:, 2],
         }
 

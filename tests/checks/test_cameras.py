@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.checks.checked import Checked, the_finding
+from tests.checks.checked import Checked, check_rule, the_finding
 
 EYE = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])"
 CAMERA = '[CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
@@ -23,6 +23,14 @@ def test_one_camera_of_several_may_see_an_object(checked: Checked, renderer: Non
     away = "sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[1.5, 0, 0])"
     two = CAMERA.replace("[", f'[CameraConfig("away", pose={away}, width=64, height=64, fov=1.0), ', 1)
     assert checked("camera-sees", (CAMERA, two)).state == "kept"
+
+
+def test_a_body_that_only_carries_a_camera_need_not_be_seen(renderer: None) -> None:
+    assert check_rule("camera-sees", "MS-AntWalk-v1", num_envs=4, seeds=4).state == "skipped"
+
+
+def test_the_planar_worlds_of_maniskill_are_measured(renderer: None) -> None:
+    assert check_rule("camera-background", "MS-HopperHop-v1", num_envs=4, seeds=4).state == "kept"
 
 
 def test_a_camera_that_looks_at_the_sky(checked: Checked, renderer: None) -> None:

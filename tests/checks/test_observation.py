@@ -6,7 +6,10 @@ from tests.checks.checked import Checked, the_finding
 
 RULES = ("observation-finite", "observation-constant", "observation-huge")
 GOAL = '"goal_pos": self.goal.pose.p,'
-HIDDEN_GOAL = ('self.goal = builder.build_kinematic(name="goal")\n', "        self._hidden_objects.append(self.goal)\n")
+HIDDEN_GOAL = (
+    'self.goal = builder.build_kinematic(name="goal")\n',
+    "        self._hidden_objects.append(self.goal)\n",
+)
 
 
 def test_an_observation_that_is_nan(checked: Checked) -> None:

@@ -45,13 +45,24 @@ def test_a_normalized_reward_that_is_another_reward(checked: Checked) -> None:
     assert checked("reward-ratio").state == "kept"
 
 
+def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
+    edit = (
+        "self.compute_dense_reward(obs, action, info) / 3",
+        "self.compute_dense_reward(obs, action, info) / 6 + 0.5",
+    )
+    result = checked("reward-ratio", edit)
+    assert result.state == "kept" and "times 0.1667 plus 0.5" in result.notes[0]
+
+
 def test_a_reward_without_a_normalized_one_has_no_ratio(checked: Checked) -> None:
     edit = 'SUPPORTED_REWARD_MODES = ("normalized_dense", "dense"', 'SUPPORTED_REWARD_MODES = ("dense"'
     assert checked("reward-ratio", edit).state == "skipped"
 
 
 def test_success_that_earns_less_than_the_way_to_it(checked: Checked) -> None:
-    finding = the_finding(checked("reward-order", ('reward[info["success"]] = 3', 'reward[info["success"]] = 0')))
+    finding = the_finding(
+        checked("reward-order", ('reward[info["success"]] = 3', 'reward[info["success"]] = 0'))
+    )
     assert "at success" in finding.message and finding.function == "compute_dense_reward"
     assert checked("reward-order").state == "kept"
 

@@ -17,7 +17,15 @@ from workbench.core.camera_data import CameraKey
 from workbench.core.cameras.place import rows_of_pose
 from workbench.core.cameras.render import cameras_of, mount_of
 from workbench.core.cameras.report import CameraReport, join_reports
-from workbench.core.cameras.visibility import measure_placement, placement_of, small_size
+from workbench.core.cameras.visibility import (
+    entities_of,
+    is_drawn,
+    list_objects,
+    measure_placement,
+    placement_of,
+    small_size,
+)
+from workbench.core.scene.scene_index import scene_index
 
 RESETS = 4
 """Resets of `Checkup.pictured` whose pictures are measured."""
@@ -32,10 +40,13 @@ UNIT = 1e-3
 def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     """Over the pictures of all sensor cameras after some resets."""
     reports = checkup.look(sensor_reports)
+    drawn = _drawn_objects(checkup)
     in_view: dict[str, list[Any]] = {}
     uncovered: dict[str, list[Any]] = {}
     for report in reports.values():
         for thing in report.wanted_objects(None):
+            if thing.name not in drawn:
+                continue
             in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
             uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
     if not in_view:
@@ -133,6 +144,17 @@ def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
                 size = small_size(placement.settings.width, placement.settings.height)
                 reports[key].append(measure_placement(task.env, e, placement, size=size))
     return {key: join_reports(each) for key, each in reports.items()}
+
+
+def _drawn_objects(checkup: Checkup) -> set[str]:
+    """Names of the objects that have anything to see: a body may only carry a camera."""
+    env = checkup.pictured.env
+    index = scene_index(env)
+    return {
+        thing.name
+        for thing in list_objects(env)
+        if any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
+    }
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:

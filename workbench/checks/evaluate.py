@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,10 +62,16 @@ def success_flickers(checkup: Checkup) -> Iterator[Found | Note]:
 def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
     """Whether there is an entry at all, and whether random actions reach it."""
     entries = checkup.starts.evaluate
+    if any(known != "elapsed_steps" for _, known in _misspelt(entries)):
+        raise CannotCheck("an entry has nearly the name that ManiSkill reads, see entry-name")
     if "success" not in entries and "fail" not in entries:
+        if "dense" in checkup.task.env.reward_mode and checkup.loaded.max_episode_steps is not None:
+            # As ManiSkill's tasks of walking and balancing.
+            yield Note("evaluate() has neither success nor fail: only the reward tells good from bad")
+            return
         yield Found(
-            "evaluate() returns neither success nor fail: no episode ends before its time limit, and no success rate "
-            "is counted. Return {'success': ...} as a bool tensor with a row for each env.",
+            "evaluate() returns neither success nor fail, and the task has no dense reward with a time limit: nothing "
+            "tells good from bad. Return {'success': ...} as a bool tensor with a row for each env.",
             checkup.places.hook("evaluate"),
         )
     elif "success" in entries:
@@ -75,14 +81,20 @@ def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
 
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
     """Entries one or two letters away from one that ManiSkill reads."""
-    for name in checkup.starts.evaluate:
+    for name, known in _misspelt(checkup.starts.evaluate):
+        yield Found(
+            f"evaluate() returns {name!r}, and ManiSkill reads {known!r}. Rename the entry.",
+            checkup.places.entry(name),
+        )
+
+
+def _misspelt(entries: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Names of entries that are nearly one that ManiSkill reads and that is missing, and that one."""
+    for name in entries:
         for known in READ_BY_MANISKILL:
             close = difflib.SequenceMatcher(None, name.lower(), known).ratio() >= 0.8
-            if name != known and known not in checkup.starts.evaluate and close and "/" not in name:
-                yield Found(
-                    f"evaluate() returns {name!r}, and ManiSkill reads {known!r}. Rename the entry.",
-                    checkup.places.entry(name),
-                )
+            if known not in entries and close and "/" not in name:
+                yield name, known
 
 
 def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
@@ -104,7 +116,12 @@ def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
     rows = episodes.evaluate.get(name)
     if rows is None:
         raise CannotCheck(f"evaluate() has no entry {name}")
-    return rows.reshape(*rows.shape[:2], -1).astype(bool).any(axis=2)
+    return flags(rows)
+
+
+def flags(rows: NDArray) -> NDArray[np.bool_]:
+    """(T, K) of (T, K, ...)."""
+    return np.logical_or.reduce(rows.reshape(*rows.shape[:2], -1).astype(bool), axis=2)
 
 
 def of(count: int, total: int, what: str) -> str:

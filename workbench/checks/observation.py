@@ -37,7 +37,7 @@ MOST_BODIES = 40
 def observation_finite(checkup: Checkup) -> Iterator[Found | Note]:
     """Over random rollouts and odd states."""
     for name, rows in _leaves(checkup).items():
-        bad = ~np.isfinite(rows).all(axis=2)
+        bad: NDArray[np.bool_] = ~np.logical_and.reduce(np.isfinite(rows), axis=2)
         if bad.any():
             step, env = (int(i) for i in np.argwhere(bad)[0])
             yield Found(

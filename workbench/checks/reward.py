@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
-from workbench.checks.evaluate import of
+from workbench.checks.evaluate import flags, of
 from workbench.checks.odd_states import DENSE_HOOKS, odd_states
 
 REWARD_HOOKS = {**DENSE_HOOKS, "sparse": "compute_sparse_reward"}
@@ -98,7 +98,9 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     constant = float(np.median(normalized[telling] / dense[telling]))
     wrong = np.abs(normalized - constant * dense)
     off = finite & (wrong > SAME_RATIO * np.abs(normalized[finite]).max())
-    if off.any():
+    if off.any() and (line := _straight_line(dense[finite], normalized[finite])) is not None:
+        yield Note(f"the normalized reward is the dense one times {line[0]:.4g} plus {line[1]:.4g}")
+    elif off.any():
         first, worst = int(np.flatnonzero(telling)[0]), int(np.argmax(np.where(off, wrong, 0)))
         yield Found(
             f"the normalized reward is {normalized[worst]:.4g} where the dense reward is {dense[worst]:.4g}, and "
@@ -107,6 +109,15 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
             checkup.places.hook("compute_normalized_dense_reward", "compute_dense_reward"),
             int(off.sum()),
         )
+
+
+def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] | None:
+    """Slope and offset with which the dense reward becomes the normalized one; None if it is no rising line."""
+    if np.ptp(dense) == 0:
+        return None
+    slope, offset = (float(number) for number in np.polyfit(dense, normalized, 1))
+    wrong = np.abs(slope * dense + offset - normalized).max()
+    return (slope, offset) if slope > 0 and wrong <= SAME_RATIO * np.abs(normalized).max() else None
 
 
 def reward_order(checkup: Checkup) -> Iterator[Found | Note]:
@@ -186,7 +197,7 @@ def _scored(checkup: Checkup) -> list[_Scored]:
     episodes, rewards = checkup.random, np.nan_to_num(_rewards(checkup))
     if "success" not in episodes.evaluate:
         raise CannotCheck("evaluate() has no entry success")
-    success = _flags(episodes.evaluate["success"][1:])
+    success = flags(episodes.evaluate["success"][1:])
     found = [_Scored(rewards, success, [[f"seed {seed}" for seed in episodes.seeds]])]
     seen = checkup.look(odd_states)
     mode = checkup.task.env.reward_mode
@@ -195,16 +206,11 @@ def _scored(checkup: Checkup) -> list[_Scored]:
         found.append(
             _Scored(
                 np.nan_to_num(np.stack([seen.reward[mode][row] for row in rows])),
-                _flags(np.stack([seen.evaluate[row]["success"] for row in rows])),
+                flags(np.stack([seen.evaluate[row]["success"] for row in rows])),
                 [[f"{seen.kinds[row]}, seed {seed}" for seed in seeds] for row in rows],
             )
         )
     return found
-
-
-def _flags(rows: NDArray) -> NDArray[np.bool_]:
-    """(T, K)"""
-    return rows.reshape(*rows.shape[:2], -1).astype(bool).any(axis=2)
 
 
 def _rewards(checkup: Checkup) -> NDArray:

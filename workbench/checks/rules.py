@@ -252,8 +252,8 @@ _TABLE = (
     Rule(
         "success-stays-possible",
         "warn",
-        "evaluate() has an entry success (or fail).",
-        "No episode ends early, and no success rate can be counted.",
+        "evaluate() has an entry success (or fail), or the task has a dense reward and a time limit.",
+        "No episode ends early, no success rate can be counted, and nothing else tells good from bad.",
         "evaluate",
     ),
     Rule(
