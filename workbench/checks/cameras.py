@@ -10,25 +10,30 @@ import numpy as np
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.evaluate import of
+from workbench.checks.evaluate import listed, of
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.camera_data import CameraKey
 from workbench.core.cameras.place import rows_of_pose
 from workbench.core.cameras.render import cameras_of, mount_of
 from workbench.core.cameras.report import CameraReport, join_reports
+from workbench.core.cameras.temporary import temporary_camera
 from workbench.core.cameras.visibility import (
+    SceneObject,
     entities_of,
     is_drawn,
     list_objects,
-    measure_placement,
+    measure,
     placement_of,
+    placement_pose,
     small_size,
 )
-from workbench.core.scene.scene_index import scene_index
+from workbench.core.scene.scene_index import read_poses, scene_index
 
 RESETS = 4
 """Resets of `Checkup.pictured` whose pictures are measured."""
+MOST_OBJECTS = 30
+"""Objects that are looked for: each takes a picture of its own."""
 MISSED_SHARE = 0.25
 """Of the pictures in which an object may be out of view."""
 BACKGROUND_SHARE = 0.5
@@ -40,17 +45,15 @@ UNIT = 1e-3
 def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     """Over the pictures of all sensor cameras after some resets."""
     reports = checkup.look(sensor_reports)
-    drawn = _drawn_objects(checkup)
     in_view: dict[str, list[Any]] = {}
     uncovered: dict[str, list[Any]] = {}
     for report in reports.values():
         for thing in report.wanted_objects(None):
-            if thing.name not in drawn:
-                continue
             in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
             uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
     if not in_view:
         raise CannotCheck("it has no objects beside the robot and the scenery")
+    covered: list[str] = []
     for name, of_cameras in in_view.items():
         missed = ~np.any(of_cameras, axis=0)
         if missed.mean() > MISSED_SHARE:
@@ -62,7 +65,9 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
                 int(missed.sum()),
             )
         elif not np.any(uncovered[name]):
-            yield Note(f"{name} is covered by other things in every picture after a reset")
+            covered.append(name)
+    if covered:
+        yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
 
 
 def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
@@ -136,25 +141,33 @@ def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
     if not sensors:
         raise CannotCheck("it has no sensor camera")
     reports: dict[CameraKey, list[CameraReport]] = {key: [] for key in sensors}
+    objects = _objects(task.env)
     for first in range(0, RESETS * task.num_envs, task.num_envs):
         checkup.reset(task, checkup.seeds[0] + first)
         for key in sensors:
             for e in range(task.num_envs):
-                placement = placement_of(task.env, key, e)
-                size = small_size(placement.settings.width, placement.settings.height)
-                reports[key].append(measure_placement(task.env, e, placement, size=size))
+                reports[key].append(_measured(task.env, e, key, objects))
     return {key: join_reports(each) for key, each in reports.items()}
 
 
-def _drawn_objects(checkup: Checkup) -> set[str]:
-    """Names of the objects that have anything to see: a body may only carry a camera."""
-    env = checkup.pictured.env
-    index = scene_index(env)
-    return {
-        thing.name
-        for thing in list_objects(env)
+def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> CameraReport:
+    placement, index = placement_of(env, key, e), scene_index(env)
+    settings = placement.settings
+    pose = placement_pose(placement, read_poses(env)[e], index)
+    with temporary_camera(env, e, "sensor", settings, small_size(settings.width, settings.height)) as view:
+        return measure(view, pose, e, objects, index, key, settings)
+
+
+def _objects(env: Any) -> list[SceneObject]:
+    """Robots and scenery, and the first objects that have anything to see: a body may only carry a camera."""
+    index, every = scene_index(env), list_objects(env)
+    drawn = [
+        thing
+        for thing in every
         if any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
-    }
+    ]
+    scenery = [thing for thing in every if thing.robot or thing.scenery]
+    return [*scenery, *[thing for thing in drawn if thing not in scenery][:MOST_OBJECTS]]
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
@@ -65,13 +66,14 @@ def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
     if any(known != "elapsed_steps" for _, known in _misspelt(entries)):
         raise CannotCheck("an entry has nearly the name that ManiSkill reads, see entry-name")
     if "success" not in entries and "fail" not in entries:
-        if "dense" in checkup.task.env.reward_mode and checkup.loaded.max_episode_steps is not None:
-            # As ManiSkill's tasks of walking and balancing.
-            yield Note("evaluate() has neither success nor fail: only the reward tells good from bad")
+        own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
+        if checkup.task.env.reward_mode != "sparse" or own:
+            # As ManiSkill's tasks of walking, balancing and drawing.
+            yield Note("evaluate() has neither success nor fail, so no success rate can be counted")
             return
         yield Found(
-            "evaluate() returns neither success nor fail, and the task has no dense reward with a time limit: nothing "
-            "tells good from bad. Return {'success': ...} as a bool tensor with a row for each env.",
+            "evaluate() returns neither success nor fail, from which the sparse reward is made: it is always 0. Return "
+            "{'success': ...} as a bool tensor with a row for each env.",
             checkup.places.hook("evaluate"),
         )
     elif "success" in entries:
@@ -129,7 +131,7 @@ def of(count: int, total: int, what: str) -> str:
     return f"{count} of {total} {what}{'' if total == 1 else 's'}"
 
 
-def listed(values: list[int], most: int = 5) -> str:
+def listed(values: Sequence[object], most: int = 5) -> str:
     """``1, 2, 3 ...``."""
     return ", ".join(map(str, values[:most])) + (" ..." if len(values) > most else "")
 

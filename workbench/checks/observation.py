@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, leaf_rows
-from workbench.checks.evaluate import of
+from workbench.checks.evaluate import listed, of
 from workbench.checks.odd_states import DENSE_HOOKS, odd_states, write_all
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
@@ -37,7 +37,7 @@ MOST_BODIES = 40
 def observation_finite(checkup: Checkup) -> Iterator[Found | Note]:
     """Over random rollouts and odd states."""
     for name, rows in _leaves(checkup).items():
-        bad: NDArray[np.bool_] = ~np.logical_and.reduce(np.isfinite(rows), axis=2)
+        bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
         if bad.any():
             step, env = (int(i) for i in np.argwhere(bad)[0])
             yield Found(
@@ -107,7 +107,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
                 told.setdefault(leaf, []).append(body)
     for leaf, bodies in told.items():
         yield Found(
-            f"{leaf!r} of _get_obs_extra() follows {_listed(bodies)} in obs_mode "
+            f"{leaf!r} of _get_obs_extra() follows {listed(bodies)} in obs_mode "
             f"{checkup.pictured.env.obs_mode!r}. Put it behind `if self.obs_mode_struct.use_state:`.",
             _place(checkup, f"extra/{leaf}"),
         )
@@ -121,7 +121,7 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     for body, moved in bodies.items():
         if moved.meaning and not moved.observation:
             yield Found(
-                f"{body} is hidden from pictures, {_listed(sorted(moved.meaning))} of evaluate() or the reward depends "
+                f"{body} is hidden from pictures, {listed(sorted(moved.meaning))} of evaluate() or the reward depends "
                 "on where it is, and nothing in _get_obs_extra() does. Add its position there, in all modes.",
                 checkup.places.hook("_get_obs_extra"),
             )
@@ -151,10 +151,6 @@ def _place(checkup: Checkup, leaf: str) -> Place | None:
 def _text(value: NDArray[np.float64]) -> str:
     shown = ", ".join(f"{number:.4g}" for number in value[:7])
     return shown if len(value) == 1 else f"({shown}{', ...' if len(value) > 7 else ''})"
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
 # --- what follows a body that is moved -----------------------------------------------------------------------
