@@ -30,6 +30,8 @@ AROUND = 0.15
 HIGHEST = 0.3
 """Metres above where a body begins."""
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
+MOST_GOALS = 4
+"""A drawing has hundreds of marks."""
 AT_GOAL = "with bodies at the place of {}"
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
 
@@ -60,7 +62,7 @@ def odd_states(checkup: Checkup) -> OddStates:
         checkup.reset(task, seeds)
         begun = read_states(task.env)
         rounds = [(kind, _changed(task.env, begun, kind, rng)) for kind in KINDS]
-        for goal in _goals(task.env):
+        for goal in _goals(task.env)[:MOST_GOALS]:
             rounds.append((AT_GOAL.format(goal.partition("/")[2]), _at(task.env, begun, goal)))
         for kind, states in rounds:
             write_all(task.env, states)
