@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.checks.checked import Checked, the_finding
+from tests.checks.checked import Checked, check_rule, the_finding
 
 
 def test_success_right_after_a_reset(checked: Checked) -> None:
@@ -23,9 +23,15 @@ def test_no_entry_for_success(checked: Checked) -> None:
             ('"fail": height < -0.1,', ""),
             ('reward[info["success"]] = 3', ""),
             ('reward[info["fail"]] = 0', ""),
+            reward_mode="sparse",
         )
     )
     assert finding.code.startswith("def evaluate")
+
+
+def test_a_dense_reward_needs_no_success() -> None:
+    result = check_rule("success-stays-possible", "MS-CartpoleSwingUp-v1", num_envs=4, seeds=4)
+    assert result.state == "kept" and "no success rate" in result.notes[0]
 
 
 def test_how_many_random_episodes_succeed_is_noted(checked: Checked) -> None:
@@ -75,3 +81,9 @@ def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:
     assert (
         checked("success-at-reset", (edit, f"{easy}  # workbench: off[reward-rows] {why}")).state == "broken"
     )
+
+
+def test_an_entry_for_all_envs_together(checked: Checked) -> None:
+    finding = the_finding(checked("info-rows", ('"cube_height": height', '"cube_height": height.mean()')))
+    assert "'cube_height'" in finding.message and finding.code.startswith('"cube_height"')
+    assert checked("info-rows").state == "kept"

@@ -26,3 +26,50 @@ def test_a_normalized_reward_above_one(checked: Checked) -> None:
     finding = the_finding(checked("reward-normalized", edit))
     assert finding.function == "compute_normalized_dense_reward" and finding.count > 1
     assert checked("reward-normalized").state == "kept"
+
+
+def test_a_reward_that_is_nan_where_random_actions_do_not_lead(checked: Checked) -> None:
+    # The cube comes within a millimetre of the goal only where it is put there.
+    nan = "reward = reach + push + torch.sqrt((info['cube_to_goal'] - 0.001).sign())\n"
+    finding = the_finding(checked("reward-finite", ("reward = reach + push\n", nan)))
+    assert "with bodies at the place of goal" in finding.message
+
+
+def test_a_normalized_reward_that_is_another_reward(checked: Checked) -> None:
+    edit = (
+        "self.compute_dense_reward(obs, action, info) / 3",
+        "(self.compute_dense_reward(obs, action, info) / 3).sqrt()",
+    )
+    finding = the_finding(checked("reward-ratio", edit))
+    assert "no single constant" in finding.message and finding.function == "compute_normalized_dense_reward"
+    assert checked("reward-ratio").state == "kept"
+
+
+def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
+    edit = (
+        "self.compute_dense_reward(obs, action, info) / 3",
+        "self.compute_dense_reward(obs, action, info) / 6 + 0.5",
+    )
+    result = checked("reward-ratio", edit)
+    assert result.state == "kept" and "times 0.1667 plus 0.5" in result.notes[0]
+
+
+def test_a_reward_without_a_normalized_one_has_no_ratio(checked: Checked) -> None:
+    edit = 'SUPPORTED_REWARD_MODES = ("normalized_dense", "dense"', 'SUPPORTED_REWARD_MODES = ("dense"'
+    assert checked("reward-ratio", edit).state == "skipped"
+
+
+def test_success_that_earns_less_than_the_way_to_it(checked: Checked) -> None:
+    finding = the_finding(
+        checked("reward-order", ('reward[info["success"]] = 3', 'reward[info["success"]] = 0'))
+    )
+    assert "at success" in finding.message and finding.function == "compute_dense_reward"
+    assert checked("reward-order").state == "kept"
+
+
+def test_the_largest_reward_without_success(checked: Checked) -> None:
+    # All of it where the cube is near the goal, and the target is half as wide as that.
+    near = "reward[info['cube_to_goal'] < 0.25] = 3"
+    finding = the_finding(checked("reward-needs-success", ('reward[info["success"]] = 3', near)))
+    assert "without success" in finding.message
+    assert checked("reward-needs-success").state == "kept"

@@ -19,6 +19,7 @@ from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
 from workbench.checks.places import Places
 from workbench.checks.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
+from workbench.core.backends import find_renderer
 from workbench.core.broken_rule import Place
 from workbench.core.capture.inspect_env import list_contacts
 from workbench.core.env import actions
@@ -33,6 +34,8 @@ ROLLOUT_STEPS = 50
 """Most control steps of an episode that is rolled out."""
 STILL_SECONDS = 1.0
 """How long the robot holds still."""
+PICTURED_ENVS = 2
+"""Envs that observe pictures: a reset renders all of their cameras."""
 MOST_OBS = 4096
 """Leaves of an observation with more numbers per env are pictures."""
 
@@ -142,11 +145,13 @@ class Checkup:
         """What raised, by the name of the evidence."""
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
+        self._looked: dict[Callable[[Checkup], Any], Any] = {}
 
     def close(self) -> None:
         while self._open:
             self._open.pop().close()
-        for name in ("task", "starts", "overlaps", "still", "random"):
+        self._looked.clear()
+        for name in ("task", "pictured", "starts", "overlaps", "still", "random"):
             self.__dict__.pop(name, None)
 
     # --- envs ---------------------------------------------------------------------------------------------
@@ -173,6 +178,35 @@ class Checkup:
         made = self._made(self.num_envs, False, "warn", {})
         self._open.append(made)
         return made
+
+    @evidence
+    def pictured(self) -> TaskEnv:
+        """`PICTURED_ENVS` envs that observe pictures. Whoever uses it resets it first.
+
+        Raises:
+            CannotCheck: nothing to render with, or the task has no such observations.
+        """
+        modes = self.loaded.cls.SUPPORTED_OBS_MODES
+        wanted = [m for m in ("rgb", "rgbd", "depth") if m in modes or "any_textures" in modes]
+        if not wanted:
+            raise CannotCheck("it has no observations with pictures")
+        if find_renderer() is None:
+            raise CannotCheck("there is nothing to render with")
+        made = self._made(PICTURED_ENVS, True, "off", {"obs_mode": wanted[0]})
+        self._open.append(made)
+        return made
+
+    def look(self, see: Callable[[Checkup], _Value]) -> _Value:
+        """What `see` gives, seen once: evidence of a module's own rules. If the task raises there, it raises it again."""
+        if (known := self.failed.get(see.__name__)) is not None:
+            raise known
+        if see not in self._looked:
+            try:
+                self._looked[see] = see(self)
+            except TaskError as error:
+                self.failed[see.__name__] = error
+                raise
+        return self._looked[see]
 
     def _made(self, num_envs: int, render: bool, rules: Degree, kwargs: Mapping[str, Any]) -> TaskEnv:
         given = constructor_arguments(self.loaded.cls, {**self.env_kwargs, **kwargs}, BaseEnv)
@@ -291,13 +325,18 @@ class Checkup:
 
 
 def read_obs(task: TaskEnv) -> dict[str, NDArray[np.float64]]:
-    """(N, D) of each leaf of the present observation that is no picture; of a flat one, a single leaf ``obs``."""
+    """`leaf_rows` of the present observation; of a flat one, a single leaf ``obs``."""
+    return leaf_rows(task.obs, task.num_envs)
+
+
+def leaf_rows(value: Any, num_envs: int) -> dict[str, NDArray[np.float64]]:
+    """(N, D) of each leaf that has a row for each env and is no picture."""
     read: dict[str, NDArray[np.float64]] = {}
-    for name, value in flat_entries(task.obs):
-        if not isinstance(value, torch.Tensor) or value.ndim == 0 or len(value) != task.num_envs:
+    for name, leaf in flat_entries(value):
+        if not isinstance(leaf, torch.Tensor) or leaf.ndim == 0 or len(leaf) != num_envs:
             continue
-        if value.numel() <= MOST_OBS * task.num_envs and not value.is_complex():
-            read[name or "obs"] = value.reshape(task.num_envs, -1).double().numpy(force=True).copy()
+        if leaf.numel() <= MOST_OBS * num_envs and not leaf.is_complex():
+            read[name or "obs"] = leaf.reshape(num_envs, -1).double().numpy(force=True).copy()
     return read
 
 

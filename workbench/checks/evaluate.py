@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+from workbench.core.env.actions import hold_action
 
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 FLICKER_SHARE = 0.25
@@ -61,10 +63,17 @@ def success_flickers(checkup: Checkup) -> Iterator[Found | Note]:
 def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
     """Whether there is an entry at all, and whether random actions reach it."""
     entries = checkup.starts.evaluate
+    if any(known != "elapsed_steps" for _, known in _misspelt(entries)):
+        raise CannotCheck("an entry has nearly the name that ManiSkill reads, see entry-name")
     if "success" not in entries and "fail" not in entries:
+        own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
+        if checkup.task.env.reward_mode != "sparse" or own:
+            # As ManiSkill's tasks of walking, balancing and drawing.
+            yield Note("evaluate() has neither success nor fail, so no success rate can be counted")
+            return
         yield Found(
-            "evaluate() returns neither success nor fail: no episode ends before its time limit, and no success rate "
-            "is counted. Return {'success': ...} as a bool tensor with a row for each env.",
+            "evaluate() returns neither success nor fail, from which the sparse reward is made: it is always 0. Return "
+            "{'success': ...} as a bool tensor with a row for each env.",
             checkup.places.hook("evaluate"),
         )
     elif "success" in entries:
@@ -74,14 +83,34 @@ def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
 
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
     """Entries one or two letters away from one that ManiSkill reads."""
-    for name in checkup.starts.evaluate:
+    for name, known in _misspelt(checkup.starts.evaluate):
+        yield Found(
+            f"evaluate() returns {name!r}, and ManiSkill reads {known!r}. Rename the entry.",
+            checkup.places.entry(name),
+        )
+
+
+def _misspelt(entries: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Names of entries that are nearly one that ManiSkill reads and that is missing, and that one."""
+    for name in entries:
         for known in READ_BY_MANISKILL:
             close = difflib.SequenceMatcher(None, name.lower(), known).ratio() >= 0.8
-            if name != known and known not in checkup.starts.evaluate and close and "/" not in name:
-                yield Found(
-                    f"evaluate() returns {name!r}, and ManiSkill reads {known!r}. Rename the entry.",
-                    checkup.places.entry(name),
-                )
+            if known not in entries and close and "/" not in name:
+                yield name, known
+
+
+def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
+    """After a reset and after a step."""
+    task = checkup.task
+    others = checkup.reset(task, checkup.seeds[0]).others
+    others = {**others, **checkup.step(task, hold_action(task.parts, task.num_envs)).others}
+    for name, entry in others.items():
+        if not entry.per_env:
+            yield Found(
+                f"the entry {name!r} of evaluate() is a {entry.what} for all {task.num_envs} envs together. Give it a row "
+                "for each env, or leave it out: what only people read can be logged elsewhere.",
+                checkup.places.entry(name.rpartition("/")[2]),
+            )
 
 
 def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
@@ -89,7 +118,12 @@ def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
     rows = episodes.evaluate.get(name)
     if rows is None:
         raise CannotCheck(f"evaluate() has no entry {name}")
-    return rows.reshape(*rows.shape[:2], -1).astype(bool).any(axis=2)
+    return flags(rows)
+
+
+def flags(rows: NDArray) -> NDArray[np.bool_]:
+    """(T, K) of (T, K, ...)."""
+    return np.logical_or.reduce(rows.reshape(*rows.shape[:2], -1).astype(bool), axis=2)
 
 
 def of(count: int, total: int, what: str) -> str:
@@ -97,7 +131,7 @@ def of(count: int, total: int, what: str) -> str:
     return f"{count} of {total} {what}{'' if total == 1 else 's'}"
 
 
-def listed(values: list[int], most: int = 5) -> str:
+def listed(values: Sequence[object], most: int = 5) -> str:
     """``1, 2, 3 ...``."""
     return ", ".join(map(str, values[:most])) + (" ..." if len(values) > most else "")
 
@@ -106,6 +140,7 @@ CHECKS: Mapping[str, Check] = {
     "success-at-reset": success_at_reset,
     "success-stays-possible": success_stays_possible,
     "entry-name": entry_name,
+    "info-rows": info_rows,
     "success-and-fail": success_and_fail,
     "success-flickers": success_flickers,
 }

@@ -95,15 +95,15 @@ class Places:
                         found.update(part for part in ast.walk(node) if isinstance(part, ast.FunctionDef))
         return frozenset(found)
 
-    def entry(self, name: str) -> Place | None:
-        """Where ``evaluate`` makes this entry, as a key or a keyword; else its ``def``."""
-        for module, function in self.functions("evaluate"):
+    def entry(self, name: str, hook: str = "evaluate") -> Place | None:
+        """Where a hook makes this entry, as a key or a keyword; else its ``def``."""
+        for module, function in self.functions(hook):
             for node in ast.walk(function):
                 if isinstance(node, ast.Constant) and node.value == name:
-                    return module.place(node, "evaluate")
+                    return module.place(node, hook)
                 if isinstance(node, ast.keyword) and node.arg == name:
-                    return module.place(node.value, "evaluate")
-        return self.hook("evaluate")
+                    return module.place(node.value, hook)
+        return self.hook(hook)
 
     def body(self, name: str, *hooks: str) -> Place | None:
         """Where a body is made or placed.

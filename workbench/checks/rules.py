@@ -252,8 +252,8 @@ _TABLE = (
     Rule(
         "success-stays-possible",
         "warn",
-        "evaluate() has an entry success (or fail).",
-        "No episode ends early, and no success rate can be counted.",
+        "evaluate() has an entry success (or fail) if the reward is sparse.",
+        "The sparse reward is made of them: without them it is always 0.",
         "evaluate",
     ),
     Rule(
@@ -304,6 +304,13 @@ _TABLE = (
         "warn",
         "At success the dense reward is not lower than elsewhere in the same episode.",
         "Policies learn to avoid success.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "reward-needs-success",
+        "warn",
+        "The largest normalized reward is given at success only.",
+        "Policies learn to wait where they earn as much as at success.",
         "compute_dense_reward",
     ),
     # --- reproducibility -------------------------------------------------------------------------------------
@@ -395,8 +402,8 @@ _TABLE = (
     Rule(
         "camera-names",
         "warn",
-        "Cameras of task, robot and people have different names.",
-        "One of them is replaced silently, or its override fails.",
+        "Sensor cameras of the task and of its robot have different names.",
+        "The last one of a name replaces the others silently.",
         "_default_sensor_configs",
     ),
     Rule(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.authoring.problem import TaskError
-from workbench.checks import devices, evaluate, files, reward, source
+from workbench.checks import cameras, devices, evaluate, files, observation, reward, source
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
 from workbench.checks.results import RuleResult, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
@@ -31,6 +31,8 @@ GROUPS: tuple[Group, ...] = (
     Group("success", evaluate.CHECKS),
     Group("rewards", reward.CHECKS),
     Group("tensors", devices.CHECKS),
+    Group("observations", observation.CHECKS),
+    Group("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"

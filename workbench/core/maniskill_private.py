@@ -425,6 +425,11 @@ def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:
     return env._get_obs_state_dict(info)
 
 
+def extra_observation(env: BaseEnv, info: dict[str, Any]) -> Any:
+    """What the task adds to the robot's own observation: ``_get_obs_extra``. Runs the author's hook."""
+    return env._get_obs_extra(info)
+
+
 def cameras(env: Any) -> dict[CameraKey, Any]:
     """``_sensors``, tactile ones too, then ``_human_render_cameras``; an env without a render device has neither."""
     lists: tuple[tuple[CameraKind, str], ...] = (("sensor", "_sensors"), ("human", "_human_render_cameras"))
@@ -485,6 +490,18 @@ def camera_configs(env: Any) -> dict[CameraKey, Any]:
         **{("sensor", name): config for name, config in sensors.items()},
         **{("human", name): config for name, config in people.items()},
     }
+
+
+def sensor_configs_of_hooks(env: Any) -> tuple[list[Any], list[Any]]:
+    """Configs that the task's and the robot's sensor hooks return now, also those that one of the same name replaces."""
+    of_robot = [] if env.agent is None else env.agent._sensor_configs
+    return _listed(env._default_sensor_configs), _listed(of_robot)
+
+
+def _listed(configs: Any) -> list[Any]:
+    if isinstance(configs, dict):
+        return [*configs.values()]
+    return [*configs] if isinstance(configs, (list, tuple)) else [configs]
 
 
 def mark_camera_configs() -> None:

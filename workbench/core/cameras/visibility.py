@@ -11,6 +11,7 @@ import numpy as np
 import sapien.physx
 import sapien.render
 from mani_skill.utils.scene_builder import SceneBuilder
+from mani_skill.utils.structs.base import BaseStruct
 from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
@@ -102,7 +103,7 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
     fingers may be nearer. Without a ``tcp`` the last link comes first.
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
-    drawn = [body for body in reversed(robot.bodies) if _is_drawn(entities[body])]
+    drawn = [body for body in reversed(robot.bodies) if is_drawn(entities[body])]
     tools = [
         getattr(agent, "tcp", None)
         for agent in maniskill_private.agents(env)
@@ -120,14 +121,15 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
 
 def _carrier(entity: Any) -> Any:
     """The nearest drawn link from this one towards the root; None if there is none."""
-    while entity is not None and not _is_drawn(entity):
+    while entity is not None and not is_drawn(entity):
         link = entity.find_component_by_type(sapien.physx.PhysxArticulationLinkComponent)
         parent = None if link is None else link.parent
         entity = None if parent is None else parent.entity
     return entity
 
 
-def _is_drawn(entity: Any) -> bool:
+def is_drawn(entity: Any) -> bool:
+    """Whether a ``sapien.Entity`` has anything that cameras see."""
     body = None if entity is None else entity.find_component_by_type(sapien.render.RenderBodyComponent)
     return body is not None and len(body.render_shapes) > 0
 
@@ -363,5 +365,7 @@ def _built_by_scene_builders(env: Any) -> set[int]:
         listed: Any = getattr(builder, "scene_objects", None) or ()
         things: Collection[Any] = listed.values() if isinstance(listed, dict) else listed
         for thing in things:
-            entities.update(id(entity) for entity in maniskill_private.objects_of(thing))
+            # The builder of ManiSkill's planar worlds lists an ActorBuilder too.
+            if isinstance(thing, BaseStruct):
+                entities.update(id(entity) for entity in maniskill_private.objects_of(thing))
     return entities

@@ -1,0 +1,64 @@
+"""Rules of the sensor cameras, each with a task that breaks it and one that keeps it."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.checks.checked import Checked, check_rule, the_finding
+
+EYE = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])"
+CAMERA = '[CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
+
+
+def test_a_camera_that_looks_past_the_objects(checked: Checked, renderer: None) -> None:
+    away = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[1.5, 0, 0])"
+    result = checked("camera-sees", (EYE, away))
+    assert [finding.message.partition(" ")[0] for finding in result.findings] == ["cube", "goal"]
+    assert "8 of 8 pictures" in result.findings[0].message
+    assert result.findings[0].code.startswith("return [CameraConfig")
+    assert checked("camera-sees").state == "kept"
+
+
+def test_one_camera_of_several_may_see_an_object(checked: Checked, renderer: None) -> None:
+    away = "sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[1.5, 0, 0])"
+    two = CAMERA.replace("[", f'[CameraConfig("away", pose={away}, width=64, height=64, fov=1.0), ', 1)
+    assert checked("camera-sees", (CAMERA, two)).state == "kept"
+
+
+def test_a_body_that_only_carries_a_camera_need_not_be_seen(renderer: None) -> None:
+    assert check_rule("camera-sees", "MS-AntWalk-v1", num_envs=4, seeds=4).state == "skipped"
+
+
+def test_the_planar_worlds_of_maniskill_are_measured(renderer: None) -> None:
+    assert check_rule("camera-background", "MS-HopperHop-v1", num_envs=4, seeds=4).state == "kept"
+
+
+def test_a_camera_that_looks_at_the_sky(checked: Checked, renderer: None) -> None:
+    up = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 1.5])"
+    finding = the_finding(checked("camera-background", (EYE, up)))
+    assert "'base_camera'" in finding.message and finding.function == "_default_sensor_configs"
+    assert checked("camera-background").state == "kept"
+
+
+def test_a_camera_that_looks_straight_down(checked: Checked) -> None:
+    down = "pose = sapien_utils.look_at(eye=[0.1, 0, 0.6], target=[0.1, 0, 0])"
+    finding = the_finding(checked("camera-pose", (EYE, down)))
+    assert "length 0.707" in finding.message and finding.code.startswith("return [CameraConfig")
+    assert checked("camera-pose").state == "kept"
+
+
+@pytest.mark.parametrize("robot", ["panda", "panda_wristcam"])
+def test_two_cameras_of_one_name(checked: Checked, robot: str) -> None:
+    name = "base_camera" if robot == "panda" else "hand_camera"
+    second = CAMERA.replace("[", f'[CameraConfig("{name}", pose=pose, width=64, height=64, fov=1.0), ', 1)
+    supported = 'SUPPORTED_ROBOTS = ["panda", "fetch"]', 'SUPPORTED_ROBOTS = ["panda", "panda_wristcam"]'
+    finding = the_finding(checked("camera-names", (CAMERA, second), supported, robot_uids=robot))
+    assert repr(name) in finding.message
+    assert checked("camera-names", supported, robot_uids=robot).state == "kept"
+
+
+def test_a_camera_with_too_many_pixels(checked: Checked) -> None:
+    large = CAMERA.replace("width=128, height=128", "width=1920, height=1080")
+    finding = the_finding(checked("camera-size", (CAMERA, large)))
+    assert "1920 x 1080" in finding.message
+    assert checked("camera-size").state == "kept"

@@ -1,0 +1,202 @@
+"""Checks of the sensor cameras: what they see, and how they are set up."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evaluate import listed, of
+from workbench.core import maniskill_private
+from workbench.core.broken_rule import Place
+from workbench.core.camera_data import CameraKey
+from workbench.core.cameras.place import rows_of_pose
+from workbench.core.cameras.render import cameras_of, mount_of
+from workbench.core.cameras.report import CameraReport, join_reports
+from workbench.core.cameras.temporary import temporary_camera
+from workbench.core.cameras.visibility import (
+    SceneObject,
+    entities_of,
+    is_drawn,
+    list_objects,
+    measure,
+    placement_of,
+    placement_pose,
+    small_size,
+)
+from workbench.core.scene.scene_index import read_poses, scene_index
+
+RESETS = 4
+"""Resets of `Checkup.pictured` whose pictures are measured."""
+MOST_OBJECTS = 30
+"""Objects that are looked for: each takes a picture of its own."""
+MISSED_SHARE = 0.25
+"""Of the pictures in which an object may be out of view."""
+BACKGROUND_SHARE = 0.5
+MOST_PIXELS = 512 * 512
+UNIT = 1e-3
+"""Largest difference of a quaternion's length from 1."""
+
+
+def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over the pictures of all sensor cameras after some resets."""
+    reports = checkup.look(sensor_reports)
+    in_view: dict[str, list[Any]] = {}
+    uncovered: dict[str, list[Any]] = {}
+    for report in reports.values():
+        for thing in report.wanted_objects(None):
+            in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
+            uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
+    if not in_view:
+        raise CannotCheck("it has no objects beside the robot and the scenery")
+    covered: list[str] = []
+    for name, of_cameras in in_view.items():
+        missed = ~np.any(of_cameras, axis=0)
+        if missed.mean() > MISSED_SHARE:
+            yield Found(
+                f"{name} is out of view of every sensor camera ({', '.join(key[1] for key in reports)}) in "
+                f"{of(int(missed.sum()), missed.size, 'picture')} after a reset. Aim one at it: "
+                "`sapien_utils.look_at(eye=..., target=...)`, or widen its fov.",
+                _place(checkup, next(iter(reports))),
+                int(missed.sum()),
+            )
+        elif not np.any(uncovered[name]):
+            covered.append(name)
+    if covered:
+        yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
+
+
+def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over the pictures of sensor cameras that are not mounted on a body."""
+    reports = checkup.look(sensor_reports)
+    env = checkup.pictured.env
+    for key, report in reports.items():
+        share = float(report.depth.background.mean())
+        if mount_of(env, cameras_of(env)[key]) is None and share > BACKGROUND_SHARE:
+            yield Found(
+                f"{share:.0%} of the picture of sensor camera {key[1]!r} is empty background, whose depth is 0. Aim it "
+                "down at the scene, narrow its fov, or build a ground.",
+                _place(checkup, key),
+            )
+
+
+def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
+    """The poses that the hooks return."""
+    for config in _own_configs(checkup):
+        lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
+        if np.abs(lengths - 1).max() > UNIT:
+            yield Found(
+                f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its extrinsics are scaled. Give a "
+                "unit quaternion; if look_at() looks straight up or down, move the eye aside by 0.001 m.",
+                _site(checkup, config),
+            )
+
+
+def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
+    """The configs that the hooks of task and robot return."""
+    of_task, of_robot = checkup.look(sensor_configs)
+    robots = {config.uid for config in of_robot}
+    for name, count in Counter(config.uid for config in of_task).items():
+        if count > 1 or name in robots:
+            config = [config for config in of_task if config.uid == name][-1]
+            other = "the robot has one of that name too" if name in robots else f"{count} have that name"
+            yield Found(
+                f"sensor camera {name!r}: {other}, and only the last one is made. Rename it.",
+                _site(checkup, config),
+            )
+
+
+def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
+    """The configs that the task's hook returns."""
+    for config in _own_configs(checkup):
+        if config.width * config.height > MOST_PIXELS:
+            megabytes = config.width * config.height * 16 / 1e6
+            yield Found(
+                f"sensor camera {config.uid!r} has {config.width} x {config.height} pixels: its textures take about "
+                f"{megabytes * 4096 / 1000:.0f} GB in 4096 envs. Use 128 x 128, and a human camera for films.",
+                _site(checkup, config),
+            )
+
+
+# --- evidence ------------------------------------------------------------------------------------------------
+
+
+def sensor_configs(checkup: Checkup) -> tuple[list[Any], list[Any]]:
+    """Evidence for `Checkup.look`: configs of the task's and of the robot's sensor cameras. Needs no renderer."""
+    maniskill_private.mark_camera_configs()
+    checkup.reset(checkup.task, checkup.seeds[0])
+    with blamed("cameras", checkup.loaded, checkup.task):
+        of_task, of_robot = maniskill_private.sensor_configs_of_hooks(checkup.task.env)
+    return [c for c in of_task if hasattr(c, "width")], [c for c in of_robot if hasattr(c, "width")]
+
+
+def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
+    """Evidence for `Checkup.look`: what each sensor camera sees after each of the `RESETS`."""
+    task = checkup.pictured
+    sensors: list[CameraKey] = [key for key in cameras_of(task.env) if key[0] == "sensor"]
+    if not sensors:
+        raise CannotCheck("it has no sensor camera")
+    reports: dict[CameraKey, list[CameraReport]] = {key: [] for key in sensors}
+    objects = _objects(task.env)
+    for first in range(0, RESETS * task.num_envs, task.num_envs):
+        checkup.reset(task, checkup.seeds[0] + first)
+        for key in sensors:
+            for e in range(task.num_envs):
+                reports[key].append(_measured(task.env, e, key, objects))
+    return {key: join_reports(each) for key, each in reports.items()}
+
+
+def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> CameraReport:
+    placement, index = placement_of(env, key, e), scene_index(env)
+    settings = placement.settings
+    pose = placement_pose(placement, read_poses(env)[e], index)
+    with temporary_camera(env, e, "sensor", settings, small_size(settings.width, settings.height)) as view:
+        return measure(view, pose, e, objects, index, key, settings)
+
+
+def _objects(env: Any) -> list[SceneObject]:
+    """Robots and scenery, and the first objects that have anything to see: a body may only carry a camera."""
+    index, every = scene_index(env), list_objects(env)
+    drawn = [
+        thing
+        for thing in every
+        if any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
+    ]
+    scenery = [thing for thing in every if thing.robot or thing.scenery]
+    return [*scenery, *[thing for thing in drawn if thing not in scenery][:MOST_OBJECTS]]
+
+
+def _own_configs(checkup: Checkup) -> list[Any]:
+    of_task, _ = checkup.look(sensor_configs)
+    if not of_task:
+        raise CannotCheck("it has no sensor camera of its own")
+    return of_task
+
+
+def _place(checkup: Checkup, key: CameraKey) -> Place | None:
+    of_task, of_robot = checkup.look(sensor_configs)
+    for config in (*of_task, *of_robot):
+        if config.uid == key[1]:
+            return _site(checkup, config)
+    return checkup.places.hook("_default_sensor_configs")
+
+
+def _site(checkup: Checkup, config: Any) -> Place | None:
+    """Where the author's code makes a config; else the hook."""
+    site = maniskill_private.camera_site(config)
+    if site is None or site.file not in map(str, checkup.loaded.source_files):
+        return checkup.places.hook("_default_sensor_configs")
+    return site.file, site.line, site.function.rpartition(".")[2]
+
+
+CHECKS: Mapping[str, Check] = {
+    "camera-sees": camera_sees,
+    "camera-background": camera_background,
+    "camera-pose": camera_pose,
+    "camera-names": camera_names,
+    "camera-size": camera_size,
+}

@@ -1,0 +1,241 @@
+"""Checks of the observation: what a policy reads, and what it should or should not be told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, leaf_rows
+from workbench.checks.evaluate import listed, of
+from workbench.checks.odd_states import DENSE_HOOKS, odd_states, write_all
+from workbench.core import maniskill_private
+from workbench.core.broken_rule import Place
+from workbench.core.capture.recorded_state import read_states
+from workbench.core.capture.state_columns import flat_names, split_flat
+from workbench.core.env.evaluate_entries import split_entries
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.scene.scene_index import scene_index
+from workbench.core.simulation.state_layout import BODY
+from workbench.core.snapshots.snapshot import remembering
+
+HUGE = 1000.0
+MOVED = np.array([0.031, -0.043, 0.057], np.float32)
+"""Metres by which a body is moved, to see which numbers follow."""
+FOLLOWS = 1e-5
+"""Least change of a number that follows."""
+MOST_BODIES = 40
+"""Bodies that are moved one after the other."""
+
+
+def observation_finite(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts and odd states."""
+    for name, rows in _leaves(checkup).items():
+        bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
+        if bad.any():
+            step, env = (int(i) for i in np.argwhere(bad)[0])
+            yield Found(
+                f"{name!r} of the observation is not finite in {of(int(bad.any(axis=0).sum()), bad.shape[1], 'episode')}, "
+                f"first at step {step} of seed {checkup.random.seeds[env]}. Look for a division or a square root of "
+                "what can be 0, and clamp it.",
+                _place(checkup, name),
+                int(bad.sum()),
+            )
+            return
+    seen = checkup.look(odd_states)
+    for row, obs in enumerate(seen.obs):
+        for name, rows in obs.items():
+            bad = ~np.isfinite(rows).all(axis=1)
+            if bad.any():
+                env = int(np.flatnonzero(bad)[0])
+                yield Found(
+                    f"{name!r} of the observation is not finite {seen.kinds[row]} (seed {seen.seeds[row][env]}). Look "
+                    "for a division or a square root of what can be 0, and clamp it.",
+                    _place(checkup, name),
+                    int(bad.sum()),
+                )
+                return
+
+
+def observation_constant(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts and odd states: leaves in which no number ever changes."""
+    seen = checkup.look(odd_states)
+    for name, rows in _leaves(checkup).items():
+        odd = [obs[name] for obs in seen.obs if name in obs]
+        together = np.concatenate([rows.reshape(-1, rows.shape[2]), *odd])
+        if not together.size or not np.isfinite(together).all() or np.ptp(together, axis=0).max() > 0:
+            continue
+        value = together[0]
+        if np.isin(value, (0.0, 1.0)).all():
+            # A flag or a force, which random actions may never raise.
+            yield Note(f"{name!r} of the observation is {_text(value)} in all states that were tried")
+            continue
+        yield Found(
+            f"{name!r} of the observation is {_text(value)} in all of {len(together)} states, over "
+            f"{len(checkup.seeds)} seeds. Leave it out, or draw it anew in _initialize_episode.",
+            _place(checkup, name),
+        )
+
+
+def observation_huge(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts."""
+    for name, rows in _leaves(checkup).items():
+        size = np.abs(np.nan_to_num(rows, posinf=0, neginf=0))
+        huge = size.max(axis=2) > HUGE
+        if huge.any():
+            step, env = (int(i) for i in np.argwhere(huge)[0])
+            yield Found(
+                f"{name!r} of the observation is up to {size.max():.4g}, first at step {step} of seed "
+                f"{checkup.random.seeds[env]}. Give metres and radians, clamp it, or leave out what is hidden far away.",
+                _place(checkup, name),
+                int(huge.sum()),
+            )
+
+
+def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
+    """In a mode with pictures: each body that moves freely is moved, and the numbers that follow are found."""
+    told: dict[str, list[str]] = {}
+    for body, moved in checkup.look(followers).items():
+        if not moved.hidden:
+            for leaf in moved.observation:
+                told.setdefault(leaf, []).append(body)
+    for leaf, bodies in told.items():
+        yield Found(
+            f"{leaf!r} of _get_obs_extra() follows {listed(bodies)} in obs_mode "
+            f"{checkup.pictured.env.obs_mode!r}. Put it behind `if self.obs_mode_struct.use_state:`.",
+            _place(checkup, f"extra/{leaf}"),
+        )
+
+
+def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
+    """In a mode with pictures: each body that the task hides is moved, and what follows is found."""
+    bodies = {body: moved for body, moved in checkup.look(followers).items() if moved.hidden}
+    if not bodies:
+        raise CannotCheck("it hides nothing from pictures")
+    for body, moved in bodies.items():
+        if moved.meaning and not moved.observation:
+            yield Found(
+                f"{body} is hidden from pictures, {listed(sorted(moved.meaning))} of evaluate() or the reward depends "
+                "on where it is, and nothing in _get_obs_extra() does. Add its position there, in all modes.",
+                checkup.places.hook("_get_obs_extra"),
+            )
+
+
+# --- leaves by name ------------------------------------------------------------------------------------------
+
+
+def _leaves(checkup: Checkup) -> dict[str, NDArray[np.float64]]:
+    """(T + 1, K, D) of random rollouts by leaf; a flat observation is split by its names."""
+    obs = checkup.random.obs
+    names = flat_names(checkup.task, checkup.task.obs) if [*obs] == ["obs"] else None
+    if names is None:
+        return obs
+    parts = split_flat(names, obs["obs"])
+    return {name: rows.reshape(*rows.shape[:2], -1) for name, rows, _ in parts}
+
+
+def _place(checkup: Checkup, leaf: str) -> Place | None:
+    """Where the task makes a leaf."""
+    owner, _, name = leaf.partition("/")
+    if owner == "agent":
+        return checkup.places.hook("_get_obs_agent")
+    return checkup.places.entry(name.partition("/")[0] or leaf, "_get_obs_extra")
+
+
+def _text(value: NDArray[np.float64]) -> str:
+    shown = ", ".join(f"{number:.4g}" for number in value[:7])
+    return shown if len(value) == 1 else f"({shown}{', ...' if len(value) > 7 else ''})"
+
+
+# --- what follows a body that is moved -----------------------------------------------------------------------
+
+
+@dataclass
+class Followers:
+    """What changes with the place of one body, and nothing else."""
+
+    hidden: bool
+    """Whether the task hides the body from pictures."""
+    observation: set[str] = field(default_factory=set)
+    """Leaves of ``_get_obs_extra``."""
+    meaning: set[str] = field(default_factory=set)
+    """Entries of ``evaluate``, and ``the reward``."""
+
+
+def followers(checkup: Checkup) -> dict[str, Followers]:
+    """Evidence for `Checkup.look`: what follows each body that moves freely or is hidden, in a mode with pictures."""
+    task = checkup.pictured
+    checkup.reset(task, checkup.seeds[0])
+    env: Any = task.env
+    begun = read_states(env)
+    robots = {agent.robot.name for agent in maniskill_private.agents(env)}
+    hidden = {actor.name for actor in maniskill_private.hidden_objects(env)}
+    found: dict[str, Followers] = {}
+    with blamed("observation", checkup.loaded, task):
+        before = _ask(checkup, task)
+        again = _ask(checkup, task)
+        restless = _changed(before, again)
+        for name, struct in [*scene_index(env).states.items()][:MOST_BODIES]:
+            kind, _, body = name.partition("/")
+            free = body not in robots if kind == "articulations" else struct.px_body_type == "dynamic"
+            if not (free or body in hidden) or np.isnan(begun[name]).any():
+                continue
+            states = {other: rows.copy() for other, rows in begun.items()}
+            states[name][:, :3] += MOVED
+            if kind == "articulations":
+                joints = (states[name].shape[1] - BODY) // 2
+                states[name][:, BODY : BODY + joints] += 0.02
+            write_all(env, states)
+            moved = _changed(before, _ask(checkup, task)) - restless
+            found[body] = Followers(
+                body in hidden,
+                {leaf.removeprefix("obs/") for leaf in moved if leaf.startswith("obs/")},
+                {leaf for leaf in moved if not leaf.startswith("obs/")},
+            )
+            write_all(env, begun)
+    return found
+
+
+def _ask(checkup: Checkup, task: TaskEnv) -> dict[str, NDArray[np.float64]]:
+    """(N, D) of each leaf of ``_get_obs_extra`` (``obs/...``), each entry of ``evaluate``, and the reward."""
+    env = task.env
+    with remembering(env):
+        info = env.get_info()
+        extra = maniskill_private.extra_observation(env, info)
+        rows = {f"obs/{name}": value for name, value in leaf_rows(extra, task.num_envs).items()}
+        entries = split_entries(info, task.num_envs)[0]
+        rows |= {name: np.asarray(value, np.float64) for name, value in entries.items()}
+        if checkup.loaded.cls.compute_dense_reward is not BaseEnv.compute_dense_reward:
+            action = torch.zeros(env.action_space.shape or (), device=env.device)
+            observed: Any = {"extra": extra}
+            reward = getattr(env, DENSE_HOOKS["dense"])(obs=observed, action=action, info=info)
+            rows["the reward"] = torch.as_tensor(reward).double().numpy(force=True)
+    return rows
+
+
+def _changed(before: dict[str, NDArray[np.float64]], now: dict[str, NDArray[np.float64]]) -> set[str]:
+    return {
+        name
+        for name, rows in now.items()
+        if name in before
+        and rows.shape == before[name].shape
+        and np.abs(np.nan_to_num(rows) - np.nan_to_num(before[name])).max(initial=0) > FOLLOWS
+    }
+
+
+CHECKS: Mapping[str, Check] = {
+    "observation-finite": observation_finite,
+    "observation-constant": observation_constant,
+    "observation-huge": observation_huge,
+}
+PICTURE_CHECKS: Mapping[str, Check] = {
+    "ground-truth": ground_truth,
+    "hidden-goal": hidden_goal,
+}
+"""In an env that observes pictures, as the cameras."""

@@ -1,0 +1,183 @@
+"""States that random actions seldom reach: joints and bodies are put there, and the task's hooks are asked again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import sapien.physx
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
+from numpy.typing import NDArray
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.checks.checkup import Checkup, leaf_rows
+from workbench.core import maniskill_private
+from workbench.core.capture.recorded_state import read_states, write_states
+from workbench.core.env import actions
+from workbench.core.env.evaluate_entries import split_entries
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.scene.scene_index import scene_index
+from workbench.core.simulation.state_layout import BODY
+from workbench.core.snapshots.snapshot import remembering
+
+BATCHES = 2
+"""Batches of seeds whose states are changed."""
+AROUND = 0.15
+"""Metres beyond where bodies begin."""
+HIGHEST = 0.3
+"""Metres above where a body begins."""
+KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
+MOST_GOALS = 4
+"""A drawing has hundreds of marks."""
+AT_GOAL = "with bodies at the place of {}"
+DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
+
+States = dict[str, NDArray[np.float32]]
+"""(N, D) by name, as `read_states` gives them."""
+
+
+@dataclass
+class OddStates:
+    """What the hooks gave in R rounds of N envs. Rounds of one seed are of one episode: its goal stays."""
+
+    seeds: list[list[int]] = field(default_factory=list)
+    """(R, N)"""
+    kinds: list[str] = field(default_factory=list)
+    """(R,) where joints and bodies were, for a sentence."""
+    evaluate: list[dict[str, NDArray]] = field(default_factory=list)
+    """(R,) of (N, ...) each."""
+    reward: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    """(R, N) by reward mode: the present one, and the dense ones that the class has."""
+    obs: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
+    """(R,) of (N, D) by leaf, pictures left out."""
+
+
+def odd_states(checkup: Checkup) -> OddStates:
+    """Evidence for `Checkup.look`: the first seeds, in each of the `KINDS` and with the bodies at each goal."""
+    task, rng, seen = checkup.task, np.random.default_rng(0), OddStates()
+    for seeds in [*checkup.batches()][:BATCHES]:
+        checkup.reset(task, seeds)
+        begun = read_states(task.env)
+        rounds = [(kind, _changed(task.env, begun, kind, rng)) for kind in KINDS]
+        for goal in _goals(task.env)[:MOST_GOALS]:
+            rounds.append((AT_GOAL.format(goal.partition("/")[2]), _at(task.env, begun, goal)))
+        for kind, states in rounds:
+            write_all(task.env, states)
+            action = actions.random_action(task.parts, task.num_envs, rng)
+            seen.seeds.append(seeds)
+            seen.kinds.append(kind)
+            with blamed("step", checkup.loaded, task):
+                _ask(checkup, task, action, seen)
+    return seen
+
+
+def write_all(env: BaseEnv, states: States) -> None:
+    """Put all envs into these states."""
+    write_states(env, {i: {name: rows[i] for name, rows in states.items()} for i in range(env.num_envs)})
+
+
+def _ask(checkup: Checkup, task: TaskEnv, action: NDArray[np.float32], seen: OddStates) -> None:
+    for mode in reward_modes(checkup):
+        with remembering(task.env):
+            info = task.env.get_info()
+            obs: Any = task.env.get_obs(info, unflattened=True)
+            given: Any = None
+            if task.parts:
+                flat = actions.to_env_action(task.env, task.parts, action)
+                given = common.to_tensor(flat, device=task.env.device)
+            if mode == reward_modes(checkup)[0]:
+                seen.evaluate.append(split_entries(info, task.num_envs)[0])
+                seen.obs.append(leaf_rows(obs, task.num_envs))
+            hook = getattr(task.env, DENSE_HOOKS[mode]) if mode in DENSE_HOOKS else task.env.get_reward
+            reward = hook(obs=obs, action=given, info=info)
+        rows = torch.as_tensor(reward).double().numpy(force=True)
+        seen.reward.setdefault(mode, []).append(np.broadcast_to(rows, (task.num_envs,)).copy())
+
+
+def reward_modes(checkup: Checkup) -> list[str]:
+    """The present reward mode, then the dense ones that the class has."""
+    cls, present = checkup.loaded.cls, checkup.task.env.reward_mode
+    own = [mode for mode, hook in DENSE_HOOKS.items() if getattr(cls, hook) is not getattr(BaseEnv, hook)]
+    return [present, *(mode for mode in own if mode != present and mode in cls.SUPPORTED_REWARD_MODES)]
+
+
+# --- the states ----------------------------------------------------------------------------------------------
+
+
+def _changed(env: BaseEnv, begun: States, kind: str, rng: np.random.Generator) -> States:
+    if kind == KINDS[0]:
+        return begun
+    low, high = _box(env, begun)
+    states: States = {}
+    for name, rows in begun.items():
+        struct = scene_index(env).states.get(name)
+        states[name] = rows = rows.copy()
+        if struct is not None and name.startswith("articulations/"):
+            rows[:, BODY:] = _joints(struct, len(rows), rng, at_limits=kind == KINDS[2])
+        elif struct is not None and struct.px_body_type == "dynamic" and kind == KINDS[1]:
+            here = np.isfinite(rows).all(axis=1)
+            highest = rows[:, 2:3] + HIGHEST
+            places = np.concatenate([np.tile(low[:2], (len(rows), 1)), rows[:, 2:3]], axis=1)
+            spans = np.concatenate([np.tile(high[:2], (len(rows), 1)), highest], axis=1) - places
+            turned = rng.normal(size=(len(rows), 4))
+            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+            pose = np.concatenate([places + rng.random((len(rows), 3)) * spans, turned], axis=1)
+            rows[here, :7], rows[here, 7:] = pose[here], 0
+    return states
+
+
+def _box(env: BaseEnv, begun: States) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(3,) lowest and highest place of what moves, and `AROUND` it."""
+    places = [
+        rows[np.isfinite(rows).all(axis=1), :3]
+        for name, rows in begun.items()
+        if name.startswith("actors/") and scene_index(env).states[name].px_body_type == "dynamic"
+    ]
+    if not places:
+        return np.full(3, -AROUND, np.float32), np.full(3, AROUND, np.float32)
+    together = np.concatenate(places)
+    return together.min(axis=0) - AROUND, together.max(axis=0) + AROUND
+
+
+def _joints(articulation: Any, count: int, rng: np.random.Generator, at_limits: bool) -> NDArray[np.float32]:
+    """(N, 2 J) positions within the limits, and no velocity. A joint without limits turns or slides by up to pi."""
+    limits = np.array(articulation.get_qlimits().numpy(force=True), np.float32)
+    low, high = np.clip(np.broadcast_to(limits, (count, *limits.shape[1:])), -np.pi, np.pi).transpose(2, 0, 1)
+    share = rng.random(low.shape)
+    qpos = low + (high - low) * (np.round(share) if at_limits else share)
+    return np.concatenate([qpos, np.zeros_like(qpos)], axis=1).astype(np.float32)
+
+
+def _goals(env: BaseEnv) -> list[str]:
+    """Kinematic bodies without collision shapes: marks of where something is to go."""
+    return [
+        name
+        for name, struct in scene_index(env).states.items()
+        if name.startswith("actors/")
+        and struct.px_body_type == "kinematic"
+        and len(maniskill_private.envs_of(struct)) == env.num_envs
+        and not any(map(_collides, maniskill_private.objects_of(struct)))
+    ]
+
+
+def _collides(entity: Any) -> bool:
+    # Of a merged actor ManiSkill's `has_collision_shapes` raises.
+    body = entity.find_component_by_type(sapien.physx.PhysxRigidBaseComponent)
+    return body is not None and len(body.collision_shapes) > 0
+
+
+def _at(env: BaseEnv, begun: States, goal: str) -> States:
+    """Dynamic bodies above or below the goal, as high as they began in every other env, and at its height in the others."""
+    states: States = {}
+    for name, rows in begun.items():
+        states[name] = rows = rows.copy()
+        struct = scene_index(env).states.get(name)
+        if name.startswith("actors/") and struct is not None and struct.px_body_type == "dynamic":
+            here = np.isfinite(rows).all(axis=1)
+            place = begun[goal][:, :3].copy()
+            place[::2, 2] = rows[::2, 2]
+            rows[here, :3], rows[here, 7:] = place[here], 0
+    return states
