@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from workbench.authoring.problem import TaskError
-from workbench.checks import evaluate, reward
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
+from workbench.checks import evaluate, placement, reproduce, reward, scene
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of, raised
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.rules import Degree, Finding, reason_of_silence
 
@@ -47,8 +47,11 @@ class Group:
 
 
 GROUPS: tuple[Group, ...] = (
+    Group("resets", placement.CHECKS),
+    Group("the same again", reproduce.CHECKS),
     Group("success", evaluate.CHECKS),
     Group("rewards", reward.CHECKS),
+    Group("the scene", scene.CHECKS),
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"
@@ -72,13 +75,6 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
                 yield result_of("runs", degrees["runs"], [raised(error)])
             continue
         yield replace(result_of(rule, degrees[rule], seen), seconds=time.perf_counter() - began)
-
-
-def raised(error: TaskError) -> Found:
-    """What the task raised, as a breach of the rule `runs`."""
-    problem = error.problem
-    place = None if problem.file is None else (problem.file, problem.line or 1, problem.stage)
-    return Found(f"{problem.stage}: {problem.message}", place)
 
 
 def core_results(findings: list[Finding], degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
