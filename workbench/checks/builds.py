@@ -154,13 +154,16 @@ def shapes_of_env(built: list[Built], env: int) -> tuple[tuple[str, tuple[Shape,
 
 
 def _built(builder: Any, made: Any, pose: Any, files: Collection[str]) -> Built:
-    links = builder.link_builders if isinstance(builder, ArticulationBuilder) else [builder]
+    links: list[Any] = [builder]
+    if isinstance(builder, ArticulationBuilder):
+        links = builder.link_builders
+    scenes: Any = builder.scene_idxs
     return Built(
         name=str(made.name),
-        kind="articulation" if isinstance(made, Articulation) else str(builder.physx_body_type),
+        kind=getattr(builder, "physx_body_type", "articulation"),
         of_robot=_in_agent(),
         quaternion=None if pose is None else _quaternions(pose),
-        envs=tuple(int(i) for i in builder.scene_idxs),
+        envs=tuple(int(i) for i in scenes),
         place=author_place(files),
         collision=tuple(_shape(record) for link in links for record in link.collision_records),
         visual=tuple(_shape(record) for link in links for record in link.visual_records),

@@ -327,7 +327,7 @@ class Checkup:
 
 def put_where_built(task: TaskEnv) -> None:
     """Put all bodies where their builders put them, with joints at zero, as the GPU simulation begins."""
-    scene = task.env.scene
+    scene: Any = task.env.scene
     for actor in scene.actors.values():
         if actor.px_body_type != "static":
             actor.set_pose(actor.initial_pose)

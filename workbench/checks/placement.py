@@ -16,6 +16,7 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evaluate import listed, of
 from workbench.core.broken_rule import Place
+from workbench.core.env.actions import random_action
 from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
 from workbench.core.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
 
@@ -41,15 +42,17 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
     """Whether partial resets fail or change other envs, where the source makes tensors of self.num_envs rows."""
     if checkup.num_envs < 2:
         raise CannotCheck("it needs two envs")
-    seen = len(checkup.findings)
     failed: TaskError | None = None
     try:
-        checkup.reset(checkup.task, list(range(checkup.num_envs)))
+        task, rng = checkup.task, np.random.default_rng(4)
+        checkup.reset(task, list(range(checkup.num_envs)))
+        # So that what is kept for each env differs from what a reset gives it.
+        checkup.step(task, random_action(task.parts, task.num_envs, rng))
         for chosen in ([0], list(range(1, checkup.num_envs))):
-            checkup.reset(checkup.task, None, chosen)
+            checkup.reset(task, None, chosen)
     except TaskError as error:
         failed = error
-    broken = {(each.file, each.function) for each in checkup.findings[:seen] + checkup.findings[seen:]}
+    broken = {(each.file, each.function) for each in checkup.findings}
     for module, function in checkup.places.functions("_initialize_episode"):
         if failed is None and (module.file, function.name) not in broken:
             continue
@@ -97,11 +100,15 @@ def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
     for first, second in deepest.values():
         seeds = seeds_of[first, second]
         mover = second if first in fixed or "/" in first else first
+        advice = (
+            f"Place {mover} higher: on a table of height 0, the middle of a body is at half its height."
+            if not fixed.isdisjoint((first, second))
+            else f"Place {mover} further away, or draw again while they are too near."
+        )
         yield Found(
             f"{first} and {second} are {1000 * depths[first, second]:.0f} mm inside each other after the reset of "
-            f"{of(len(seeds), len(checkup.overlaps), 'seed')} (seed {listed(seeds)}). Place {mover} further away: a "
-            "body on a table of height 0 has its middle at half its height.",
-            checkup.places.body(mover, "_initialize_episode"),
+            f"{of(len(seeds), len(checkup.overlaps), 'seed')} (seed {listed(seeds)}). {advice}",
+            _where_placed(checkup, mover),
             len(seeds),
         )
 
@@ -110,7 +117,8 @@ def falls_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
     """Over all seeds, while the robot holds still for a second."""
     index, still = scene_index(checkup.task.env), checkup.still
     robots = _robots(checkup)
-    wanted = _start_moving(checkup)
+    # What a hand holds may slip, and what is pushed out of the robot has a rule of its own.
+    wanted = _start_moving(checkup) | _touched(checkup, robots)
     before, after = still.poses[0], still.poses[-1]
     for body, name in enumerate(index.names):
         loose = index.kinds[body] == "dynamic" or (
@@ -133,7 +141,7 @@ def falls_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
             f"{name} {how} {moved[worst]:.2f} m and turns {np.degrees(turned[worst]):.0f} degrees in the first second of "
             f"{of(len(seeds), len(bad), 'seed')} (seed {listed(seeds)}) while the robot holds still. Place it where it "
             "rests.",
-            checkup.places.body(index.owners[body], "_initialize_episode"),
+            _where_placed(checkup, index.owners[body]),
             len(seeds),
         )
 
@@ -194,7 +202,7 @@ def outside_reach(checkup: Checkup) -> Iterator[Found | Note]:
             yield Found(
                 f"{name} is up to {distance.max():.2f} m from the robot's base, whose tcp reaches {reach:.2f} m, in "
                 f"{of(len(seeds), len(beyond), 'seed')} (seed {listed(seeds)}). Narrow the range in which it is placed.",
-                checkup.places.body(name, "_initialize_episode"),
+                _where_placed(checkup, name),
                 len(seeds),
             )
 
@@ -281,6 +289,13 @@ def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], P
             yield each.name, each.quaternions, each.place
 
 
+def _where_placed(checkup: Checkup, body: str) -> Place | None:
+    """The author's line that sets its pose in a reset."""
+    owner = body.split("/", 1)[0]
+    lines = [each.place for each in checkup.placed if each.name == owner and each.place is not None]
+    return lines[-1] if lines else checkup.places.body(body, "_initialize_episode")
+
+
 def _text(quaternion: NDArray[np.float32]) -> str:
     return "(" + ", ".join(f"{number:.3g}" for number in quaternion) + ")"
 
@@ -312,6 +327,16 @@ def _start_moving(checkup: Checkup) -> set[str]:
     return moving
 
 
+def _touched(checkup: Checkup, robots: set[str]) -> set[str]:
+    """Names of what touches a robot after the reset of some seed."""
+    pairs = [
+        [body.split("/", 1)[0] for body in overlap.bodies]
+        for overlaps in checkup.overlaps.values()
+        for overlap in overlaps
+    ]
+    return {owner for pair in pairs if not robots.isdisjoint(pair) for owner in pair}
+
+
 def _is_fixed(articulation: Any) -> bool:
     """Whether its root cannot move."""
     return all(each.links[0].joint.type == "fixed" for each in objects_of(articulation))
@@ -320,8 +345,10 @@ def _is_fixed(articulation: Any) -> bool:
 def _immovable(checkup: Checkup) -> set[str]:
     """Bodies that no contact moves: static and kinematic ones, and links between which and a fixed root no joint is."""
     index: SceneIndex = scene_index(checkup.task.env)
-    found = {name for name, kind in zip(index.names, index.kinds, strict=True) if kind in ("static", "kinematic")}
-    for owner, articulation in checkup.task.env.scene.articulations.items():
+    found = {
+        name for name, kind in zip(index.names, index.kinds, strict=True) if kind in ("static", "kinematic")
+    }
+    for articulation in checkup.task.env.scene.articulations.values():
         for link in objects_of(articulation)[0].links:
             name, above = index.name_of(link), link
             while above is not None and above.joint.type == "fixed":

@@ -158,13 +158,14 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
         names = [name.split("/", 1)[1] for name in partial]
         merge = next((part[name] for name in names if name in part), None)
         rows = sorted({len(envs_of(index.states[name])) for name in partial})
+        several = f"{names[0]} and {len(names) - 1} more have"
         advice = (
             f"Merge those that stand for one body: Actor.merge([...], name={names[0].rstrip('0123456789_-')!r}), and"
             if merge is None
             else "After the merge,"
         )
         yield Found(
-            f"{listed(names)} {'has' if len(names) == 1 else 'have'} {listed(rows)} rows in the state of {count} envs. "
+            f"{f'{names[0]} has' if len(names) == 1 else several} {listed(rows)} rows in the state of {count} envs. "
             f"{advice} call self.remove_from_state_dict_registry(part) for each part and "
             "self.add_to_state_dict_registry(merged).",
             merge.place if merge is not None and merge.place else places.get(names[0]),
