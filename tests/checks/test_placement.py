@@ -38,7 +38,9 @@ def test_a_cube_above_the_table(checked: Checked) -> None:
 
 
 def test_a_cube_that_is_thrown_may_fly(checked: Checked) -> None:
-    thrown = f"{CUBE_POSE}\n            self.cube.set_linear_velocity(torch.tensor([[0.5, 0, 0]]).repeat(b, 1))"
+    thrown = (
+        f"{CUBE_POSE}\n            self.cube.set_linear_velocity(torch.tensor([[0.5, 0, 0]]).repeat(b, 1))"
+    )
     assert checked("falls-at-reset", (CUBE_POSE, thrown)).state == "kept"
 
 
@@ -76,9 +78,7 @@ def test_half_a_turn_is_noted_only(checked: Checked) -> None:
 def test_quaternions_of_scipy(checked: Checked) -> None:
     scipy = "Rotation.identity(b).as_quat({})"
     lines = "from scipy.spatial.transform import Rotation\n            {}\n            " + CUBE_POSE
-    finding = the_finding(
-        checked("quaternion-order", (CUBE_POSE, lines.format("q = " + scipy.format(""))))
-    )
+    finding = the_finding(checked("quaternion-order", (CUBE_POSE, lines.format("q = " + scipy.format("")))))
     assert "as_quat() gives x, y, z, w" in finding.message
     first = lines.format("q = " + scipy.format("scalar_first=True"))
     assert checked("quaternion-order", (CUBE_POSE, first)).state == "kept"
@@ -108,6 +108,9 @@ def test_a_robot_that_cannot_hold_itself(checked: Checked) -> None:
 
 
 def test_a_cube_that_is_sometimes_too_far(checked: Checked) -> None:
-    edit = "cube[:, 2] = CUBE_HALF_SIZE\n", "cube[:, 2] = CUBE_HALF_SIZE\n            cube[:, 0] += torch.rand(b)\n"
+    edit = (
+        "cube[:, 2] = CUBE_HALF_SIZE\n",
+        "cube[:, 2] = CUBE_HALF_SIZE\n            cube[:, 0] += torch.rand(b)\n",
+    )
     finding = the_finding(checked("outside-reach", edit))
     assert "cube is up to" in finding.message and 0 < finding.count < 8 and finding.code == CUBE_POSE

@@ -24,18 +24,23 @@ def test_a_partial_reset_that_fails(checked: Checked) -> None:
 
 
 def test_unseeded_numbers(checked: Checked) -> None:
-    finding = the_finding(checked("same-seed", (DRAWN, "torch.tensor(np.random.rand(b, 2)).float()"), seeds=4))
+    finding = the_finding(
+        checked("same-seed", (DRAWN, "torch.tensor(np.random.rand(b, 2)).float()"), seeds=4)
+    )
     assert finding.degree == "stop" and "np.random.rand is not seeded" in finding.message
     assert "actors/cube" in finding.message and "np.random.rand" in finding.code
 
 
 def test_a_value_that_only_the_first_reset_draws(checked: Checked) -> None:
-    edits = (DRAWN, "self.drawn()"), (
-        "    def evaluate(self)",
-        "    def drawn(self):\n"
-        "        self.count = getattr(self, 'count', 0) + 1\n"
-        "        return torch.full((1, 2), 0.01 * self.count)\n\n"
-        "    def evaluate(self)",
+    edits = (
+        (DRAWN, "self.drawn()"),
+        (
+            "    def evaluate(self)",
+            "    def drawn(self):\n"
+            "        self.count = getattr(self, 'count', 0) + 1\n"
+            "        return torch.full((1, 2), 0.01 * self.count)\n\n"
+            "    def evaluate(self)",
+        ),
     )
     assert "actors/cube" in the_finding(checked("same-seed", *edits, seeds=4)).message
 
@@ -43,7 +48,10 @@ def test_a_value_that_only_the_first_reset_draws(checked: Checked) -> None:
 def test_a_goal_that_is_in_no_state(checked: Checked) -> None:
     kept = (
         (GOAL_POSE, "self.goal_pos[env_idx] = goal"),
-        ('self.goal = builder.build_kinematic(name="goal")', "self.goal_pos = torch.zeros((self.num_envs, 3))"),
+        (
+            'self.goal = builder.build_kinematic(name="goal")',
+            "self.goal_pos = torch.zeros((self.num_envs, 3))",
+        ),
         ("self.goal.pose.p[:, :2]", "self.goal_pos[:, :2]"),
         ("self.goal.pose.p", "self.goal_pos"),
     )
@@ -65,14 +73,17 @@ def test_random_pushes_in_a_step(checked: Checked) -> None:
 
 
 def test_sizes_that_depend_on_the_number_of_envs(checked: Checked) -> None:
-    many = """for i in range(self.num_envs):
+    many = (
+        """for i in range(self.num_envs):
             size = {}
             each = self.scene.create_actor_builder()
             each.add_box_collision(half_size=[size] * 3)
             each.initial_pose = sapien.Pose(p=[0.4, 0.4, 0.5])
             each.set_scene_idxs([i])
             each.build_static(name=f"box_{{i}}")
-        """ + SIZE
+        """
+        + SIZE
+    )
     finding = the_finding(
         checked("same-for-any-batch", (SIZE, many.format("0.02 + 0.01 * float(torch.rand(1))")), seeds=4)
     )

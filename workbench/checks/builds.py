@@ -30,8 +30,6 @@ class Shape:
     """``box sphere capsule cylinder plane file convex_mesh nonconvex_mesh multiple_convex_meshes``"""
     file: str
     """Of a mesh, else empty."""
-    decomposition: str
-    """``none`` or ``coacd``"""
     numbers: tuple[float, ...]
     """Sizes, pose in the body, colour or friction."""
 
@@ -192,7 +190,6 @@ def _shape(record: Any) -> Shape:
     return Shape(
         record.type,
         str(record.filename or ""),
-        str(getattr(record, "decomposition", "none")),
         tuple(round(float(number), 5) for number in numbers),
     )
 

@@ -26,7 +26,7 @@ from workbench.core.env.evaluate_entries import flat_entries
 from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.maniskill_private import apply_and_fetch
+from workbench.core.maniskill_private import apply_and_fetch, fetch
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.scene_index import scene_index
 
@@ -304,6 +304,7 @@ class Checkup:
         """One substep of physics: the contacts that it finds are those of the state before it."""
         with blamed("step", self.loaded, task):
             task.env.scene.step()
+            fetch(task.env)
 
     def _episodes(self, choose: Callable[[TaskEnv, int], Any], steps: int) -> Episodes:
         together: list[Episodes] = []

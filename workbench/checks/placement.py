@@ -100,11 +100,15 @@ def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
     for first, second in deepest.values():
         seeds = seeds_of[first, second]
         mover = second if first in fixed or "/" in first else first
-        advice = (
-            f"Place {mover} higher: on a table of height 0, the middle of a body is at half its height."
-            if not fixed.isdisjoint((first, second))
-            else f"Place {mover} further away, or draw again while they are too near."
-        )
+        still = [body for body in (first, second) if body in fixed and "/" not in body]
+        if "/" in mover:
+            advice = "Raise its root, or reset it to joint positions with which it touches nothing."
+        elif still:
+            advice = (
+                f"Place {mover} higher: on a table of height 0, the middle of a body is at half its height."
+            )
+        else:
+            advice = f"Place {mover} further away, or draw again while they are too near."
         yield Found(
             f"{first} and {second} are {1000 * depths[first, second]:.0f} mm inside each other after the reset of "
             f"{of(len(seeds), len(checkup.overlaps), 'seed')} (seed {listed(seeds)}). {advice}",

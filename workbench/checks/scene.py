@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ DEEP_AT_LOAD = 0.005
 """Metres."""
 MOST_LINKS = 64
 MOST_TRIANGLES = 100_000
+_RESETS = ("_initialize_episode", "_load_scene", "_load_agent", "set_state_dict", "set_state")
 STILL = 1e-5
 """Metres, and numbers of a quaternion."""
 
@@ -39,13 +41,17 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """Of what was built: bodies that collide. Others cannot hurt."""
+    unposed: dict[Place | None, list[str]] = {}
     for each in _own(checkup):
         if each.quaternion is None and each.collision:
-            yield Found(
-                f"{each.name} is built without an initial pose, at the origin. Set "
-                "`builder.initial_pose = sapien.Pose(p=[...])` before it is built, to a place where it touches nothing.",
-                each.place,
-            )
+            unposed.setdefault(each.place, []).append(each.name)
+    for place, names in unposed.items():
+        yield Found(
+            f"{_several(names)} built without an initial pose, at the origin. Set "
+            "`builder.initial_pose = sapien.Pose(p=[...])` before it is built, to a place where it touches nothing.",
+            place,
+            len(names),
+        )
 
 
 def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
@@ -68,20 +74,28 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def kinematic_never_moved(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over the resets of all seeds and random episodes."""
+    """Over the resets of all seeds and random episodes, where no hook of a step sets a pose: it may do so later."""
+    if any(
+        _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
+    ):
+        raise CannotCheck("it sets poses in a step")
     index = scene_index(checkup.task.env)
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])
-    # Episodes of one env: a merged body may be elsewhere in each.
-    rows = poses.reshape(len(poses), -1, checkup.num_envs, *poses.shape[2:])
-    moved = (np.nan_to_num(rows.max(axis=(0, 1)) - rows.min(axis=(0, 1))) > STILL).any(axis=(0, 2))
+    if poses.shape[1] < 2:
+        raise CannotCheck("it needs two seeds")
+    moved = (np.nan_to_num(poses.max(axis=(0, 1)) - poses.min(axis=(0, 1))) > STILL).any(axis=1)
     own = {each.name: each for each in _own(checkup) if each.kind == "kinematic"}
+    still: dict[Place | None, list[str]] = {}
     for body, name in enumerate(index.names):
         if name in own and index.kinds[body] == "kinematic" and not moved[body] and not index.hidden[body]:
-            yield Found(
-                f"{name} is kinematic and at the same pose in every reset and step. Build it with "
-                f"`builder.build_static(name={name!r})` at its initial_pose, and do not set its pose.",
-                own[name].place,
-            )
+            still.setdefault(own[name].place, []).append(name)
+    for place, names in still.items():
+        yield Found(
+            f"{_several(names)} kinematic and at the same pose in every reset and step. Build it with "
+            f"`builder.build_static(name={names[0]!r})` at its initial_pose, and do not set its pose.",
+            place,
+            len(names),
+        )
 
 
 def body_names(checkup: Checkup) -> Iterator[Found | Note]:
@@ -126,15 +140,21 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of what was built."""
-    for each in _own(checkup):
-        files = {shape.file for shape in each.collision if shape.decomposition != "none"}
-        for file in sorted(files):
-            yield Found(
-                f"{each.name} asks for a convex decomposition of {Path(file).name} where it is built. Make it once, ship "
-                f"the file ({Path(file).name}.coacd.ply), and load that with decomposition='none'.",
-                each.place,
-            )
+    """Of the source: building would need the package that decomposes."""
+    for module, function in checkup.places.functions():
+        for node in ast.walk(function):
+            for keyword in node.keywords if isinstance(node, ast.Call) else ():
+                value = keyword.value
+                if (
+                    keyword.arg == "decomposition"
+                    and isinstance(value, ast.Constant)
+                    and value.value != "none"
+                ):
+                    yield Found(
+                        f"a mesh is decomposed with {value.value} where it is built. Do it once, ship the file that it "
+                        "writes beside the mesh (.coacd.ply), and load that with decomposition='none'.",
+                        module.place(value, function.name),
+                    )
 
 
 def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
@@ -158,14 +178,13 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
         names = [name.split("/", 1)[1] for name in partial]
         merge = next((part[name] for name in names if name in part), None)
         rows = sorted({len(envs_of(index.states[name])) for name in partial})
-        several = f"{names[0]} and {len(names) - 1} more have"
         advice = (
             f"Merge those that stand for one body: Actor.merge([...], name={names[0].rstrip('0123456789_-')!r}), and"
             if merge is None
             else "After the merge,"
         )
         yield Found(
-            f"{f'{names[0]} has' if len(names) == 1 else several} {listed(rows)} rows in the state of {count} envs. "
+            f"{_several(names, 'has', 'have')} {listed(rows)} rows in the state of {count} envs. "
             f"{advice} call self.remove_from_state_dict_registry(part) for each part and "
             "self.add_to_state_dict_registry(merged).",
             merge.place if merge is not None and merge.place else places.get(names[0]),
@@ -194,19 +213,6 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
-def frequencies(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the settings."""
-    env = checkup.task.env
-    if env.sim_freq % env.control_freq:
-        substeps = env.sim_freq // env.control_freq
-        yield Found(
-            f"sim_freq {env.sim_freq} is no multiple of control_freq {env.control_freq}: a control step is "
-            f"{substeps} substeps, {substeps / env.sim_freq:.4f} s, and not {1 / env.control_freq:.4f} s. Choose, say, "
-            f"sim_freq={env.control_freq * max(1, substeps)}.",
-            _settings(checkup),
-        )
-
-
 def env_spacing(checkup: Checkup) -> Iterator[Found | Note]:
     """Over the resets of all seeds and random episodes."""
     index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
@@ -226,6 +232,22 @@ def env_spacing(checkup: Checkup) -> Iterator[Found | Note]:
             _settings(checkup),
             count,
         )
+
+
+def _sets_a_pose(function: ast.FunctionDef) -> bool:
+    """Whether it calls set_pose or set_state, or assigns a pose."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if node.func.attr in ("set_pose", "set_state", "set_state_dict"):
+                return True
+        elif isinstance(node, ast.Assign):
+            if any(isinstance(to, ast.Attribute) and to.attr == "pose" for to in node.targets):
+                return True
+    return False
+
+
+def _several(names: list[str], one: str = "is", many: str = "are") -> str:
+    return f"{names[0]} {one}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more {many}"
 
 
 def _settings(checkup: Checkup) -> Place | None:
@@ -277,6 +299,5 @@ CHECKS: Mapping[str, Check] = {
     "heavy-mesh": heavy_mesh,
     "merged-actors": merged_actors,
     "reconfigures": reconfigures,
-    "frequencies": frequencies,
     "env-spacing": env_spacing,
 }
