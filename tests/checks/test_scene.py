@@ -110,14 +110,12 @@ def meshed(file: Path, call: str) -> tuple[str, str]:
 
 def open_box() -> trimesh.Trimesh:
     """Four walls and a floor."""
-    sides = [((0.2, 0.2, 0.01), (0, 0, 0))]
+    floor = trimesh.creation.box(extents=(0.2, 0.2, 0.01))
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        sides.append(((0.01, 0.2, 0.1) if x else (0.2, 0.01, 0.1), (0.1 * x, 0.1 * y, 0.05)))
-    made = []
-    for extents, at in sides:
-        side = trimesh.creation.box(extents=extents)
-        made.append(side.apply_translation(at))
-    return trimesh.util.concatenate(made)
+        wall = trimesh.creation.box(extents=(0.01, 0.2, 0.1) if x else (0.2, 0.01, 0.1))
+        wall.apply_translation((0.1 * x, 0.1 * y, 0.05))
+        floor = floor + wall
+    return floor
 
 
 def test_a_box_that_its_hull_closes(checked: Checked, tmp_path: Path) -> None:
