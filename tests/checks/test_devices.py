@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from tests.checks.checked import Checked, check_rules, the_finding
-from workbench.checks.rules import RULES
+from tests.checks.checked import Checked, the_finding
 from workbench.checks.run import RuleResult
-
-BROKEN = Path(__file__).parents[2] / "tasks" / "broken"
 
 AT = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 WITH_DEVICE = "        with torch.device(self.device):\n            b = len(env_idx)\n"
@@ -140,23 +135,3 @@ def test_a_reset_and_a_build_without_a_device(checked: Checked) -> None:
     kept = buffer, f"{buffer}        self.best = torch.zeros(self.num_envs)\n"
     finding = the_finding(checked("foreign-device", kept, (AT, f"{AT}        self.best + distance\n")))
     assert "made in line" in finding.message and finding.code == "self.best + distance"
-
-
-@pytest.mark.parametrize(
-    ("name", "rule", "line", "besides"),
-    (
-        ("tip_block", "loop-over-envs", "for i in range(self.num_envs):", set()),
-        ("gather_blocks", "unknown-name", "builder.inital_pose =", {"initial-pose", "robot-pose"}),
-        ("hover_over_cube", "foreign-device", "wanted = self.cube.pose.p + torch.tensor(", set()),
-        ("nudge_ball", "device-copies", "near = [1 - min(each.item(), 1)", {"loop-over-envs"}),
-    ),
-)
-def test_each_small_task_has_its_mistake_and_no_other(
-    name: str, rule: str, line: str, besides: set[str]
-) -> None:
-    results = check_rules(RULES, str(BROKEN / f"{name}.py"), num_envs=4, seeds=4)
-    assert the_finding(results[rule]).code.startswith(line)
-    broken = {each for each, result in results.items() if result.state == "broken"}
-    assert {each for each in broken if RULES[each].degree == "stop"} == set()
-    assert broken - {rule} <= besides
-    assert not [result for result in results.values() if result.state == "failed"]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
+from workbench.checks.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
 from workbench.checks.places import Places
 from workbench.checks.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.core.backends import find_renderer
@@ -27,6 +28,7 @@ from workbench.core.env.evaluate_entries import flat_entries
 from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.maniskill_private import apply_and_fetch, fetch
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.scene_index import scene_index
 
@@ -36,6 +38,9 @@ STILL_SECONDS = 1.0
 """How long the robot holds still."""
 PICTURED_ENVS = 2
 """Envs that observe pictures: a reset renders all of their cameras."""
+FIRST_BUILT_SEED = 2022
+"""With which BaseEnv's constructor builds env 0; env i with the i-th after it."""
+SEEDS_ALONE = 2
 MOST_OBS = 4096
 """Leaves of an observation with more numbers per env are pictures."""
 
@@ -94,6 +99,18 @@ class Overlap:
     """Metres."""
 
 
+@dataclass(frozen=True)
+class Alone:
+    """What one env alone builds."""
+
+    shapes: dict[int, tuple[Any, ...]]
+    """`shapes_of_env` by seed."""
+    rebuilds: bool
+    """Whether it is rebuilt at resets."""
+    overlaps: tuple[Overlap, ...]
+    """Where everything is built, before the first reset."""
+
+
 @dataclass
 class Episodes:
     """What was seen of K episodes over T control steps; episode k began with seed ``seeds[k]``. Leading dimension T + 1 for
@@ -143,6 +160,10 @@ class Checkup:
         """Breaches of the rules of GPU simulation, seen in all that ran so far."""
         self.failed: dict[str, TaskError] = {}
         """What raised, by the name of the evidence."""
+        self.files = frozenset(str(file) for file in loaded.source_files)
+        self.builds: list[Built] = []
+        """What `task` has built."""
+        self.merges: list[Merged] = []
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
         self._looked: dict[Callable[[Checkup], Any], Any] = {}
@@ -175,7 +196,8 @@ class Checkup:
     @evidence
     def task(self) -> TaskEnv:
         """`num_envs` envs without a renderer, which check the rules of GPU simulation. Whoever uses it resets it first."""
-        made = self._made(self.num_envs, False, "warn", {})
+        with noting_builds(self.builds, self.merges, self.files):
+            made = self._made(self.num_envs, False, "warn", {})
         self._open.append(made)
         return made
 
@@ -299,10 +321,37 @@ class Checkup:
                     self.step(task, action)
         return watch.uses
 
+    def alone(self) -> Alone:
+        """Of the seeds with which the first envs of `task` were built."""
+        seeds = [FIRST_BUILT_SEED + i for i in range(min(SEEDS_ALONE, self.num_envs))]
+        built: list[Built] = []
+        shapes: dict[int, tuple[Any, ...]] = {}
+        with noting_builds(built, [], self.files), self.env(1) as task:
+            rebuilds = task.env.reconfiguration_freq != 0
+            for seed in seeds:
+                if shapes:
+                    built.clear()
+                    with blamed("reset", self.loaded, task):
+                        task.reset(seed, options={"reconfigure": True})
+                shapes[seed] = shapes_of_env(built, 0)
+            put_where_built(task)
+            self.first_substep(task)
+            return Alone(shapes, rebuilds, overlaps_of(task, 0))
+
+    @evidence
+    def placed(self) -> list[Placed]:
+        """The poses that are set in a reset of the first seeds."""
+        placed: list[Placed] = []
+        task = self.task
+        with noting_poses(placed, self.files):
+            self.reset(task, next(self.batches()))
+        return placed
+
     def first_substep(self, task: TaskEnv) -> None:
         """One substep of physics: the contacts that it finds are those of the state before it."""
         with blamed("step", self.loaded, task):
             task.env.scene.step()
+            fetch(task.env)
 
     def _episodes(self, choose: Callable[[TaskEnv, int], Any], steps: int) -> Episodes:
         together: list[Episodes] = []
@@ -322,6 +371,25 @@ class Checkup:
                 over |= ended
             together.append(_stacked(seeds, states, rewards, obs, length))
         return _joined(together)
+
+
+def put_where_built(task: TaskEnv) -> None:
+    """Put all bodies where their builders put them, with joints at zero, as the GPU simulation begins."""
+    scene: Any = task.env.scene
+    for actor in scene.actors.values():
+        if actor.px_body_type != "static":
+            actor.set_pose(actor.initial_pose)
+    for articulation in scene.articulations.values():
+        articulation.set_pose(articulation.initial_pose)
+        articulation.set_qpos(articulation.get_qpos() * 0)
+    apply_and_fetch(task.env)
+
+
+def raised(error: TaskError) -> Found:
+    """What the task raised, as a breach of the rule `runs`."""
+    problem = error.problem
+    place = None if problem.file is None else (problem.file, problem.line or 1, problem.stage)
+    return Found(f"{problem.stage}: {problem.message}", place)
 
 
 def read_obs(task: TaskEnv) -> dict[str, NDArray[np.float64]]:

@@ -98,14 +98,14 @@ _TABLE = (
         "initial-pose",
         "warn",
         "Every builder has an initial_pose before it is built.",
-        "Bodies are built inside each other at the origin; on the GPU that first collision can stay in the simulation.",
+        "Bodies are built inside each other at the origin, and the GPU's simulation makes its first step there.",
         "_load_scene",
     ),
     Rule(
         "overlap-at-load",
         "warn",
         "Bodies do not overlap where they are built, before the first reset.",
-        "The GPU's simulation may begin with an explosion and needs more memory for contacts.",
+        "The GPU's simulation makes its first step there: it may begin with an explosion, and needs more memory for contacts.",
         "_load_scene",
     ),
     Rule(
@@ -119,7 +119,7 @@ _TABLE = (
         "body-names",
         "warn",
         "Bodies have names, each its own.",
-        "ManiSkill overwrites the first body of that name in the state, so it is neither saved nor restored.",
+        "The second that is merged under a name takes the place of the first, in the scene and in the state.",
         "_load_scene",
     ),
     Rule(
@@ -140,7 +140,7 @@ _TABLE = (
         "decomposition-at-load",
         "warn",
         "Convex decompositions are made once, not at every build.",
-        "Every process that makes the task waits for it, seconds to minutes a mesh.",
+        "The first process on each machine waits for it, seconds to minutes a mesh, and needs the package coacd.",
         "_load_scene",
     ),
     Rule(
@@ -163,13 +163,6 @@ _TABLE = (
         "A scene that is built at random is rebuilt now and then (reconfiguration_freq), at one env at each reset.",
         "One env trains on the same objects for ever.",
         "_load_scene",
-    ),
-    Rule(
-        "frequencies",
-        "warn",
-        "sim_freq is a multiple of control_freq.",
-        "A control step has not the length that control_freq says.",
-        "_default_sim_config",
     ),
     Rule(
         "env-spacing",

@@ -9,8 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.authoring.problem import TaskError
-from workbench.checks import cameras, devices, evaluate, files, observation, reward, source
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
+from workbench.checks import (
+    cameras,
+    devices,
+    evaluate,
+    files,
+    observation,
+    placement,
+    reproduce,
+    reward,
+    scene,
+    source,
+)
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of, raised
 from workbench.checks.results import RuleResult, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.env import actions
@@ -28,10 +39,13 @@ class Group:
 
 GROUPS: tuple[Group, ...] = (
     Group("source", {**source.CHECKS, **files.CHECKS}),
+    Group("resets", placement.CHECKS),
     Group("success", evaluate.CHECKS),
     Group("rewards", reward.CHECKS),
     Group("tensors", devices.CHECKS),
+    Group("the same again", reproduce.CHECKS),
     Group("observations", observation.CHECKS),
+    Group("the scene", scene.CHECKS),
     Group("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
 )
 """In the order in which they run: what people meet most first."""
@@ -77,13 +91,6 @@ def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> I
             yield RuleResult(rule, "failed", why=str(error))
         if degrees["runs"] != "off":
             yield result_of("runs", degrees["runs"], [raised(error)])
-
-
-def raised(error: TaskError) -> Found:
-    """What the task raised, as a breach of the rule `runs`."""
-    problem = error.problem
-    place = None if problem.file is None else (problem.file, problem.line or 1, problem.stage)
-    return Found(f"{problem.stage}: {problem.message}", place)
 
 
 def core_results(findings: list[Finding], degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:

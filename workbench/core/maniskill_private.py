@@ -359,6 +359,11 @@ def apply_and_fetch(env: BaseEnv) -> None:
     env.scene._gpu_fetch_all()
 
 
+def fetch(env: BaseEnv) -> None:
+    """Fetch the tensors of the simulation, after ``scene.step()``: ``_gpu_fetch_all``."""
+    env.scene._gpu_fetch_all()
+
+
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
     """Each env's numpy generators: of its episodes, and of its episode seeds."""
     return {"episode": env._batched_episode_rng.rngs, "main": env._batched_main_rng.rngs}

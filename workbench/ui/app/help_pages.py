@@ -31,6 +31,7 @@ OVERVIEW = "overview"
 GROUPS = (
     ("", "Use it"),
     ("reference", "Look something up"),
+    ("rules", "Look up a rule of the checks"),
     ("developers", "Change the workbench"),
 )
 """Folders of the documents, and what a reader wants who looks there."""

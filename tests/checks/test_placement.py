@@ -1,0 +1,116 @@
+"""Rules of where a reset puts things, each with a task that breaks it and one that keeps it."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.checks.checked import Checked, the_finding
+
+CUBE_POSE = "self.cube.set_pose(Pose.create_from_pq(p=cube, q=[1, 0, 0, 0]))"
+HEIGHT = "cube[:, 2] = CUBE_HALF_SIZE\n"
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        "overlap-at-reset",
+        "falls-at-reset",
+        "batch-of-reset",
+        "quaternion-order",
+        "unit-quaternion",
+        "robot-holds",
+        "outside-reach",
+    ],
+)
+def test_the_example_keeps_each(checked: Checked, rule: str) -> None:
+    assert checked(rule, seeds=4).state == "kept"
+
+
+def test_a_cube_in_the_table(checked: Checked) -> None:
+    finding = the_finding(checked("overlap-at-reset", (HEIGHT, "cube[:, 2] = 0.005\n")))
+    assert "cube and table-workspace are 15 mm" in finding.message and finding.count == 8
+    assert finding.code == CUBE_POSE and finding.function == "_initialize_episode"
+
+
+def test_a_cube_above_the_table(checked: Checked) -> None:
+    finding = the_finding(checked("falls-at-reset", (HEIGHT, "cube[:, 2] = 0.08\n")))
+    assert "cube falls 0.06 m" in finding.message and finding.code == CUBE_POSE
+
+
+def test_a_cube_that_is_thrown_may_fly(checked: Checked) -> None:
+    thrown = (
+        f"{CUBE_POSE}\n            self.cube.set_linear_velocity(torch.tensor([[0.5, 0, 0]]).repeat(b, 1))"
+    )
+    assert checked("falls-at-reset", (CUBE_POSE, thrown)).state == "kept"
+
+
+def test_a_whole_batch_in_a_partial_reset(checked: Checked) -> None:
+    edit = "cube = torch.zeros((b, 3))", "cube = torch.zeros((self.num_envs, 3))"
+    fails = "cube[:, :2] = (2 * torch.rand((b, 2))", "cube[:, :2] = (2 * torch.rand((self.num_envs, 2))"
+    finding = the_finding(checked("batch-of-reset", edit, fails))
+    assert "self.num_envs" in finding.code and "len(env_idx)" in finding.message
+
+
+def test_a_whole_batch_of_which_rows_are_taken_is_right(checked: Checked) -> None:
+    edit = "torch.rand((b, 2))", "torch.rand((self.num_envs, 2))[env_idx]"
+    assert checked("batch-of-reset", edit).state == "kept"
+
+
+TURNED = """half = torch.rand(b) * 3
+            zero = torch.zeros(b)
+            q = torch.stack([{}], dim=1)
+            self.cube.set_pose(Pose.create_from_pq(p=cube, q=q))"""
+
+
+def test_quaternions_with_w_last(checked: Checked) -> None:
+    wrong = TURNED.format("zero, zero, half.sin(), half.cos()")
+    finding = the_finding(checked("quaternion-order", (CUBE_POSE, wrong)))
+    assert "x, y, z, w" in finding.message and finding.code.startswith("self.cube.set_pose")
+    right = TURNED.format("half.cos(), zero, zero, half.sin()")
+    assert checked("quaternion-order", (CUBE_POSE, right)).state == "kept"
+
+
+def test_half_a_turn_is_noted_only(checked: Checked) -> None:
+    result = checked("quaternion-order", (CUBE_POSE, CUBE_POSE.replace("[1, 0, 0, 0]", "[0, 0, 0, 1]")))
+    assert result.state == "kept" and "cube is turned by half a turn" in result.notes[0]
+
+
+def test_quaternions_of_scipy(checked: Checked) -> None:
+    scipy = "Rotation.identity(b).as_quat({})"
+    lines = "from scipy.spatial.transform import Rotation\n            {}\n            " + CUBE_POSE
+    finding = the_finding(checked("quaternion-order", (CUBE_POSE, lines.format("q = " + scipy.format("")))))
+    assert "as_quat() gives x, y, z, w" in finding.message
+    first = lines.format("q = " + scipy.format("scalar_first=True"))
+    assert checked("quaternion-order", (CUBE_POSE, first)).state == "kept"
+
+
+def test_a_quaternion_that_is_too_long(checked: Checked) -> None:
+    edit = CUBE_POSE, CUBE_POSE.replace("[1, 0, 0, 0]", "[1, 0, 0, 1]")
+    finding = the_finding(checked("unit-quaternion", edit))
+    assert "has length 1.41" in finding.message and "[1, 0, 0, 1]" in finding.code
+
+
+def test_a_robot_that_cannot_hold_itself(checked: Checked) -> None:
+    weak = """super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
+        for link in self.agent.robot.links:
+            link.disable_gravity[:] = False
+            for each in link._objs:
+                each.disable_gravity = False
+        for joint in self.agent.robot.active_joints:
+            joint.set_drive_properties(1.0, 1.0)
+"""
+    finding = the_finding(
+        checked(
+            "robot-holds", ("super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))\n", weak), seeds=4
+        )
+    )
+    assert "panda_joint" in finding.message and finding.function == "_initialize_episode"
+
+
+def test_a_cube_that_is_sometimes_too_far(checked: Checked) -> None:
+    edit = (
+        "cube[:, 2] = CUBE_HALF_SIZE\n",
+        "cube[:, 2] = CUBE_HALF_SIZE\n            cube[:, 0] += torch.rand(b)\n",
+    )
+    finding = the_finding(checked("outside-reach", edit))
+    assert "cube is up to" in finding.message and 0 < finding.count < 8 and finding.code == CUBE_POSE

@@ -1,0 +1,171 @@
+"""Rules of what is built, each with a task that breaks it and one that keeps it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from tests.checks.checked import Checked, the_finding
+from workbench.checks.scene import CHECKS
+
+CUBE = 'self.cube = builder.build(name="cube")\n'
+CUBE_AT = "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE_HALF_SIZE])"
+GOAL_POSE = "self.goal.set_pose(Pose.create_from_pq(p=goal, q=[1, 0, 0, 0]))"
+PER_ENV = """parts = []
+        for i in range(self.num_envs):
+            each = self.scene.create_actor_builder()
+            each.add_box_collision(half_size=[{size}] * 3)
+            each.initial_pose = sapien.Pose(p=[0.3, 0.3, 0.02])
+            each.set_scene_idxs([i])
+            parts.append(each.build(name=f"part_{{i}}"))
+        {merge}
+"""
+REGISTERED = """for part in parts:
+            self.remove_from_state_dict_registry(part)
+        self.add_to_state_dict_registry(self.merged)"""
+
+
+def added(code: str) -> tuple[str, str]:
+    """An edit that runs this after the cube is built."""
+    return CUBE, f"{CUBE}        {code}\n"
+
+
+def boxes(merge: str, size: str = "0.02") -> tuple[str, str]:
+    """An edit that builds a box for each env."""
+    return added(PER_ENV.format(size=size, merge=merge))
+
+
+@pytest.mark.parametrize("rule", CHECKS)
+def test_the_example_keeps_each(checked: Checked, rule: str) -> None:
+    assert checked(rule, seeds=4).state == "kept"
+
+
+def test_a_robot_at_the_origin(checked: Checked) -> None:
+    edit = "super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))", "super()._load_agent(options)"
+    finding = the_finding(checked("robot-pose", edit, seeds=4))
+    assert "panda is built without an initial pose" in finding.message and finding.function == "_load_agent"
+
+
+def test_a_body_at_the_origin(checked: Checked) -> None:
+    finding = the_finding(checked("initial-pose", (CUBE_AT, ""), seeds=4))
+    assert finding.code == CUBE.strip() and finding.function == "_load_scene"
+
+
+def test_a_mark_without_collision_may_be_built_anywhere(checked: Checked) -> None:
+    goal_at = "builder.initial_pose = sapien.Pose(p=[0.2, 0, GOAL_HEIGHT])"
+    assert checked("initial-pose", (goal_at, ""), seeds=4).state == "kept"
+
+
+def test_a_cube_that_is_built_in_the_table(checked: Checked) -> None:
+    finding = the_finding(
+        checked("overlap-at-load", (CUBE_AT, "builder.initial_pose = sapien.Pose()"), seeds=4)
+    )
+    assert "cube and table-workspace are built 20 mm inside" in finding.message
+    assert finding.code == CUBE.strip()
+
+
+def test_a_goal_that_never_moves(checked: Checked) -> None:
+    finding = the_finding(checked("kinematic-never-moved", (GOAL_POSE, "pass"), seeds=4))
+    assert "build_static(name='goal')" in finding.message and "build_kinematic" in finding.code
+
+
+def test_a_goal_that_a_step_may_move_is_left_alone(checked: Checked) -> None:
+    moves = f"    def _after_control_step(self):\n        if self.push > 9:\n            {GOAL_POSE}\n\n"
+    edits = (GOAL_POSE, "self.push = 0"), ("    def evaluate(self)", f"{moves}    def evaluate(self)")
+    assert checked("kinematic-never-moved", *edits, seeds=4).state == "skipped"
+
+
+def test_bodies_merged_under_one_name(checked: Checked) -> None:
+    merge = "from mani_skill.utils.structs import Actor\n        Actor.merge(parts, name={})"
+    finding = the_finding(checked("body-names", boxes(merge.format("'cube'")), seeds=4))
+    assert "cube is the name of 2 bodies" in finding.message and "Actor.merge" in finding.code
+    assert checked("body-names", boxes(merge.format("'box'")), seeds=4).state == "kept"
+
+
+def test_an_articulation_of_many_links(checked: Checked) -> None:
+    chain = """chain = self.scene.create_articulation_builder()
+        link = chain.create_link_builder(None)
+        for i in range({}):
+            link.set_name(f"link_{{i}}")
+            link = chain.create_link_builder(link)
+            link.set_joint_name(f"joint_{{i}}")
+            link.set_joint_properties("revolute", [[-1, 1]], sapien.Pose(), sapien.Pose())
+        link.set_name("last")
+        chain.initial_pose = sapien.Pose(p=[0.5, 0.5, 1])
+        chain.build(name="chain", fix_root_link=True)"""
+    finding = the_finding(checked("too-many-links", added(chain.format(64)), seeds=4))
+    assert "chain has 65 links" in finding.message and "chain.build" in finding.code
+    assert checked("too-many-links", added(chain.format(63)), seeds=4).state == "kept"
+
+
+def meshed(file: Path, call: str) -> tuple[str, str]:
+    """An edit that builds a body of a mesh file."""
+    return added(f"""each = self.scene.create_actor_builder()
+        each.{call.format(repr(str(file)))}
+        each.initial_pose = sapien.Pose(p=[0.4, 0.4, 0.3])
+        each.build_static(name="thing")""")
+
+
+def open_box() -> trimesh.Trimesh:
+    """Four walls and a floor."""
+    floor = trimesh.creation.box(extents=(0.2, 0.2, 0.01))
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        wall = trimesh.creation.box(extents=(0.01, 0.2, 0.1) if x else (0.2, 0.01, 0.1))
+        wall.apply_translation((0.1 * x, 0.1 * y, 0.05))
+        floor = floor + wall
+    return floor
+
+
+def test_a_box_that_its_hull_closes(checked: Checked, tmp_path: Path) -> None:
+    open_box().export(tmp_path / "box.stl")
+    call = "add_convex_collision_from_file({})"
+    finding = the_finding(checked("hull-fills-hollow", meshed(tmp_path / "box.stl", call), seeds=4))
+    assert "thing collides as the convex hull of box.stl" in finding.message
+    trimesh.creation.capsule(height=0.1, radius=0.05).export(tmp_path / "solid.stl")
+    assert checked("hull-fills-hollow", meshed(tmp_path / "solid.stl", call), seeds=4).state == "kept"
+
+
+def test_a_decomposition_where_it_is_built(checked: Checked) -> None:
+    call = "if False:\n            builder.add_multiple_convex_collisions_from_file('box.ply', decomposition={!r})"
+    finding = the_finding(checked("decomposition-at-load", added(call.format("coacd")), seeds=4))
+    assert "decomposition='coacd'" in finding.code and ".coacd.ply" in finding.message
+    assert checked("decomposition-at-load", added(call.format("none")), seeds=4).state == "kept"
+
+
+def test_a_mesh_of_many_triangles(checked: Checked, tmp_path: Path) -> None:
+    for subdivisions, state in ((7, "broken"), (3, "kept")):
+        file = tmp_path / f"ball_{subdivisions}.ply"
+        trimesh.creation.icosphere(subdivisions=subdivisions).export(file)
+        result = checked("heavy-mesh", meshed(file, "add_visual_from_file({})"), seeds=4)
+        assert result.state == state
+        assert not result.findings or "327,680 triangles" in result.findings[0].message
+
+
+def test_parts_that_stay_in_the_state(checked: Checked) -> None:
+    merge = "from mani_skill.utils.structs import Actor\n        self.merged = Actor.merge(parts, name='box')"
+    finding = the_finding(checked("merged-actors", boxes(merge), seeds=4))
+    assert finding.count == 4 and "part_0 and 3 more have 1 rows" in finding.message
+    assert "Actor.merge" in finding.code
+    assert checked("merged-actors", boxes(f"{merge}\n        {REGISTERED}"), seeds=4).state == "kept"
+
+
+def test_a_merged_body_that_is_in_no_state(checked: Checked) -> None:
+    merge = "from mani_skill.utils.structs import Actor\n        self.merged = Actor.merge(parts, name='box')"
+    removed = f"{merge}\n        {REGISTERED}".rsplit("\n", 1)[0]
+    assert "is not in the state" in the_finding(checked("merged-actors", boxes(removed), seeds=4)).message
+
+
+def test_one_env_with_the_same_objects_for_ever(checked: Checked) -> None:
+    drawn = boxes("pass", size="0.02 + 0.01 * self._batched_episode_rng[i].rand()")
+    assert "never rebuilt" in the_finding(checked("reconfigures", drawn, seeds=4)).message
+    freq = "super().__init__(*args, robot_uids=robot_uids, **kwargs)"
+    often = freq, freq.replace("**kwargs", "reconfiguration_freq=1, **kwargs")
+    assert checked("reconfigures", drawn, often, seeds=4).state == "kept"
+
+
+def test_a_body_in_the_env_of_a_neighbour(checked: Checked) -> None:
+    far = "cube[:, 2] = CUBE_HALF_SIZE\n", "cube[:, 2] = CUBE_HALF_SIZE\n            cube[:, 0] += 3\n"
+    finding = the_finding(checked("env-spacing", far, seeds=4))
+    assert "cube comes" in finding.message and "SimConfig(spacing=" in finding.message

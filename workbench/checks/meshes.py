@@ -1,0 +1,75 @@
+"""Mesh files: how many triangles they have, and whether a hull would close them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+_BYTES_PER_TRIANGLE = 3.0
+"""No format of a mesh stores a triangle in less, unless it is compressed."""
+_RAYS = 162
+_MOST_TRIANGLES = 50_000
+_LEAST_WALL, _LEAST_OPEN = 0.6, 0.03
+"""Shares of all directions, seen from within a hollow, in which there is a wall, and in which it is open."""
+
+
+def triangles_in(file: str, more_than: int) -> int:
+    """Triangles of a mesh file; 0 if it is too small to have `more_than`, or cannot be read."""
+    if not Path(file).is_file() or Path(file).stat().st_size < _BYTES_PER_TRIANGLE * more_than:
+        return 0
+    mesh = _read(file)
+    return 0 if mesh is None else len(mesh.faces)
+
+
+@lru_cache(maxsize=256)
+def is_hollow(file: str) -> bool:
+    """Whether something could be put into it: from the middle of its convex hull, walls are seen in most directions and
+    nothing in some, on one side. False if that cannot be said."""
+    mesh = _read(file)
+    if mesh is None or not 4 <= len(mesh.faces) <= _MOST_TRIANGLES:
+        return False
+    try:
+        hull = mesh.convex_hull
+    except Exception:  # qhull: all in one plane
+        return False
+    directions = trimesh.creation.icosphere(subdivisions=2).vertices[:_RAYS]
+    hits = _crossings(np.asarray(mesh.triangles), np.asarray(hull.center_mass), np.asarray(directions))
+    through = hits == 0
+    if not _LEAST_OPEN <= through.mean() <= 1 - _LEAST_WALL:
+        return False
+    # An opening is on one side; gaps of a ring, a frame or a star are on several.
+    return float(np.linalg.norm(directions[through].mean(axis=0))) > 0.5
+
+
+def _crossings(
+    triangles: NDArray[np.float64], origin: NDArray[np.float64], directions: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """(R,) how many of the triangles (F, 3, 3) each ray from `origin` meets (Moeller and Trumbore)."""
+    first = triangles[:, 0]
+    one, two = triangles[:, 1] - first, triangles[:, 2] - first
+    to_origin = origin - first
+    across = np.cross(to_origin, one)
+    ahead = np.einsum("fi,fi->f", two, across)
+    count = np.zeros(len(directions), np.int64)
+    for row, direction in enumerate(directions):
+        normal = np.cross(direction, two)
+        volume = np.einsum("fi,fi->f", one, normal)
+        flat = np.abs(volume) < 1e-15
+        scale = 1 / np.where(flat, 1, volume)
+        u = np.einsum("fi,fi->f", to_origin, normal) * scale
+        v = across @ direction * scale
+        count[row] = int((~flat & (u >= 0) & (v >= 0) & (u + v <= 1) & (ahead * scale > 0)).sum())
+    return count
+
+
+@lru_cache(maxsize=64)
+def _read(file: str) -> trimesh.Trimesh | None:
+    try:
+        mesh = trimesh.load(file, force="mesh")
+    except Exception:  # any of a dozen readers; a file that is missing has a rule of its own
+        return None
+    return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None

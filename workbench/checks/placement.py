@@ -1,0 +1,373 @@
+"""Checks of where a reset puts things: inside each other, falling, out of reach, turned wrongly."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
+from numpy.typing import NDArray
+
+from workbench.authoring.problem import TaskError
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evaluate import listed, of
+from workbench.core.broken_rule import Place
+from workbench.core.env.actions import random_action
+from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
+from workbench.core.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
+
+DEEP = 0.002
+"""Metres that two bodies may overlap: contacts of bodies at rest are about so deep."""
+MOVED, TURNED = 0.02, 0.35
+"""Metres and radians in a second. A body that is put down 1 cm above the table may settle."""
+STARTS_MOVING = 0.01
+"""Of a velocity, in m/s or rad/s: the task wants that body to move."""
+SAGGED = {"prismatic": 0.02, "revolute": 0.1}
+"""Metres and radians in a second."""
+POSTURES = 40
+"""Random postures of each env's robot from which its reach is found."""
+REACH_MARGIN = 0.05
+"""Metres that a body's middle may be further away than the robot comes."""
+NOT_UNIT = 1e-3
+_CREATED = ("zeros", "ones", "rand", "randn", "randint", "empty", "full", "tile", "arange")
+_SIZED = ("repeat", "expand", "new_zeros", "new_ones", "uniform", "normal", "view", "reshape")
+_REORDERED = ("roll", "scalar_first", "wxyz", "[3, 0, 1, 2]", "xyzw")
+
+
+def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
+    """Whether partial resets fail or change other envs, where the source makes tensors of self.num_envs rows."""
+    if checkup.num_envs < 2:
+        raise CannotCheck("it needs two envs")
+    failed: TaskError | None = None
+    try:
+        task, rng = checkup.task, np.random.default_rng(4)
+        checkup.reset(task, list(range(checkup.num_envs)))
+        # So that what is kept for each env differs from what a reset gives it.
+        checkup.step(task, random_action(task.parts, task.num_envs, rng))
+        for chosen in ([0], list(range(1, checkup.num_envs))):
+            checkup.reset(task, None, chosen)
+    except TaskError as error:
+        failed = error
+    broken = {(each.file, each.function) for each in checkup.findings}
+    for module, function in checkup.places.functions("_initialize_episode"):
+        if failed is None and (module.file, function.name) not in broken:
+            continue
+        for node in _whole_batches(function):
+            yield Found(
+                "tensors of self.num_envs rows are made in a reset of some envs. Take b = len(env_idx) for their "
+                "number of rows.",
+                module.place(node, function.name),
+            )
+            return
+
+
+def _whole_batches(function: ast.FunctionDef) -> Iterator[ast.AST]:
+    """Calls that make a tensor with self.num_envs in its size, and of which not only rows are taken."""
+    sliced = {id(node.value) for node in ast.walk(function) if isinstance(node, ast.Subscript)}
+    for node in ast.walk(function):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute) or id(node) in sliced:
+            continue
+        given = [*node.args, *(keyword.value for keyword in node.keywords)]
+        if node.func.attr in _CREATED + _SIZED and any(_is_num_envs(part) for part in given):
+            yield node
+
+
+def _is_num_envs(node: ast.AST) -> bool:
+    """Whether it is ``self.num_envs``, or a tuple or list with it."""
+    if isinstance(node, (ast.Tuple, ast.List)):
+        return any(_is_num_envs(item) for item in node.elts)
+    return isinstance(node, ast.Attribute) and node.attr == "num_envs"
+
+
+def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over all seeds."""
+    fixed = _immovable(checkup)
+    seeds_of: dict[tuple[str, str], list[int]] = {}
+    depths: dict[tuple[str, str], float] = {}
+    for seed, overlaps in checkup.overlaps.items():
+        for overlap in overlaps:
+            if overlap.depth > DEEP and not fixed.issuperset(overlap.bodies):
+                seeds_of.setdefault(overlap.bodies, []).append(seed)
+                depths[overlap.bodies] = max(depths.get(overlap.bodies, 0), overlap.depth)
+    # One robot in a table has many links in it: a finding for each pair of owners, of the deepest bodies.
+    deepest: dict[frozenset[str], tuple[str, str]] = {}
+    for pair in sorted(depths, key=lambda pair: -depths[pair]):
+        deepest.setdefault(frozenset(body.split("/", 1)[0] for body in pair), pair)
+    for first, second in deepest.values():
+        seeds = seeds_of[first, second]
+        mover = second if first in fixed or "/" in first else first
+        still = [body for body in (first, second) if body in fixed and "/" not in body]
+        if "/" in mover:
+            advice = "Raise its root, or reset it to joint positions with which it touches nothing."
+        elif still:
+            advice = (
+                f"Place {mover} higher: on a table of height 0, the middle of a body is at half its height."
+            )
+        else:
+            advice = f"Place {mover} further away, or draw again while they are too near."
+        yield Found(
+            f"{first} and {second} are {1000 * depths[first, second]:.0f} mm inside each other after the reset of "
+            f"{of(len(seeds), len(checkup.overlaps), 'seed')} (seed {listed(seeds)}). {advice}",
+            _where_placed(checkup, mover),
+            len(seeds),
+        )
+
+
+def falls_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over all seeds, while the robot holds still for a second."""
+    index, still = scene_index(checkup.task.env), checkup.still
+    robots = _robots(checkup)
+    # What a hand holds may slip, and what is pushed out of the robot has a rule of its own.
+    wanted = _start_moving(checkup) | _touched(checkup, robots)
+    before, after = still.poses[0], still.poses[-1]
+    for body, name in enumerate(index.names):
+        loose = index.kinds[body] == "dynamic" or (
+            index.kinds[body] == "link" and index.owners[body] not in robots
+        )
+        if not loose or index.owners[body] in wanted:
+            continue
+        away = after[:, body, :3] - before[:, body, :3]
+        moved = np.linalg.norm(away, axis=1)
+        turned = _angle(before[:, body, 3:], after[:, body, 3:])
+        # A body that an env lacks is NaN in both.
+        lost = ~np.isfinite(after[:, body]).all(axis=1) & np.isfinite(before[:, body]).all(axis=1)
+        bad = (moved > MOVED) | (turned > TURNED) | lost
+        if not bad.any():
+            continue
+        worst = int(np.nan_to_num(np.where(bad, moved, 0), nan=np.inf).argmax())
+        how = "falls" if away[worst, 2] < -0.7 * moved[worst] else "moves"
+        seeds = [still.seeds[i] for i in np.flatnonzero(bad)]
+        yield Found(
+            f"{name} {how} {moved[worst]:.2f} m and turns {np.degrees(turned[worst]):.0f} degrees in the first second of "
+            f"{of(len(seeds), len(bad), 'seed')} (seed {listed(seeds)}) while the robot holds still. Place it where it "
+            "rests.",
+            _where_placed(checkup, index.owners[body]),
+            len(seeds),
+        )
+
+
+def robot_holds(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over all seeds, while the controllers are asked to hold, for a second."""
+    env = checkup.task.env
+    if not checkup.task.parts:
+        raise CannotCheck("it has no robot")
+    for part in checkup.task.parts:
+        delta = getattr(part.controller.config, "use_delta", False)
+        absolute = isinstance(part.controller, PDJointPosController) and not isinstance(
+            part.controller, PDEEPosController
+        )
+        if not delta and not absolute:
+            raise CannotCheck(f"no action holds a robot in control mode {env.control_mode}")
+    if any(not _is_fixed(robot.robot) for robot in agents(env)):
+        raise CannotCheck("its robot stands on the floor: balancing is what a policy learns")
+    driven = {joint.name for part in checkup.task.parts for joint in part.controller.joints}
+    qpos, robots = checkup.still.qpos, _robots(checkup)
+    if qpos is None:
+        raise CannotCheck("its robots have other joints in each env")
+    column = 0
+    for owner, articulation in joints_of_scene(env):
+        for joint in articulation.active_joints:
+            limit = SAGGED["prismatic" if str(joint.type[0]) == "prismatic" else "revolute"]
+            away = np.abs(qpos[-1, :, column] - qpos[0, :, column])
+            column += 1
+            if owner not in robots or joint.name not in driven or not (away > limit).any():
+                continue
+            count = int((away > limit).sum())
+            unit = "m" if limit == SAGGED["prismatic"] else "rad"
+            yield Found(
+                f"joint {joint.name} moves {float(away.max()):.2f} {unit} in a second after the reset of "
+                f"{of(count, len(away), 'seed')}, with the targets of the reset. Raise the stiffness or force limit of its "
+                "controller, or reset it to a pose within its limits that touches nothing.",
+                checkup.places.hook("_initialize_episode"),
+                count,
+            )
+            return
+
+
+def outside_reach(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over all seeds: bodies that are within reach at some, and beyond at others."""
+    task = checkup.task
+    robots = agents(task.env)
+    if len(robots) != 1 or not _is_fixed(robots[0].robot) or not hasattr(robots[0], "tcp"):
+        raise CannotCheck("it has no single robot with a fixed base and a tcp")
+    base, reach = _reach(checkup, robots[0])
+    index, poses = scene_index(task.env), checkup.starts.poses[0]
+    for body, name in enumerate(index.names):
+        if index.kinds[body] != "dynamic":
+            continue
+        distance = np.nan_to_num(np.linalg.norm(poses[:, body, :3] - base, axis=1))
+        beyond = distance > reach + REACH_MARGIN
+        if beyond.any() and not beyond.all():
+            seeds = [checkup.starts.seeds[i] for i in np.flatnonzero(beyond)]
+            yield Found(
+                f"{name} is up to {distance.max():.2f} m from the robot's base, whose tcp reaches {reach:.2f} m, in "
+                f"{of(len(seeds), len(beyond), 'seed')} (seed {listed(seeds)}). Narrow the range in which it is placed.",
+                _where_placed(checkup, name),
+                len(seeds),
+            )
+
+
+def _reach(checkup: Checkup, robot: Any) -> tuple[NDArray[np.float32], float]:
+    """(3,) the base, and how far the tcp comes from it, from random postures within the joints' limits."""
+    task = checkup.task
+    checkup.reset(task, next(checkup.batches()))
+    articulation = robot.robot
+    limits = articulation.get_qlimits()
+    if not torch.isfinite(limits).all():
+        limits = limits.clamp(-np.pi, np.pi)
+        if any(str(joint.type[0]) == "prismatic" and not np.isfinite(np.ravel(joint.limits.cpu())).all()
+               for joint in articulation.active_joints):  # fmt: skip
+            raise CannotCheck("its robot drives around")
+    base = articulation.pose.p.cpu().numpy()
+    generator = torch.Generator(device=limits.device).manual_seed(0)
+    reach = 0.0
+    for _ in range(POSTURES):
+        part = torch.rand(limits.shape[:2], generator=generator, device=limits.device)
+        articulation.set_qpos(limits[..., 0] + part * (limits[..., 1] - limits[..., 0]))
+        apply_and_fetch(task.env)
+        reach = max(reach, float(np.linalg.norm(robot.tcp.pose.p.cpu().numpy() - base, axis=1).max()))
+    return base[0], reach
+
+
+def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the poses that the task sets in a reset, and of its initial poses."""
+    for name, quaternions, place in _quaternions(checkup):
+        length = np.linalg.norm(quaternions, axis=1)
+        wrong = np.abs(length - 1) > NOT_UNIT
+        if wrong.any():
+            yield Found(
+                f"the quaternion of {name} has length {length[wrong][0]:.3g}: {_text(quaternions[wrong][0])}. Divide it "
+                "by its norm, or make it with euler2quat or random_quaternions.",
+                place,
+            )
+
+
+def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the poses that the task sets in a reset, and of calls of SciPy's as_quat."""
+    by_name: dict[str, list[tuple[NDArray[np.float32], Place | None]]] = {}
+    for name, quaternions, place in _quaternions(checkup):
+        by_name.setdefault(name, []).append((quaternions, place))
+    robots, found = _robots(checkup), False
+    for name, given in by_name.items():
+        rows, place = np.concatenate([rows for rows, _ in given[-1:]]), given[-1][1]
+        flat = (np.abs(rows[:, :2]) < 1e-6).all(axis=1).all()
+        if not flat or len(rows) < 2:
+            continue
+        if np.ptp(rows[:, 2:], axis=0).max() > 0.05:
+            found = True
+            yield Found(
+                f"the quaternions of {name} are (0, 0, ...) in every env, such as {_text(rows[0])}: a turn about the "
+                "vertical, in the order x, y, z, w. Write w first: (w, x, y, z).",
+                place,
+                len(rows),
+            )
+        elif name not in robots and (np.abs(rows[:, 3]) > 1 - 1e-6).all():
+            yield Note(
+                f"{name} is turned by half a turn about z in every env: (0, 0, 0, 1) is no turn in the order x, y, z, w"
+            )
+    if found:
+        return
+    for module, function in checkup.places.functions():
+        text = ast.unparse(function)
+        for node in ast.walk(function):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                if node.func.attr == "as_quat" and not any(word in text for word in _REORDERED):
+                    yield Found(
+                        "as_quat() gives x, y, z, w. Write as_quat(scalar_first=True), or np.roll(q, 1, axis=-1).",
+                        module.place(node),
+                    )
+
+
+def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], Place | None]]:
+    """Name, (b, 4) and place of what the author's lines set."""
+    placed = checkup.placed
+    for each in checkup.builds:
+        if each.place is not None and each.quaternion is not None:
+            yield each.name, each.quaternion, each.place
+    for each in placed:
+        if each.place is not None:
+            yield each.name, each.quaternions, each.place
+
+
+def _where_placed(checkup: Checkup, body: str) -> Place | None:
+    """The author's line that sets its pose in a reset."""
+    owner = body.split("/", 1)[0]
+    lines = [each.place for each in checkup.placed if each.name == owner and each.place is not None]
+    return lines[-1] if lines else checkup.places.body(body, "_initialize_episode")
+
+
+def _text(quaternion: NDArray[np.float32]) -> str:
+    return "(" + ", ".join(f"{number:.3g}" for number in quaternion) + ")"
+
+
+def _angle(before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(K,) radians between quaternions (K, 4)."""
+    product = np.abs(np.einsum("ki,ki->k", before, after))
+    lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    return 2 * np.arccos(np.clip(product / np.maximum(lengths, 1e-9), 0, 1))
+
+
+def _robots(checkup: Checkup) -> set[str]:
+    """Names of the articulations that agents move."""
+    return {str(agent.robot.name) for agent in agents(checkup.task.env)} | {
+        each.name for each in checkup.builds if each.of_robot
+    }
+
+
+def _start_moving(checkup: Checkup) -> set[str]:
+    """Names of what a reset gives a velocity."""
+    moving: set[str] = set()
+    checkup.reset(checkup.task, next(checkup.batches()))
+    for name, rows in present_states(checkup.task.env).items():
+        rows = np.asarray(rows)
+        joints = (rows.shape[1] - 13) // 2
+        speeds = np.concatenate([rows[:, 7:13], rows[:, 13 + joints :]], axis=1)
+        if (np.abs(np.nan_to_num(speeds)) > STARTS_MOVING).any():
+            moving.add(name.split("/", 1)[1])
+    return moving
+
+
+def _touched(checkup: Checkup, robots: set[str]) -> set[str]:
+    """Names of what touches a robot after the reset of some seed."""
+    pairs = [
+        [body.split("/", 1)[0] for body in overlap.bodies]
+        for overlaps in checkup.overlaps.values()
+        for overlap in overlaps
+    ]
+    return {owner for pair in pairs if not robots.isdisjoint(pair) for owner in pair}
+
+
+def _is_fixed(articulation: Any) -> bool:
+    """Whether its root cannot move."""
+    return all(each.links[0].joint.type == "fixed" for each in objects_of(articulation))
+
+
+def _immovable(checkup: Checkup) -> set[str]:
+    """Bodies that no contact moves: static and kinematic ones, and links between which and a fixed root no joint is."""
+    index: SceneIndex = scene_index(checkup.task.env)
+    found = {
+        name for name, kind in zip(index.names, index.kinds, strict=True) if kind in ("static", "kinematic")
+    }
+    for articulation in checkup.task.env.scene.articulations.values():
+        for link in objects_of(articulation)[0].links:
+            name, above = index.name_of(link), link
+            while above is not None and above.joint.type == "fixed":
+                above = above.parent
+            if name is not None and above is None:
+                found.add(name)
+    return found
+
+
+CHECKS: Mapping[str, Check] = {
+    "overlap-at-reset": overlap_at_reset,
+    "falls-at-reset": falls_at_reset,
+    "batch-of-reset": batch_of_reset,
+    "quaternion-order": quaternion_order,
+    "unit-quaternion": unit_quaternion,
+    "robot-holds": robot_holds,
+    "outside-reach": outside_reach,
+}

@@ -1,0 +1,266 @@
+"""Checks that a task runs in any order of resets, and does the same again."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.problem import TaskError
+from workbench.checks.builds import shapes_of_env
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, raised, read_obs
+from workbench.checks.evaluate import listed
+from workbench.core.broken_rule import Place
+from workbench.core.capture.state_columns import env_states, flat_names, split_flat
+from workbench.core.env.actions import random_action
+from workbench.core.env.cpu_scene import BatchedCpuMixin
+from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.maniskill_private import apply_and_fetch
+
+ROUNDS = 6
+"""Partial resets, with a step between them."""
+REPLAYED_STEPS = 10
+SAME = 1e-4
+"""Largest difference of two numbers that are equal: poses come back rounded."""
+RESTORED = 1e-3
+"""The same after a state dict, whose link poses are computed from joints again; of larger numbers, relative."""
+Numbers = dict[str, NDArray[np.float64]]
+"""(N, ...) by name."""
+
+
+def runs(checkup: Checkup) -> Iterator[Found | Note]:
+    """Resets at random subsets, with and without seeds, and steps with random actions, the largest among them."""
+    try:
+        task, rng = checkup.task, np.random.default_rng(1)
+        every = range(checkup.num_envs)
+        checkup.reset(task, None)
+        for turn in range(ROUNDS):
+            count = int(rng.integers(1, checkup.num_envs + 1))
+            chosen = sorted(int(i) for i in rng.choice(every, count, replace=False))
+            checkup.reset(task, None if turn % 2 else [1000 * turn + i for i in chosen], chosen)
+            action = random_action(task.parts, task.num_envs, rng)
+            checkup.step(task, np.sign(action) if turn == 0 else action)
+    except TaskError as error:
+        yield raised(error)
+
+
+def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
+    """After a reset, and again after resets and steps of other seeds."""
+    task, seeds = checkup.task, next(checkup.batches())
+    # Else a touch sensor reads the contacts of the last episode.
+    with _without_past(task):
+        first = _seen(task, checkup.reset(task, seeds))
+    # Others that have their own generators may be at an equal place after a reset.
+    checkup.reset(task, [seed + 5000 for seed in seeds])
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        checkup.step(task, random_action(task.parts, task.num_envs, rng))
+    if checkup.num_envs > 1:
+        checkup.reset(task, None, [checkup.num_envs - 1])
+    with _without_past(task):
+        again = _seen(task, checkup.reset(task, seeds))
+    differing = _differing(first, again, SAME)
+    if differing:
+        place, called = _random_call(checkup)
+        yield Found(
+            f"{_named(differing)} after two resets with the same seeds. "
+            + (
+                f"{called} is not seeded by the reset: draw"
+                if called
+                else "Set everything in a reset, and draw"
+            )
+            + " with torch.rand in _initialize_episode, or from self._batched_episode_rng.",
+            place or checkup.places.hook("_initialize_episode"),
+            len(differing),
+        )
+
+
+def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
+    """What one env builds for a seed, beside what the batch built for it."""
+    if checkup.num_envs < 2:
+        raise CannotCheck("it needs two envs")
+    assert checkup.task
+    wrong = [
+        seed
+        for env, (seed, alone) in enumerate(checkup.alone.shapes.items())
+        if alone != shapes_of_env(checkup.builds, env)
+    ]
+    if wrong:
+        yield Found(
+            f"one env alone is built with other shapes or colours for seed {listed(wrong)} than the env of that seed among "
+            f"{checkup.num_envs}. Draw from self._batched_episode_rng[i] for env i, not from torch or numpy.",
+            checkup.places.hook("_load_scene"),
+            len(wrong),
+        )
+
+
+def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
+    """The state right after a reset, put back after a reset with other seeds. No step is made: contacts are in no state."""
+    seeds = next(checkup.batches())[: min(4, checkup.num_envs)]
+    with checkup.env(len(seeds)) as task:
+        checkup.reset(task, seeds)
+        with blamed("reset", checkup.loaded, task):
+            state = _copied(task.env.get_state_dict())
+            before = _rescored(task)
+            noisy = _differing(before, _rescored(task), 0)
+            # Velocities of links, say, come out of a state otherwise than out of a step.
+            task.env.set_state_dict(state)
+            apply_and_fetch(task.env)
+            noisy |= _differing(before, _rescored(task), RESTORED)
+        checkup.reset(task, [seed + 5000 for seed in seeds])
+        with blamed("reset", checkup.loaded, task):
+            other = _rescored(task)
+            task.env.set_state_dict(state)
+            apply_and_fetch(task.env)
+            after = _rescored(task)
+    differing = _differing(before, after, RESTORED)
+    # What is as it was before the state was set was not restored; the rest may only be rounded.
+    lost = {name: by for name, by in differing.items() if name not in noisy}
+    if lost:
+        same = sum(name not in _differing(other, after, RESTORED) for name in lost)
+        yield Found(
+            f"{_named(lost)} after get_state_dict() and set_state_dict(). Keep what decides it in a body (a kinematic goal "
+            "that has a pose), or add it to the state in get_state_dict and set_state_dict.",
+            checkup.places.hook("get_state_dict", "_initialize_episode"),
+            max(1, same),
+        )
+
+
+def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
+    """Twice from the same seeds. Each reset begins with physics that has no past, so only the task's code can differ."""
+    seeds = next(checkup.batches())
+    task = checkup.task
+    if not task.parts:
+        raise CannotCheck("it takes no actions")
+    with _without_past(task):
+        first, second = (_episode(checkup, task, seeds) for _ in range(2))
+    for step, (one, other) in enumerate(zip(first, second, strict=True)):
+        if not (differing := _differing(one, other, SAME)):
+            continue
+        if step == 0:
+            raise CannotCheck("the same seed gives another start")
+        yield Found(
+            f"{_named(differing)} after {step} {'step' if step == 1 else 'steps'} of the same actions from the same seeds. "
+            "What is drawn in a step must come from self._batched_episode_rng, or be drawn in the reset.",
+            checkup.places.hook("_before_control_step", "_after_control_step", "evaluate"),
+        )
+        return
+
+
+@contextmanager
+def _without_past(task: TaskEnv) -> Iterator[None]:
+    """Within this, physics begins at each reset without contacts or an order of solving them from before."""
+    if not isinstance(task.env, BatchedCpuMixin):
+        yield
+        return
+    before, task.env.begins_anew = task.env.begins_anew, True
+    try:
+        yield
+    finally:
+        task.env.begins_anew = before
+
+
+# --- what is compared ------------------------------------------------------------------------------------
+
+
+def _seen(task: TaskEnv, result: StepResult) -> Numbers:
+    """State, evaluate() and observation after a reset."""
+    states = {
+        name: np.asarray(rows, np.float64)
+        for name, rows in env_states(task.env).items()
+        if _is_batch(task, rows)
+    }
+    return {**states, **_of_result(result), **_observed(task)}
+
+
+def _of_result(result: StepResult) -> Numbers:
+    return {
+        "the reward": result.reward.astype(np.float64),
+        **{f"evaluate()[{name!r}]": np.asarray(v, np.float64) for name, v in result.evaluate.items()},
+    }
+
+
+def _rescored(task: TaskEnv) -> Numbers:
+    """Reward, evaluate() and observation of the present state, for an action of zeros."""
+    action = np.zeros((task.num_envs, sum(len(part.names) for part in task.parts)), np.float32)
+    # Of a task without a reward, it would raise.
+    result = task.rescore(None if task.env.reward_mode == "none" else action)
+    return {**_of_result(result), **_observed(task)}
+
+
+def _observed(task: TaskEnv) -> Numbers:
+    """The leaves of the observation, of a flat one too."""
+    found: Numbers = {}
+    for name, value in read_obs(task).items():
+        names = flat_names(task, task.obs) if name == "obs" else None
+        parts = [(name, value, "")] if names is None else split_flat(names, value)
+        found |= {f"obs/{part}": numbers for part, numbers, _ in parts}
+    # A robot's touch sensors read the contacts of the last substep, of the last episode.
+    found = {name: numbers for name, numbers in found.items() if not name.startswith("obs/agent/")}
+    return found
+
+
+def _episode(checkup: Checkup, task: TaskEnv, seeds: list[int]) -> list[Numbers]:
+    rng = np.random.default_rng(3)
+    results = [checkup.reset(task, seeds)]
+    for _ in range(REPLAYED_STEPS):
+        results.append(checkup.step(task, random_action(task.parts, task.num_envs, rng)))
+    return [{"a pose": result.poses.astype(np.float64), **_of_result(result)} for result in results]
+
+
+def _differing(one: Numbers, other: Numbers, tolerance: float) -> dict[str, float]:
+    """By how much at most, of what differs. Infinite where shapes differ."""
+    found: dict[str, float] = {}
+    for name in one.keys() & other.keys():
+        a, b = one[name], other[name]
+        if a.shape != b.shape:
+            found[name] = np.inf
+            continue
+        away = np.abs(np.nan_to_num(a) - np.nan_to_num(b))
+        if (away > tolerance * np.maximum(1, np.abs(np.nan_to_num(a)))).any():
+            found[name] = float(away.max())
+    return dict(sorted(found.items()))
+
+
+def _named(differing: Mapping[str, float]) -> str:
+    """``actors/cube (by 0.05), the reward (by 1) differ``."""
+    names = [f"{name} (by {by:.2g})" for name, by in differing.items()]
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"{', '.join(names[:3])}{more} {'differs' if len(names) == 1 else 'differ'}"
+
+
+def _is_batch(task: TaskEnv, rows: Any) -> bool:
+    return hasattr(rows, "shape") and len(rows.shape) > 0 and rows.shape[0] == task.num_envs
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _copied(item) for key, item in value.items()}
+    return value.clone() if isinstance(value, torch.Tensor) else value
+
+
+def _random_call(checkup: Checkup) -> tuple[Place | None, str]:
+    """The first call of numpy's or Python's global generator, or of a new one, in the author's hooks of a reset."""
+    for module, function in checkup.places.functions("_initialize_episode", "reset"):
+        for node in ast.walk(function):
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                if called.startswith(("np.random.", "numpy.random.", "random.")):
+                    return module.place(node, function.name), called
+    return None, ""
+
+
+CHECKS: Mapping[str, Check] = {
+    "runs": runs,
+    "same-seed": same_seed,
+    "state-restores": state_restores,
+    "actions-replay": actions_replay,
+    "same-for-any-batch": same_for_any_batch,
+}

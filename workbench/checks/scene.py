@@ -1,0 +1,303 @@
+"""Checks of what ``_load_agent`` and ``_load_scene`` build, and of the simulation's settings."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from workbench.checks.builds import Built
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evaluate import listed
+from workbench.checks.meshes import is_hollow, triangles_in
+from workbench.core.broken_rule import Place
+from workbench.core.maniskill_private import envs_of, objects_of
+from workbench.core.scene.scene_index import scene_index
+
+DEEP_AT_LOAD = 0.005
+"""Metres."""
+MOST_LINKS = 64
+MOST_TRIANGLES = 100_000
+_RESETS = ("_initialize_episode", "_load_scene", "_load_agent", "set_state_dict", "set_state")
+STILL = 1e-5
+"""Metres, and numbers of a quaternion."""
+
+
+def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of what was built."""
+    robots = [each for each in _builds(checkup) if each.of_robot and each.kind == "articulation"]
+    if not robots:
+        raise CannotCheck("it has no robot")
+    for name in dict.fromkeys(each.name for each in robots if each.quaternion is None):
+        yield Found(
+            f"{name} is built without an initial pose, at the origin. Write "
+            "`super()._load_agent(options, sapien.Pose(p=[...]))` with a place where it touches nothing.",
+            checkup.places.hook("_load_agent"),
+        )
+
+
+def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of what was built: bodies that collide. Others cannot hurt."""
+    unposed: dict[Place | None, list[str]] = {}
+    for each in _own(checkup):
+        if each.quaternion is None and each.collision:
+            unposed.setdefault(each.place, []).append(each.name)
+    for place, names in unposed.items():
+        yield Found(
+            f"{_several(names)} built without an initial pose, at the origin. Set "
+            "`builder.initial_pose = sapien.Pose(p=[...])` before it is built, to a place where it touches nothing.",
+            place,
+            len(names),
+        )
+
+
+def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
+    """With one env, all bodies where they are built and all joints at zero."""
+    builds = _builds(checkup)
+    # Those have a rule of their own.
+    unposed = {each.name for each in builds if each.quaternion is None}
+    places = {each.name: each.place for each in builds}
+    for overlap in checkup.alone.overlaps:
+        owners = [body.split("/", 1)[0] for body in overlap.bodies]
+        if overlap.depth < DEEP_AT_LOAD or not unposed.isdisjoint(owners):
+            continue
+        own = [places[owner] for owner in owners if places.get(owner) is not None]
+        first, second = overlap.bodies
+        yield Found(
+            f"{first} and {second} are built {1000 * overlap.depth:.0f} mm inside each other. Give one of them another "
+            "initial pose; _initialize_episode moves it to where an episode begins.",
+            own[0] if own else checkup.places.hook("_load_agent", "_load_scene"),
+        )
+
+
+def kinematic_never_moved(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over the resets of all seeds and random episodes, where no hook of a step sets a pose: it may do so later."""
+    if any(
+        _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
+    ):
+        raise CannotCheck("it sets poses in a step")
+    index = scene_index(checkup.task.env)
+    poses = np.concatenate([checkup.starts.poses, checkup.random.poses])
+    if poses.shape[1] < 2:
+        raise CannotCheck("it needs two seeds")
+    moved = (np.nan_to_num(poses.max(axis=(0, 1)) - poses.min(axis=(0, 1))) > STILL).any(axis=1)
+    own = {each.name: each for each in _own(checkup) if each.kind == "kinematic"}
+    still: dict[Place | None, list[str]] = {}
+    for body, name in enumerate(index.names):
+        if name in own and index.kinds[body] == "kinematic" and not moved[body] and not index.hidden[body]:
+            still.setdefault(own[name].place, []).append(name)
+    for place, names in still.items():
+        yield Found(
+            f"{_several(names)} kinematic and at the same pose in every reset and step. Build it with "
+            f"`builder.build_static(name={names[0]!r})` at its initial_pose, and do not set its pose.",
+            place,
+            len(names),
+        )
+
+
+def body_names(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of what was built and merged. ManiSkill's builders refuse a name that is taken; merging does not."""
+    merges = {merge.parts: merge for merge in _merges(checkup)}.values()
+    taken = Counter(merge.name for merge in merges)
+    built = {each.name for each in _builds(checkup)}
+    for merge in merges:
+        if merge.name is None:
+            yield Found(
+                f"{len(merge.parts)} bodies are merged without a name. Write `Actor.merge(parts, name='...')`.",
+                merge.place or checkup.places.hook("_load_scene"),
+            )
+        elif taken[merge.name] > 1 or merge.name in built - merge.parts:
+            yield Found(
+                f"{merge.name} is the name of {taken[merge.name] + (merge.name in built)} bodies. Name each its own.",
+                merge.place or checkup.places.hook("_load_scene"),
+            )
+
+
+def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of what was built."""
+    places = _places_of(checkup)
+    for name, articulation in checkup.task.env.scene.articulations.items():
+        if (count := len(articulation.links)) > MOST_LINKS:
+            yield Found(
+                f"{name} has {count} links. Join those with fixed joints between them, or divide it.",
+                places.get(name) or checkup.places.hook("_load_agent", "_load_scene"),
+            )
+
+
+def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the mesh files that bodies of the task collide as one convex hull."""
+    for file, each in _mesh_files(checkup, "convex_mesh").items():
+        if is_hollow(file):
+            yield Found(
+                f"{each.name} collides as the convex hull of {Path(file).name}, which is hollow: nothing can be put into "
+                "it. Use add_multiple_convex_collisions_from_file with a decomposed mesh, or boxes; for a body that "
+                "never moves, add_nonconvex_collision_from_file.",
+                each.place,
+            )
+
+
+def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the source: building would need the package that decomposes."""
+    for module, function in checkup.places.functions():
+        for node in ast.walk(function):
+            for keyword in node.keywords if isinstance(node, ast.Call) else ():
+                value = keyword.value
+                if (
+                    keyword.arg == "decomposition"
+                    and isinstance(value, ast.Constant)
+                    and value.value != "none"
+                ):
+                    yield Found(
+                        f"a mesh is decomposed with {value.value} where it is built. Do it once, ship the file that it "
+                        "writes beside the mesh (.coacd.ply), and load that with decomposition='none'.",
+                        module.place(value, function.name),
+                    )
+
+
+def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the mesh files that bodies of the task are drawn with."""
+    for file, each in _mesh_files(checkup, "file").items():
+        if (count := triangles_in(file, MOST_TRIANGLES)) > MOST_TRIANGLES:
+            yield Found(
+                f"{each.name} is drawn with {count:,} triangles ({Path(file).name}). Reduce the mesh "
+                "(trimesh: mesh.simplify_quadric_decimation(face_count=20_000)).",
+                each.place,
+            )
+
+
+def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the structs in the state dict."""
+    index, count = scene_index(checkup.task.env), checkup.num_envs
+    places = _places_of(checkup)
+    part = {name: merge for merge in _merges(checkup) for name in merge.parts}
+    partial = [name for name, struct in index.states.items() if len(envs_of(struct)) != count]
+    if partial:
+        names = [name.split("/", 1)[1] for name in partial]
+        merge = next((part[name] for name in names if name in part), None)
+        rows = sorted({len(envs_of(index.states[name])) for name in partial})
+        advice = (
+            f"Merge those that stand for one body: Actor.merge([...], name={names[0].rstrip('0123456789_-')!r}), and"
+            if merge is None
+            else "After the merge,"
+        )
+        yield Found(
+            f"{_several(names, 'has', 'have')} {listed(rows)} rows in the state of {count} envs. "
+            f"{advice} call self.remove_from_state_dict_registry(part) for each part and "
+            "self.add_to_state_dict_registry(merged).",
+            merge.place if merge is not None and merge.place else places.get(names[0]),
+            len(partial),
+        )
+    kept = {id(thing) for struct in index.states.values() for thing in objects_of(struct)}
+    for name, actor in checkup.task.env.scene.actors.items():
+        lost = [thing for thing in objects_of(actor) if id(thing) not in kept]
+        if lost and actor.px_body_type == "dynamic":
+            yield Found(
+                f"{name} moves, and is not in the state. Call self.add_to_state_dict_registry(merged) with what it was "
+                "merged into.",
+                places.get(name) or checkup.places.hook("_load_scene"),
+            )
+            return
+
+
+def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
+    """With one env, built for several seeds."""
+    alone = checkup.alone
+    if len(set(alone.shapes.values())) > 1 and not alone.rebuilds:
+        yield Found(
+            "One env is built with other shapes or colours for another seed, and never rebuilt after the first. In "
+            "__init__, take `reconfiguration_freq=None` and, if it is None, hand on 1 for num_envs == 1 and 0 otherwise.",
+            checkup.places.hook("__init__", "_load_scene"),
+        )
+
+
+def env_spacing(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over the resets of all seeds and random episodes."""
+    index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
+    moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
+    poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
+    if not moving:
+        raise CannotCheck("nothing in it moves")
+    away = np.nan_to_num(np.abs(poses[..., :2]).max(axis=-1))
+    far = away.max(axis=(0, 1))
+    if far.max() > half:
+        body = int(far.argmax())
+        count = int((away[:, :, body] > half).any(axis=0).sum())
+        yield Found(
+            f"{index.names[moving[body]]} comes {far[body]:.1f} m from the middle of its env in {count} of "
+            f"{away.shape[1]} episodes, and the middles are {2 * half:g} m apart. Return "
+            f"`SimConfig(spacing={np.ceil(2.5 * far[body]):g})` from _default_sim_config, or keep it nearer.",
+            _settings(checkup),
+            count,
+        )
+
+
+def _sets_a_pose(function: ast.FunctionDef) -> bool:
+    """Whether it calls set_pose or set_state, or assigns a pose."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if node.func.attr in ("set_pose", "set_state", "set_state_dict"):
+                return True
+        elif isinstance(node, ast.Assign):
+            if any(isinstance(to, ast.Attribute) and to.attr == "pose" for to in node.targets):
+                return True
+    return False
+
+
+def _several(names: list[str], one: str = "is", many: str = "are") -> str:
+    return f"{names[0]} {one}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more {many}"
+
+
+def _settings(checkup: Checkup) -> Place | None:
+    return checkup.places.hook("_default_sim_config")
+
+
+def _builds(checkup: Checkup) -> list[Built]:
+    assert checkup.task
+    return checkup.builds
+
+
+def _merges(checkup: Checkup) -> list:
+    assert checkup.task
+    return checkup.merges
+
+
+def _own(checkup: Checkup) -> Iterator[Built]:
+    """What the author's files build, of bodies of one kind for each env only the first; without robots."""
+    lines = set()
+    for each in _builds(checkup):
+        if each.place is not None and not each.of_robot and (each.place, each.name) not in lines:
+            lines.add((each.place, each.name))
+            yield each
+
+
+def _places_of(checkup: Checkup) -> dict[str, Place | None]:
+    return {each.name: each.place for each in _builds(checkup)}
+
+
+def _mesh_files(checkup: Checkup, kind: str) -> dict[str, Built]:
+    """The files of the task's bodies that are used as this kind of shape, each with the first body that uses it."""
+    found: dict[str, Built] = {}
+    for each in _own(checkup):
+        for shape in each.collision + each.visual:
+            if shape.kind == kind and shape.file:
+                found.setdefault(shape.file, each)
+    return found
+
+
+CHECKS: Mapping[str, Check] = {
+    "robot-pose": robot_pose,
+    "initial-pose": initial_pose,
+    "overlap-at-load": overlap_at_load,
+    "kinematic-never-moved": kinematic_never_moved,
+    "body-names": body_names,
+    "too-many-links": too_many_links,
+    "hull-fills-hollow": hull_fills_hollow,
+    "decomposition-at-load": decomposition_at_load,
+    "heavy-mesh": heavy_mesh,
+    "merged-actors": merged_actors,
+    "reconfigures": reconfigures,
+    "env-spacing": env_spacing,
+}
