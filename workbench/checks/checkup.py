@@ -321,6 +321,7 @@ class Checkup:
                     self.step(task, action)
         return watch.uses
 
+    @evidence
     def alone(self) -> Alone:
         """Of the seeds with which the first envs of `task` were built."""
         seeds = [FIRST_BUILT_SEED + i for i in range(min(SEEDS_ALONE, self.num_envs))]
