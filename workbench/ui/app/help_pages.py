@@ -97,7 +97,7 @@ def _topic(name: str, group: str, path: str, file: Path) -> Topic:
 def find_topic(name: str) -> Topic | None:
     """The topic of this name; ``Batched env`` and ``batched-env`` name ``batched_env``."""
     wanted = re.sub(r"[\s-]+", "_", name.strip().lower()).removesuffix(".md")
-    return next((topic for topic in topics() if topic.name == wanted), None)
+    return next((topic for topic in topics() if topic.name.replace("-", "_") == wanted), None)
 
 
 def topics_about(words: str) -> list[Topic]:
