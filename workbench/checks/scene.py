@@ -59,6 +59,7 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     builds = _builds(checkup)
     # Those have a rule of their own.
     unposed = {each.name for each in builds if each.quaternion is None}
+    unposed |= {str(merge.name) for merge in _merges(checkup) if not unposed.isdisjoint(merge.parts)}
     places = {each.name: each.place for each in builds}
     for overlap in checkup.alone.overlaps:
         owners = [body.split("/", 1)[0] for body in overlap.bodies]
