@@ -35,7 +35,7 @@ class CalmReachEnv(BaseEnv):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])
+        pose = sapien_utils.look_at(eye=[0.9, 0, 0.7], target=[0, 0, 0.35])
         return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
 
     @property
@@ -67,6 +67,8 @@ class CalmReachEnv(BaseEnv):
             self.travelled = torch.zeros(self.num_envs)
 
     def _after_control_step(self) -> None:
+        if self.gpu_sim_enabled:
+            self.scene._gpu_fetch_all()
         self.travelled += torch.linalg.norm(self.agent.tcp.linear_velocity, dim=1) * self.control_timestep
 
     def evaluate(self) -> dict[str, torch.Tensor]:
