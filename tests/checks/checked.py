@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from workbench.authoring.loading.load import load_task, undo_load
-from workbench.checks.checkup import Checkup
+from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.rules import RULES
 from workbench.checks.run import GROUPS, RuleResult, core_results, run_group
 from workbench.core.rules import Finding

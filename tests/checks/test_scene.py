@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from tests.checks.checked import Checked, the_finding
-from workbench.checks.scene import CHECKS
+from workbench.checks.by_hook.scene import CHECKS
 
 CUBE = 'self.cube = builder.build(name="cube")\n'
 CUBE_AT = "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE_HALF_SIZE])"

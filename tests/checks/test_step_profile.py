@@ -9,8 +9,8 @@ import pytest
 
 from tests.checks.checked import EXAMPLE
 from workbench.authoring.loading.load import load_task, undo_load
-from workbench.checks.checkup import Checkup
-from workbench.checks.step_profile import StepProfile, profile_step
+from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.evidence.step_profile import StepProfile, profile_step
 
 SLOW = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.authoring.problem import TaskError
-from workbench.checks import (
+from workbench.checks.by_hook import (
     cameras,
     devices,
     evaluate,
@@ -21,7 +21,7 @@ from workbench.checks import (
     scene,
     source,
 )
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of, raised
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of, raised
 from workbench.checks.results import RuleResult, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.env import actions

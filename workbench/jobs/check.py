@@ -12,7 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, undo_load
-from workbench.checks.checkup import Checkup
+from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
 from workbench.checks.run import (
     CORE_GROUP,

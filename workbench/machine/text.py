@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -166,3 +166,13 @@ class _OneLine(logging.Formatter):
 
     def formatException(self, ei: Any) -> str:
         return plain_text(super().formatException(ei), "\n\t")
+
+
+def of(count: int, total: int, what: str) -> str:
+    """``3 of 32 seeds``."""
+    return f"{count} of {total} {what}{'' if total == 1 else 's'}"
+
+
+def listed(values: Sequence[object], most: int = 5) -> str:
+    """``1, 2, 3 ...``."""
+    return ", ".join(map(str, values[:most])) + (" ..." if len(values) > most else "")

@@ -13,7 +13,7 @@ from workbench.session.protocol.questions import CheckedGroup, CheckGroup, Profi
 
 if TYPE_CHECKING:
     from workbench.authoring.loading.load import LoadedTask
-    from workbench.checks.checkup import Checkup
+    from workbench.checks.evidence.checkup import Checkup
     from workbench.checks.results import RuleResult
 
 OnResult = Callable[[int, int, "RuleResult"], None]
@@ -90,7 +90,7 @@ class WorkerChecks:
         return CheckedGroup(len(names), total, names[following] if following < len(names) else "")
 
     def _checkup_of(self, loaded: LoadedTask, options: TaskOptions) -> Checkup:
-        from workbench.checks.checkup import Checkup  # late: the worker that plays checks nothing
+        from workbench.checks.evidence.checkup import Checkup  # late: the worker that plays checks nothing
 
         if self._checkup is None or self._of is not loaded:
             self.close()

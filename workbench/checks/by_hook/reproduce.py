@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.problem import TaskError
-from workbench.checks.builds import shapes_of_env
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, raised, read_obs
-from workbench.checks.evaluate import listed
+from workbench.checks.evidence.builds import shapes_of_env
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, raised, read_obs
 from workbench.core.broken_rule import Place
 from workbench.core.capture.state_columns import env_states, flat_names, split_flat
 from workbench.core.env.actions import random_action
@@ -23,6 +22,7 @@ from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import apply_and_fetch
+from workbench.machine.text import listed
 
 ROUNDS = 6
 """Partial resets, with a step between them."""

@@ -13,9 +13,9 @@ from typing import Any
 from mani_skill import ASSET_DIR
 from mani_skill.utils import assets
 
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.places import Module
-from workbench.checks.source import HOOKS
+from workbench.checks.by_hook.source import HOOKS
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.places import Module
 from workbench.core.broken_rule import Place
 from workbench.core.env.assets import assets_at
 

@@ -13,7 +13,7 @@ from mani_skill.utils import common
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.checkup import Checkup, leaf_rows
+from workbench.checks.evidence.checkup import Checkup, leaf_rows
 from workbench.core import maniskill_private
 from workbench.core.capture.recorded_state import read_states, write_states
 from workbench.core.env import actions

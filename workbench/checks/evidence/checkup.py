@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
-from workbench.checks.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
-from workbench.checks.places import Places
-from workbench.checks.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
+from workbench.checks.evidence.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
+from workbench.checks.evidence.places import Places
+from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.core.backends import find_renderer
 from workbench.core.broken_rule import Place
 from workbench.core.capture.inspect_env import list_contacts

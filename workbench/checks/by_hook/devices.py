@@ -5,17 +5,12 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator, Mapping
 
-from workbench.checks.checkup import Check, Checkup, Found, Note
-from workbench.checks.places import Module
-from workbench.checks.tensor_watch import NUM_ENVS, TensorUses
+from workbench.checks.evidence.checkup import Check, Checkup, Found, Note
+from workbench.checks.evidence.places import Module
+from workbench.checks.evidence.step_profile import EVERY_STEP
+from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses
 from workbench.core.broken_rule import Place
 
-EVERY_STEP = (
-    "evaluate", "_get_obs_extra", "_get_obs_agent", "compute_dense_reward", "compute_normalized_dense_reward",
-    "compute_sparse_reward", "_before_control_step", "_after_control_step", "_before_simulation_step",
-    "_after_simulation_step", "step", "get_info", "get_obs", "get_reward",
-)  # fmt: skip
-"""Hooks that run at every step."""
 _ONE_FOR_EACH_ENV = {"num_envs", "_num_envs", "_objs", "_bodies", "sub_scenes"}
 _LOOPS = (ast.For, ast.comprehension)
 

@@ -12,9 +12,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, leaf_rows
-from workbench.checks.evaluate import listed, of
-from workbench.checks.odd_states import DENSE_HOOKS, odd_states, write_all
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, leaf_rows
+from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states, write_all
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.capture.recorded_state import read_states
@@ -24,6 +23,7 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.simulation.state_layout import BODY
 from workbench.core.snapshots.snapshot import remembering
+from workbench.machine.text import listed, of
 
 HUGE = 1000.0
 MOVED = np.array([0.031, -0.043, 0.057], np.float32)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.checks.builds import Built
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.evaluate import listed
-from workbench.checks.meshes import is_hollow, triangles_in
+from workbench.checks.evidence.builds import Built
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.core.broken_rule import Place
 from workbench.core.maniskill_private import envs_of, objects_of
 from workbench.core.scene.scene_index import scene_index
+from workbench.machine.text import listed
 
 DEEP_AT_LOAD = 0.005
 """Metres."""

@@ -15,10 +15,10 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 
 from workbench.authoring.loading import registry
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.devices import EVERY_STEP
-from workbench.checks.places import Module
-from workbench.checks.reward import REWARD_HOOKS
+from workbench.checks.by_hook.devices import EVERY_STEP
+from workbench.checks.by_hook.reward import REWARD_HOOKS
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.places import Module
 from workbench.core.broken_rule import Place
 from workbench.core.env.assets import robots_of
 

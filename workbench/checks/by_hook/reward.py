@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
-from workbench.checks.evaluate import flags, of
-from workbench.checks.odd_states import DENSE_HOOKS, odd_states
+from workbench.checks.by_hook.evaluate import flags
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states
+from workbench.machine.text import of
 
 REWARD_HOOKS = {**DENSE_HOOKS, "sparse": "compute_sparse_reward"}
 LARGEST = 1.0 + 1e-4

@@ -14,11 +14,17 @@ from typing import Any
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.checks.checkup import Checkup
-from workbench.checks.devices import EVERY_STEP
+from workbench.checks.evidence.checkup import Checkup
 from workbench.core.broken_rule import Place
 from workbench.core.env import actions
 from workbench.core.env.task_env import TaskEnv
+
+EVERY_STEP = (
+    "evaluate", "_get_obs_extra", "_get_obs_agent", "compute_dense_reward", "compute_normalized_dense_reward",
+    "compute_sparse_reward", "_before_control_step", "_after_control_step", "_before_simulation_step",
+    "_after_simulation_step", "step", "get_info", "get_obs", "get_reward",
+)  # fmt: skip
+"""Hooks that run at every step."""
 
 STEPS = 200
 NUM_ENVS = 64

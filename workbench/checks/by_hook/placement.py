@@ -13,12 +13,12 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.evaluate import listed, of
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.core.broken_rule import Place
 from workbench.core.env.actions import random_action
 from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
 from workbench.core.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
+from workbench.machine.text import listed, of
 
 DEEP = 0.002
 """Metres that two bodies may overlap: contacts of bodies at rest are about so deep."""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
 from workbench.core.env.actions import hold_action
+from workbench.machine.text import listed, of
 
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 FLICKER_SHARE = 0.25
@@ -124,16 +125,6 @@ def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
 def flags(rows: NDArray) -> NDArray[np.bool_]:
     """(T, K) of (T, K, ...)."""
     return np.logical_or.reduce(rows.reshape(*rows.shape[:2], -1).astype(bool), axis=2)
-
-
-def of(count: int, total: int, what: str) -> str:
-    """``3 of 32 seeds``."""
-    return f"{count} of {total} {what}{'' if total == 1 else 's'}"
-
-
-def listed(values: Sequence[object], most: int = 5) -> str:
-    """``1, 2, 3 ...``."""
-    return ", ".join(map(str, values[:most])) + (" ..." if len(values) > most else "")
 
 
 CHECKS: Mapping[str, Check] = {

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.evaluate import listed, of
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.camera_data import CameraKey
@@ -29,6 +28,7 @@ from workbench.core.cameras.visibility import (
     small_size,
 )
 from workbench.core.scene.scene_index import read_poses, scene_index
+from workbench.machine.text import listed, of
 
 RESETS = 4
 """Resets of `Checkup.pictured` whose pictures are measured."""

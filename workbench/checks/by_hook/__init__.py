@@ -1,0 +1,1 @@
+"""The rules, a function each, by the hook that they guard."""
