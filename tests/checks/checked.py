@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import linecache
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,14 @@ def checked(tmp_path: Path) -> Checked:
 
 def check_rule(rule: str, reference: str, num_envs: int, seeds: int, **env_kwargs: Any) -> RuleResult:
     """The result of one rule on a task file or an id."""
-    degrees = dict.fromkeys(RULES, "off") | {rule: RULES[rule].degree}
+    return check_rules([rule], reference, num_envs, seeds, **env_kwargs)[rule]
+
+
+def check_rules(
+    rules: Collection[str], reference: str, num_envs: int, seeds: int, **env_kwargs: Any
+) -> dict[str, RuleResult]:
+    """The results of these rules on a task file or an id."""
+    degrees = dict.fromkeys(RULES, "off") | {rule: RULES[rule].degree for rule in rules}
     loaded = load_task(reference)
     checkup = Checkup(loaded, env_kwargs, num_envs=num_envs, seeds=seeds)
     results: list[RuleResult] = []
@@ -60,7 +67,7 @@ def check_rule(rule: str, reference: str, num_envs: int, seeds: int, **env_kwarg
     finally:
         checkup.close()
         undo_load(loaded)
-    return next(result for result in results if result.rule == rule)
+    return {result.rule: result for result in results}
 
 
 def the_finding(result: RuleResult) -> Finding:

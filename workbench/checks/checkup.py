@@ -18,6 +18,7 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
 from workbench.checks.places import Places
+from workbench.checks.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.core.broken_rule import Place
 from workbench.core.capture.inspect_env import list_contacts
 from workbench.core.env import actions
@@ -250,6 +251,19 @@ class Checkup:
             self.first_substep(self.task)
             found |= {seed: overlaps_of(self.task, env) for env, seed in enumerate(seeds)}
         return found
+
+    @evidence
+    def tensor_uses(self) -> TensorUses:
+        """What the author's lines do with tensors: at a build, a reset and three steps."""
+        watch = TensorWatch({str(file) for file in self.loaded.source_files})
+        with watch, self.env(NUM_ENVS) as task:
+            self.reset(task, self.seeds[0])
+            rng = np.random.default_rng(0)
+            for _ in range(3):
+                action = actions.random_action(task.parts, NUM_ENVS, rng)
+                with watch.step():
+                    self.step(task, action)
+        return watch.uses
 
     def first_substep(self, task: TaskEnv) -> None:
         """One substep of physics: the contacts that it finds are those of the state before it."""

@@ -66,6 +66,35 @@ class Places:
                 if not names or function.name in names:
                     yield module, function
 
+    def reached_from(self, *hooks: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
+        """These hooks of the task, and the author's functions that they name, directly or not."""
+        known: dict[str, list[tuple[Module, ast.FunctionDef]]] = {}
+        for module in self.modules:
+            for function in module.functions:
+                if function not in self._of_other_tasks:
+                    known.setdefault(function.name, []).append((module, function))
+        waiting, seen = list(hooks), set(hooks)
+        while waiting:
+            for module, function in known.get(waiting.pop(0), ()):
+                yield module, function
+                for node in ast.walk(function):
+                    name = getattr(node, "attr", getattr(node, "id", None))
+                    if name in known and name not in seen:
+                        seen.add(name)
+                        waiting.append(name)
+
+    @cached_property
+    def _of_other_tasks(self) -> frozenset[ast.FunctionDef]:
+        """Methods of further tasks in the files."""
+        mine = {cls.__name__ for cls in self._loaded.cls.__mro__}
+        found: set[ast.FunctionDef] = set()
+        for module in self.modules:
+            for node in ast.walk(module.tree):
+                if isinstance(node, ast.ClassDef) and node.name not in mine:
+                    if mine & {getattr(base, "attr", getattr(base, "id", "")) for base in node.bases}:
+                        found.update(part for part in ast.walk(node) if isinstance(part, ast.FunctionDef))
+        return frozenset(found)
+
     def entry(self, name: str) -> Place | None:
         """Where ``evaluate`` makes this entry, as a key or a keyword; else its ``def``."""
         for module, function in self.functions("evaluate"):

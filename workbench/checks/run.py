@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from workbench.authoring.problem import TaskError
-from workbench.checks import evaluate, reward
+from workbench.checks import devices, evaluate, files, reward, source
 from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of
 from workbench.checks.results import RuleResult, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
@@ -24,8 +24,10 @@ class Group:
 
 
 GROUPS: tuple[Group, ...] = (
+    Group("source", {**source.CHECKS, **files.CHECKS}),
     Group("success", evaluate.CHECKS),
     Group("rewards", reward.CHECKS),
+    Group("tensors", devices.CHECKS),
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"

@@ -1,0 +1,162 @@
+"""Rules of loops over envs, copies to the host and the device of tensors, with tasks that break and keep them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.checks.checked import Checked, check_rules, the_finding
+from workbench.checks.rules import RULES
+from workbench.checks.run import RuleResult
+
+BROKEN = Path(__file__).parents[2] / "tasks" / "broken"
+
+AT = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
+WITH_DEVICE = "        with torch.device(self.device):\n            b = len(env_idx)\n"
+GOAL = "            goal = cube + torch.tensor([GOAL_RADIUS + 0.1, 0, 0])\n"
+
+
+def in_evaluate(checked: Checked, rule: str, *lines: str) -> RuleResult:
+    return checked(rule, (AT, AT + "".join(f"        {line}\n" for line in lines)))
+
+
+@pytest.mark.parametrize("rule", ("loop-over-envs", "device-copies", "foreign-device"))
+def test_the_example_keeps_it(rule: str, checked: Checked) -> None:
+    assert checked(rule).state == "kept"
+
+
+@pytest.mark.parametrize(
+    "line",
+    (
+        "[i for i in range(self.num_envs)]",
+        "for row in self.cube.pose.p: row + 1",
+        "for i in range(len(self.cube._objs)): pass",
+        "n = self.num_envs; [i for i in range(n)]",
+        "torch.stack([p * 2 for p, q in zip(self.cube.pose.p, self.cube.pose.q)])",
+    ),
+)
+def test_a_loop_over_envs(line: str, checked: Checked) -> None:
+    finding = the_finding(in_evaluate(checked, "loop-over-envs", line))
+    assert finding.code == line and finding.function == "evaluate"
+
+
+def test_a_loop_in_what_evaluate_calls(checked: Checked) -> None:
+    method = "    def count(self):\n        return [i for i in range(self.num_envs)]\n\n    def evaluate("
+    finding = the_finding(
+        checked("loop-over-envs", ("    def evaluate(", method), (AT, f"{AT}        self.count()\n"))
+    )
+    assert finding.function == "count"
+
+
+def test_other_loops_are_none_over_envs(checked: Checked) -> None:
+    lines = (
+        "x, y, z = self.cube.pose.p[0]",
+        "for actor in (self.cube, self.goal): actor.pose.p",
+        "for joint in self.agent.robot.joints: joint.name",
+        "for axis in self.cube.pose.p.T: axis + 1",
+    )
+    assert in_evaluate(checked, "loop-over-envs", *lines).state == "kept"
+
+
+@pytest.mark.parametrize(
+    ("line", "written"),
+    (
+        ("float(distance[0])", "float(tensor)"),
+        ("distance.max().item()", ".item()"),
+        ("distance.cpu()", ".cpu()"),
+        ("distance.tolist()", ".tolist()"),
+        ("1 if (distance < 0.1).any() else 2", "if tensor:"),
+        ("self.cube.pose[0].sp", ".cpu()"),
+    ),
+)
+def test_a_copy_to_the_host(line: str, written: str, checked: Checked) -> None:
+    finding = the_finding(in_evaluate(checked, "device-copies", line))
+    assert written in finding.message and finding.code == line and " once in a step" in finding.message
+
+
+def test_a_copy_for_each_env(checked: Checked) -> None:
+    line = "torch.tensor([d.item() for d in distance])"
+    assert "for each env in a step" in the_finding(in_evaluate(checked, "device-copies", line)).message
+
+
+def test_copies_of_host_tensors_and_at_resets_are_none(checked: Checked) -> None:
+    edits = (
+        (AT, f"{AT}        float(torch.tensor([1.0, 2.0])[0])\n"),
+        (GOAL, f"{GOAL}            cube.cpu()\n"),
+    )
+    assert checked("device-copies", *edits).state == "kept"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    (
+        ("distance + torch.zeros(self.num_envs)",),
+        ("torch.where(distance < 1, torch.ones(1).expand(self.num_envs), distance)",),
+        ("x = torch.zeros(self.num_envs)", "x = x * 2", "torch.stack([x, distance])"),
+        ("x = torch.zeros(self.num_envs)", "x[distance < 1]"),
+        ("distance.clone()[distance < 1] = torch.zeros(self.num_envs)[distance.cpu() < 1]",),
+        ("distance.cpu() + distance",),
+        ("distance + torch.from_numpy(np.zeros(self.num_envs))",),
+        ("distance + torch.zeros(self.num_envs, device='cpu')",),
+        ("x = torch.zeros(self.num_envs)", "torch.zeros(self.num_envs, device=x.device) + distance"),
+        ("Pose.create_from_pq(torch.zeros((self.num_envs, 3))).p + self.cube.pose.p",),
+    ),
+)
+def test_a_host_tensor_meets_one_of_the_device(lines: tuple[str, ...], checked: Checked) -> None:
+    finding = the_finding(in_evaluate(checked, "foreign-device", *lines))
+    assert finding.code == lines[-1] and finding.function == "evaluate"
+
+
+def test_what_a_gpu_takes(checked: Checked) -> None:
+    lines = (
+        "distance + torch.tensor(2.0)",  # no dimension
+        "distance[torch.arange(2)]",  # an index
+        "self.cube.pose.p.clone()[:, :2] = torch.zeros(2)",  # copied over
+        "distance + torch.zeros(self.num_envs).to(self.device)",
+        "distance + torch.zeros(self.num_envs).to(distance)",
+        "distance + torch.zeros(self.num_envs, device=self.device)",
+        "distance + torch.zeros_like(distance)",
+        "distance + distance.new_zeros(self.num_envs)",
+        "x = torch.zeros(3) + torch.ones(3)",  # two of the host
+        "distance.clone().copy_(torch.zeros(self.num_envs))",
+        "Pose.create_from_pq(torch.zeros((self.num_envs, 3)), device=self.device).p + self.cube.pose.p",
+        "Pose.create_from_pq(torch.zeros((1, 3))).p + torch.ones((1, 3))",
+        "distance + torch.Tensor([1])",  # its origin is not seen
+        "self.cube.pose * sapien.Pose(p=[0, 0, 1])",
+    )
+    assert in_evaluate(checked, "foreign-device", *lines).state == "kept"
+
+
+def test_a_reset_and_a_build_without_a_device(checked: Checked) -> None:
+    no_context = WITH_DEVICE, "        if True:\n            b = len(env_idx)\n"
+    # A reset whose tensors all stay on the host works: set_pose() moves them.
+    assert checked("foreign-device", no_context).state == "kept"
+    mixed = GOAL, "            goal = self.cube.pose.p[env_idx] + torch.tensor([GOAL_RADIUS + 0.1, 0, 0])\n"
+    finding = the_finding(checked("foreign-device", no_context, mixed))
+    assert finding.function == "_initialize_episode" and finding.code.startswith("goal =")
+    assert checked("foreign-device", mixed).state == "kept"
+    buffer = '        self.goal = builder.build_kinematic(name="goal")\n'
+    kept = buffer, f"{buffer}        self.best = torch.zeros(self.num_envs)\n"
+    finding = the_finding(checked("foreign-device", kept, (AT, f"{AT}        self.best + distance\n")))
+    assert "made in line" in finding.message and finding.code == "self.best + distance"
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "line", "besides"),
+    (
+        ("tip_block", "loop-over-envs", "for i in range(self.num_envs):", set()),
+        ("gather_blocks", "unknown-name", "builder.inital_pose =", {"initial-pose", "robot-pose"}),
+        ("hover_over_cube", "foreign-device", "wanted = self.cube.pose.p + torch.tensor(", set()),
+        ("nudge_ball", "device-copies", "near = [1 - min(each.item(), 1)", {"loop-over-envs"}),
+    ),
+)
+def test_each_small_task_has_its_mistake_and_no_other(
+    name: str, rule: str, line: str, besides: set[str]
+) -> None:
+    results = check_rules(RULES, str(BROKEN / f"{name}.py"), num_envs=4, seeds=4)
+    assert the_finding(results[rule]).code.startswith(line)
+    broken = {each for each, result in results.items() if result.state == "broken"}
+    assert {each for each in broken if RULES[each].degree == "stop"} == set()
+    assert broken - {rule} <= besides
+    assert not [result for result in results.values() if result.state == "failed"]

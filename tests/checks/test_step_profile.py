@@ -1,0 +1,59 @@
+"""Where the time of a control step goes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.checks.checked import EXAMPLE
+from workbench.authoring.loading.load import load_task, undo_load
+from workbench.checks.checkup import Checkup
+from workbench.checks.step_profile import StepProfile, profile_step
+
+SLOW = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
+
+
+def profile(file: Path, text: str) -> StepProfile:
+    file.write_text(text)
+    loaded = load_task(str(file))
+    checkup = Checkup(loaded, num_envs=2, seeds=2)
+    try:
+        return profile_step(checkup, num_envs=4, steps=20)
+    finally:
+        checkup.close()
+        undo_load(loaded)
+
+
+def test_hooks_and_lines_share_the_step(tmp_path: Path) -> None:
+    found = profile(tmp_path / "task.py", EXAMPLE.read_text())
+    assert (found.num_envs, found.steps) == (4, 20) and found.milliseconds > 0
+    names = {hook.name: hook for hook in found.hooks}
+    assert {"evaluate", "compute_dense_reward", "_get_obs_extra", "physics", "controller"} <= set(names)
+    assert sum(hook.share for hook in found.hooks) == pytest.approx(1)
+    assert sum(hook.milliseconds for hook in found.hooks) == pytest.approx(found.milliseconds)
+    of_evaluate = [line for line in found.lines if line.hook == "evaluate"]
+    assert sum(line.milliseconds for line in of_evaluate) == pytest.approx(names["evaluate"].milliseconds)
+    assert names["evaluate"].place is not None and names["physics"].place is None
+    assert sys.gettrace() is None or "workbench" not in sys.gettrace().__module__  # type: ignore[union-attr]
+
+
+def test_a_slow_line_is_the_first(tmp_path: Path) -> None:
+    text = EXAMPLE.read_text()
+    assert SLOW in text
+    slow = "        self.wait()\n"
+    method = "    def wait(self):\n        import time\n        time.sleep(0.05)\n\n    def evaluate("
+    text = text.replace(SLOW, SLOW + slow).replace("    def evaluate(", method)
+    found = profile(tmp_path / "task.py", text)
+    line, hook = found.lines[0], found.hooks[0]
+    assert line.code == "time.sleep(0.05)" and line.hook == hook.name == "evaluate"
+    assert 45 < line.milliseconds <= hook.milliseconds <= found.milliseconds and line.share > 0.5
+    assert next(each for each in found.lines if each.code == "self.wait()").milliseconds < 5
+
+
+def test_the_reward_is_timed_without_the_hooks_that_it_calls(tmp_path: Path) -> None:
+    slow = "        reward = reach + push\n"
+    text = EXAMPLE.read_text().replace(slow, f"        import time; time.sleep(0.05)\n{slow}")
+    found = {hook.name: hook.milliseconds for hook in profile(tmp_path / "task.py", text).hooks}
+    assert found["compute_dense_reward"] > 45 > found["compute_normalized_dense_reward"]

@@ -1,0 +1,421 @@
+"""Checks of the task's class and registration, and of names and calls in its source."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from types import CodeType
+from typing import Any
+
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
+
+from workbench.authoring.loading import registry
+from workbench.checks.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.devices import EVERY_STEP
+from workbench.checks.places import Module
+from workbench.checks.reward import REWARD_HOOKS
+from workbench.core.broken_rule import Place
+from workbench.core.env.assets import robots_of
+
+HOOKS = tuple(
+    name for name, member in vars(BaseEnv).items() if callable(member) or isinstance(member, property)
+)
+AT_RESETS = ("_initialize_episode", "reset", *EVERY_STEP)
+"""Hooks that run after the GPU's simulation has begun."""
+_BUILDERS = {"create_actor_builder": ActorBuilder, "create_articulation_builder": ArticulationBuilder}
+_SEEDED = {"RandomState", "default_rng", "Generator", "SeedSequence", "PCG64", "Philox", "MT19937", "Random"}
+"""They are random of their own accord only without an argument."""
+_NO_DRAW = {"seed", "get_state", "set_state", "getstate", "setstate"}
+_GPU_CALLS = {"_gpu_apply_all", "_gpu_fetch_all"}
+_STATE = re.compile(r"(get_|set_)?(\w+_)?(pose|qpos|qvel|velocity|global_pose)$")
+_GUARDS = {
+    "gpu_sim_enabled",
+    "is_cuda",
+    "is_gpu_enabled",
+    "backend",
+    "sim_backend",
+    "_sim_device",
+    "device_type",
+}
+
+
+# --- the class and its registration --------------------------------------------------------------------
+
+
+def registered(checkup: Checkup) -> Iterator[Found | Note]:
+    """In ManiSkill's table."""
+    if _spec(checkup) is None:
+        yield Found(
+            f'{checkup.loaded.class_name} has no id: write @register_env("{_suggested_id(checkup)}", '
+            "max_episode_steps=100) above the class.",
+            checkup.places.task,
+        )
+
+
+def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
+    """The registered id."""
+    _needs_id(checkup)
+    env_id = checkup.loaded.env_id
+    if re.search(r"-v\d+$", env_id) is None:
+        yield Found(f"the id {env_id!r} has no version: write {env_id + '-v1'!r}.", _decorator(checkup))
+
+
+def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
+    """The registered limit."""
+    _needs_id(checkup)
+    if checkup.loaded.max_episode_steps is None:
+        yield Found(
+            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), as many "
+            "control steps as a slow success needs.",
+            _decorator(checkup),
+        )
+
+
+def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
+    """What was registered before this file was loaded."""
+    _needs_id(checkup)
+    for env_id in checkup.loaded.replaced_ids:
+        yield Found(
+            f"{env_id} is another task's: plain ManiSkill skips this class, and gym.make({env_id!r}) makes the "
+            "other. Choose an id that no task has.",
+            _decorator(checkup),
+        )
+
+
+def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the class, with the constructor's default."""
+    cls = checkup.loaded.cls
+    robot = robots_of(cls, checkup.loaded.default_kwargs)
+    supported = cls.SUPPORTED_ROBOTS
+    if supported is None:
+        if robot is None or robot in ("none", ()):
+            raise CannotCheck("its constructor names no robot")
+        yield Found(
+            f"the class does not say which robots it is for. Write SUPPORTED_ROBOTS = [{_named(robot)}].",
+            checkup.places.task,
+        )
+    elif robot is not None and robot not in supported and _as_tuple(robot) not in supported:
+        yield Found(
+            f"the default of robot_uids, {_named(robot)}, is not in SUPPORTED_ROBOTS: ManiSkill warns about each "
+            "env. Add it there.",
+            _class_value(checkup, "SUPPORTED_ROBOTS"),
+        )
+
+
+def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of the class, with the methods that it overrides."""
+    cls = checkup.loaded.cls
+    if cls.get_reward is not BaseEnv.get_reward:
+        raise CannotCheck("it has a get_reward() of its own")
+    for mode in cls.SUPPORTED_REWARD_MODES:
+        hook = REWARD_HOOKS.get(mode)
+        if mode == "none" or mode == "sparse":
+            continue
+        if hook is None:
+            why = f"ManiSkill knows no reward mode {mode!r}"
+        elif getattr(cls, hook) is getattr(BaseEnv, hook):
+            why = f"{mode!r} is among SUPPORTED_REWARD_MODES, and there is no {hook}()"
+        else:
+            continue
+        yield Found(
+            f"{why}: the first step in that mode raises NotImplementedError. "
+            f"Write SUPPORTED_REWARD_MODES = {_implemented(cls)!r}, or write the method.",
+            _class_value(checkup, "SUPPORTED_REWARD_MODES"),
+        )
+
+
+# --- names and calls in the source -----------------------------------------------------------------------
+
+
+def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
+    """By the source, with the names that the classes have."""
+    read = {
+        node.attr
+        for module in checkup.places.modules
+        for node in ast.walk(module.tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
+    }
+    for module, function in checkup.places.reached_from(*HOOKS):
+        builders = _builders(function)
+        for node in ast.walk(function):
+            if not isinstance(node, ast.Attribute) or not isinstance(node.value, ast.Name):
+                continue
+            known = builders.get(node.value.id)
+            if known is None or not isinstance(node.ctx, ast.Store) or node.attr in known | read:
+                continue
+            close = difflib.get_close_matches(node.attr, known, n=1, cutoff=0.6)
+            yield Found(
+                f"a builder has no attribute {node.attr!r}: Python sets it, and ManiSkill never reads it."
+                + (f" Write {close[0]!r}." if close else ""),
+                module.place(node, function.name),
+            )
+    known_self, known_scene = _names_of(checkup, checkup.loaded.cls), _names_of(checkup, ManiSkillScene)
+    for module, function in _methods_of_task(checkup):
+        for node in ast.walk(function):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                continue
+            owner, name = ast.unparse(node.func.value), node.func.attr
+            known = known_self if owner == "self" else known_scene if owner == "self.scene" else None
+            if known is None or name in known:
+                continue
+            close = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+            other = f" Write self.scene.{name}()." if owner == "self" and name in known_scene else ""
+            yield Found(
+                f"there is no {owner}.{name}(): this line raises AttributeError when it is reached."
+                + (other or (f" Write {owner}.{close[0]}()." if close else "")),
+                module.place(node, function.name),
+            )
+
+
+def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
+    """By the source of the hooks and what they call."""
+    at_resets = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
+    for module, function in checkup.places.reached_from(*HOOKS):
+        for node in ast.walk(function):
+            drawn = _drawn(node, module)
+            if drawn is None:
+                continue
+            write = (
+                "torch.rand((len(env_idx), ...)), which is seeded for the reset"
+                if function in at_resets
+                else "self._batched_episode_rng, which has a generator for each env's seed"
+            )
+            yield Found(
+                f"{drawn} is seeded by nobody: the same seed gives another episode. Draw from {write}.",
+                module.place(node, function.name),
+            )
+
+
+def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
+    """By the source of the hooks and what they call."""
+    after_begin = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
+    for module, function in checkup.places.reached_from(*HOOKS):
+        guarded = set(_guarded(function.body))
+        for node in ast.walk(function):
+            if not isinstance(node, ast.Attribute) or node in guarded:
+                continue
+            place = module.place(node, function.name)
+            if node.attr in _GPU_CALLS or (_is_px(node.value) and node.attr.startswith(("gpu_", "cuda_"))):
+                yield Found(
+                    f"{node.attr} exists in the GPU simulation only: on the CPU this line raises. Write it below "
+                    "`if self.gpu_sim_enabled:`.",
+                    place,
+                )
+            elif node.attr == "get_contacts" and (_is_px(node.value) or _ends_in(node.value, "scene")):
+                yield Found(
+                    "get_contacts() exists in the CPU simulation only: on a GPU this line raises. Use "
+                    "self.scene.get_pairwise_contact_forces(a, b), which has a row for each env.",
+                    place,
+                )
+            elif function in after_begin and _STATE.match(node.attr) and _is_one_object(node.value):
+                yield Found(
+                    f"{node.attr} of a SAPIEN object is the state of one env in the CPU simulation only: a GPU "
+                    "does not update it. Use the ManiSkill object itself, whose pose.p is (N, 3).",
+                    place,
+                )
+
+
+# --- parts of the above ------------------------------------------------------------------------------------
+
+
+def _spec(checkup: Checkup) -> Any:
+    if checkup.loaded.robot is not None:
+        raise CannotCheck("it is a robot in a scene of ManiSkill's")
+    return registry.environment(checkup.loaded.env_id)
+
+
+def _needs_id(checkup: Checkup) -> None:
+    if _spec(checkup) is None:
+        raise CannotCheck("it is not registered")
+
+
+def _suggested_id(checkup: Checkup) -> str:
+    return f"{checkup.loaded.class_name.removesuffix('Env')}-v1"
+
+
+def _decorator(checkup: Checkup) -> Place | None:
+    """The ``@register_env`` line; else the class."""
+    place = checkup.places.task
+    for module in checkup.places.modules:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ClassDef) and node.name == checkup.loaded.class_name:
+                for each in node.decorator_list:
+                    if "register_env" in ast.unparse(each):
+                        return module.file, each.lineno, node.name
+    return place
+
+
+def _class_value(checkup: Checkup, name: str) -> Place | None:
+    """Where the class, or one that it inherits in the author's files, assigns this; else the class."""
+    owners = [cls.__name__ for cls in checkup.loaded.cls.__mro__ if name in vars(cls)]
+    for module in checkup.places.modules:
+        for node in ast.walk(module.tree):
+            if not isinstance(node, ast.ClassDef) or node.name not in owners[:1]:
+                continue
+            for statement in node.body:
+                targets = getattr(statement, "targets", [getattr(statement, "target", None)])
+                if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+                    return module.file, statement.lineno, node.name
+    return checkup.places.task
+
+
+def _named(robot: Any) -> str:
+    return getattr(robot, "__name__", None) or repr(robot)
+
+
+def _as_tuple(robot: Any) -> Any:
+    return tuple(robot) if isinstance(robot, (list, tuple)) else robot
+
+
+def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
+    """Those of its reward modes that it has."""
+    have = [
+        mode
+        for mode in cls.SUPPORTED_REWARD_MODES
+        if mode in ("sparse", "none")
+        or (
+            mode in REWARD_HOOKS
+            and getattr(cls, REWARD_HOOKS[mode]) is not getattr(BaseEnv, REWARD_HOOKS[mode])
+        )
+    ]
+    return tuple(have) or ("none",)
+
+
+def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
+    """The attributes that the builders of each of the function's variables have."""
+    found: dict[str, set[str]] = {}
+    for node in ast.walk(function):
+        if not isinstance(node, ast.Assign):
+            continue
+        call = node.value
+        made = call.func.attr if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) else ""
+        for target in node.targets:
+            if isinstance(target, ast.Name) and made in _BUILDERS:
+                found.setdefault(target.id, set()).update(dir(_BUILDERS[made]()))
+    return found
+
+
+def _methods_of_task(checkup: Checkup) -> Iterator[tuple[Module, ast.FunctionDef]]:
+    """Methods of the task's class, and of those in the author's files that it inherits."""
+    names = {cls.__name__ for cls in checkup.loaded.cls.__mro__}
+    for module in checkup.places.modules:
+        for owner in ast.walk(module.tree):
+            if isinstance(owner, ast.ClassDef) and owner.name in names:
+                for node in owner.body:
+                    if isinstance(node, ast.FunctionDef) and node.args.args[:1]:
+                        yield module, node
+
+
+def _names_of(checkup: Checkup, cls: type) -> set[str]:
+    """All names that an object of this class may have: of its classes, those that the author's files assign or ask for
+    by ``hasattr``, and those that code outside these files reads or sets."""
+    own = {module.file for module in checkup.places.modules}
+    names = set(dir(cls))
+    for module in checkup.places.modules:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+                names.add(node.attr)
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                names.add(node.target.id)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                names.add(node.value)
+    for base in cls.__mro__:
+        for member in vars(base).values():
+            member = getattr(member, "fget", None) or getattr(member, "__func__", member)
+            code = getattr(inspect.unwrap(member) if callable(member) else member, "__code__", None)
+            if isinstance(code, CodeType) and code.co_filename not in own:
+                names.update(code.co_names)
+    return names
+
+
+def _drawn(node: ast.AST, module: Module) -> str | None:
+    """``np.random.rand()`` if the node is such a call."""
+    if not isinstance(node, ast.Call):
+        return None
+    written = ast.unparse(node.func)
+    first, *rest = written.split(".")
+    full = ".".join([_imports(module).get(first, first), *rest])
+    for owner in ("numpy.random.", "random."):
+        name = full.removeprefix(owner)
+        if name == full or first not in _imports(module):
+            continue
+        top = name.split(".")[0]
+        if top in _NO_DRAW or "(" in top or (top in _SEEDED and (node.args or node.keywords)):
+            return None
+        return f"{written}()"
+    if full == "scipy.spatial.transform.Rotation.random" and len(node.args) < 2 and not node.keywords:
+        return f"{written}()"
+    return None
+
+
+def _imports(module: Module) -> dict[str, str]:
+    """``np`` to ``numpy``, ``uniform`` to ``random.uniform``."""
+    found: dict[str, str] = {}
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Import):
+            for each in node.names:
+                found[each.asname or each.name.split(".")[0]] = (
+                    each.name if each.asname else each.name.split(".")[0]
+                )
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            for each in node.names:
+                found[each.asname or each.name] = f"{node.module}.{each.name}"
+    return found
+
+
+def _guarded(body: list[ast.stmt]) -> Iterator[ast.AST]:
+    """What stands behind a condition about the backend, in these statements and below."""
+    behind = False
+    for statement in body:
+        if behind:
+            yield from ast.walk(statement)
+            continue
+        for node in ast.walk(statement):
+            if isinstance(node, (ast.If, ast.IfExp, ast.BoolOp, ast.While)):
+                test = node.values[0] if isinstance(node, ast.BoolOp) else node.test
+                if _asks_for_backend(test):
+                    yield from ast.walk(node)
+            elif isinstance(node, ast.Try):
+                yield from ast.walk(node)
+        if isinstance(statement, ast.Assert):
+            behind = _asks_for_backend(statement.test)
+        if isinstance(statement, ast.If) and _asks_for_backend(statement.test):
+            behind = isinstance(statement.body[-1], (ast.Return, ast.Raise, ast.Continue))
+
+
+def _asks_for_backend(test: ast.expr) -> bool:
+    names = {getattr(node, "attr", getattr(node, "id", "")) for node in ast.walk(test)}
+    return not names.isdisjoint(_GUARDS) or any("gpu" in name or "cuda" in name for name in names)
+
+
+def _is_px(node: ast.expr) -> bool:
+    return _ends_in(node, "px") or _ends_in(node, "physx_system")
+
+
+def _ends_in(node: ast.expr, name: str) -> bool:
+    return getattr(node, "attr", getattr(node, "id", None)) == name
+
+
+def _is_one_object(node: ast.expr) -> bool:
+    """``self.cube._objs[0]``."""
+    return isinstance(node, ast.Subscript) and (
+        _ends_in(node.value, "_objs") or _ends_in(node.value, "_bodies")
+    )
+
+
+CHECKS: Mapping[str, Check] = {
+    "registered": registered,
+    "versioned-id": versioned_id,
+    "time-limit": time_limit,
+    "id-taken": id_taken,
+    "supported-robots": supported_robots,
+    "reward-modes": reward_modes,
+    "unknown-name": unknown_name,
+    "unseeded-random": unseeded_random,
+    "backend-only-call": backend_only_call,
+}
