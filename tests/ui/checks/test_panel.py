@@ -179,7 +179,7 @@ PROFILED = StepProfile(
     200,
     21.0,
     (HookTime("evaluate", 10.5, 0.5), HookTime("physics", 5.2, 0.25)),
-    (LineTime("/home/me/push.py", 88, "x < <i>", 7.35, 0.35, "evaluate"),),
+    (LineTime("evaluate", "/home/me/push.py", 88, "x < <i>", 7.35, 0.35),),
 )
 
 

@@ -56,7 +56,9 @@ class WorkerChecks:
         try:
             if isinstance(question, CheckGroup):
                 return self._check(checkup, question, on_result)
-            return _profile(checkup)
+            from workbench.checks.evidence.step_profile import profile_step
+
+            return profile_step(checkup)
         except _Ended:
             raise CannotAnswer("another request came") from None
 
@@ -111,7 +113,3 @@ def _core_rules() -> set[str]:
     from workbench.core.rules import RULES
 
     return set(RULES)
-
-
-def _profile(checkup: Checkup) -> StepProfile:
-    raise CannotAnswer("a step cannot be timed yet")
