@@ -11,8 +11,8 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
 from workbench.authoring.problem import TaskError
+from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
-from workbench.checks.run import RuleResult
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
 from workbench.core.rules import Degree, Finding

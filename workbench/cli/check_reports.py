@@ -14,8 +14,8 @@ from typing import Any
 from urllib.parse import quote
 from xml.etree import ElementTree
 
+from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
-from workbench.checks.run import RuleResult
 from workbench.core.rules import DEGREES, Degree, Finding
 from workbench.jobs.check import CheckOptions, CheckReport
 from workbench.ui.app.help_pages import find_topic

@@ -12,9 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, undo_load
-from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
-from workbench.checks.run import (
+from workbench.checks.by_hook.run import (
     CORE_GROUP,
     GROUPS,
     Group,
@@ -24,6 +22,8 @@ from workbench.checks.run import (
     run_core,
     run_group,
 )
+from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.keywords import constructor_arguments
 from workbench.core.rules import DEGREES, Degree, Finding, silences

@@ -69,7 +69,7 @@ class WorkerChecks:
         self._checkup = self._of = None
 
     def _check(self, checkup: Checkup, question: CheckGroup, on_result: OnResult) -> CheckedGroup:
-        from workbench.checks.run import CORE_GROUP, GROUPS, core_results, run_group
+        from workbench.checks.by_hook.run import CORE_GROUP, GROUPS, core_results, run_group
 
         degrees = question.degrees
         checked = {rule for group in GROUPS for rule in group.checks} | _core_rules()
