@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from workbench.checks.results import StepProfile
 from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.watched_thread import on_free_cores
 from workbench.session.protocol.messages import CannotAnswer
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, ProfileStep
 
@@ -55,7 +56,8 @@ class WorkerChecks:
         checkup = self._checkup_of(opened.loaded, options)
         try:
             if isinstance(question, CheckGroup):
-                return self._check(checkup, question, on_result)
+                with on_free_cores(self._waits):
+                    return self._check(checkup, question, on_result)
             from workbench.checks.evidence.step_profile import profile_step
 
             return profile_step(checkup)
