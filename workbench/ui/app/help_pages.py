@@ -31,7 +31,6 @@ OVERVIEW = "overview"
 GROUPS = (
     ("", "Use it"),
     ("reference", "Look something up"),
-    ("rules", "Look up a rule of the checks"),
     ("developers", "Change the workbench"),
 )
 """Folders of the documents, and what a reader wants who looks there."""
