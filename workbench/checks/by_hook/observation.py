@@ -72,8 +72,8 @@ def observation_constant(checkup: Checkup) -> Iterator[Found | Note]:
         if not together.size or not np.isfinite(together).all() or np.ptp(together, axis=0).max() > 0:
             continue
         value = together[0]
-        if np.isin(value, (0.0, 1.0)).all():
-            # A flag or a force, which random actions may never raise.
+        if np.isin(value, (0.0, 1.0)).all() or name.startswith("agent/"):
+            # A flag or a force, which random actions may never raise; or the robot's own, such as a palm that is fixed.
             yield Note(f"{name!r} of the observation is {_text(value)} in all states that were tried")
             continue
         yield Found(
