@@ -63,7 +63,7 @@ def check_rules(
     try:
         for group in GROUPS:
             results += run_group(group, checkup, degrees)  # type: ignore[arg-type]
-        results += core_results(checkup.findings, degrees)  # type: ignore[arg-type]
+        results += core_results(checkup.findings, checkup.silenced, degrees)  # type: ignore[arg-type]
     finally:
         checkup.close()
         undo_load(loaded)

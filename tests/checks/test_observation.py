@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.checks.checked import Checked, the_finding
+from tests.checks.checked import Checked, check_rule, the_finding
 
 RULES = ("observation-finite", "observation-constant", "observation-huge")
 GOAL = '"goal_pos": self.goal.pose.p,'
@@ -33,6 +33,19 @@ def test_an_observation_that_never_changes(checked: Checked) -> None:
 def test_a_flag_that_random_actions_never_raise_is_noted(checked: Checked) -> None:
     result = checked("observation-constant", (GOAL, f"{GOAL} 'held': self.agent.is_grasping(self.cube),"))
     assert result.state == "kept" and "'extra/held'" in result.notes[0]
+
+
+def test_what_the_robot_adds_and_never_changes_is_noted(checked: Checked) -> None:
+    """The palm of a hand that is fixed; what the task adds beside it is the author's."""
+    result = check_rule("observation-constant", "RotateSingleObjectInHandLevel0-v1", num_envs=2, seeds=2)
+    assert result.state == "kept" and any("'agent/palm_pose'" in note for note in result.notes)
+    extra = "    def _get_obs_extra("
+    agent = (
+        "    def _get_obs_agent(self):\n"
+        "        return {**super()._get_obs_agent(), 'base': self.agent.robot.pose.p}\n\n"
+    )
+    finding = the_finding(checked("observation-constant", (extra, agent + extra)))
+    assert "'agent/base'" in finding.message and finding.function == "_get_obs_agent"
 
 
 def test_an_observation_in_millimetres(checked: Checked) -> None:

@@ -68,6 +68,25 @@ def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path)
     assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "kept"}
 
 
+def test_a_finding_of_gpu_simulation_that_a_comment_silences_is_listed(
+    tmp_path: Path, child_process: None
+) -> None:
+    old, loses = LOSES_ROWS
+    why = "one target for each reset"
+    silenced = old, loses.rstrip("\n") + f"  # workbench: off[rows-lost] {why}\n"
+    for workers in (1, 2):
+        rules = ("rows-lost", "entry-name")[:workers]
+        report = check(options(task_of(tmp_path, silenced), *rules, workers=workers))
+        (result,) = report.of_state("silenced")
+        (one,) = result.silenced
+        assert (result.rule, one.reason, one.finding.degree) == ("rows-lost", why, "stop")
+        assert one.finding.code.startswith("self.drawn") and not report.fails("warn")
+    further = old, silenced[1] + loses.removeprefix(old).replace("drawn", "other")
+    result = check(options(task_of(tmp_path, further), "rows-lost")).results[0]
+    assert result.state == "broken" and len(result.silenced) == 1
+    assert [finding.code for finding in result.findings] == ["self.other = torch.rand((b, 2))"]
+
+
 def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_path: Path) -> None:
     task = task_of(tmp_path, RAISES)
     report = check(options(task, "runs", "reward-finite", "success-at-reset", "rows-lost"))

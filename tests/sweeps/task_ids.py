@@ -109,7 +109,7 @@ def _no_row(env_id: str, outcome: str, note: str) -> dict:
 
 def try_here(ids: Sequence[str]) -> None:
     """Print a row for each id."""
-    _refuse_the_network()
+    refuse_the_network()
     import torch
 
     # Four rows are too few to share: torch's threads cost more than they save.
@@ -133,7 +133,9 @@ def _tried(env_id: str) -> dict:
     return row
 
 
-def _refuse_the_network() -> None:
+def refuse_the_network() -> None:
+    """From here on, what reaches for the network raises."""
+
     def hook(event: str, details: tuple) -> None:
         if event in ("socket.connect", "socket.getaddrinfo") and "AF_UNIX" not in repr(details[0]):
             raise RuntimeError(f"something reached for the network: {event} {details[1:]}")

@@ -48,11 +48,14 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
         with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
             row = bar.add_task("opening", total=total)
             done: set[str] = set()
+            told: set[tuple[str, str]] = set()
 
             def show(result: RuleResult) -> None:
                 done.add(result.rule)
                 bar.update(row, completed=len(done))
-                if result.state in ("broken", "failed") and not err.is_terminal:
+                news = result.rule, result.state
+                if result.state in ("broken", "failed") and not err.is_terminal and news not in told:
+                    told.add(news)
                     # A bar in a file or a pipe is drawn once, at the end.
                     err.print(escape(f"{result.rule}: {result.state}"), soft_wrap=True)
 

@@ -95,6 +95,7 @@ class BrokenRules:
         """
         self._degrees, self._on_finding = degrees, on_finding
         self._rows: dict[_Key, _KeptFinding] = {}
+        self._silenced: dict[_Key, tuple[Finding, str]] = {}
         self._now: Occasion = "reset"
         self.more = 0
         """Breaches at places beyond `MOST_ROWS`."""
@@ -106,6 +107,11 @@ class BrokenRules:
     @property
     def rows(self) -> tuple[Finding, ...]:
         return tuple(row.finding for row in self._rows.values())
+
+    @property
+    def silenced(self) -> tuple[tuple[Finding, str], ...]:
+        """What a comment at its line silences, with the reason; its breaches are not counted."""
+        return tuple(self._silenced.values())
 
     def degree(self, rule: str) -> Degree:
         return self._degrees[rule]
@@ -131,7 +137,7 @@ class BrokenRules:
         if frames is not None:
             frames = frames or frames_of_the_task()
             place = place_of(frames)
-        if _is_silenced(place, rule):
+        if self._is_silenced(rule, message, place):
             return
         if degree == "stop":
             raise broken_at(BrokenRule(message, rule, place), frames or ())
@@ -146,11 +152,20 @@ class BrokenRules:
 
     def returned(self, rule: str, hook: str, problem: str, place: Place | None) -> None:
         """As `report_breach`, for the return value of a hook."""
-        if self._degrees[rule] == "off" or _is_silenced(place, rule):
+        message = f"{hook}() {problem}."
+        if self._degrees[rule] == "off" or self._is_silenced(rule, message, place):
             return
         if self._degrees[rule] == "stop":
             raise WrongReturn(problem, hook, rule, place)
-        self._note(rule, f"{hook}() {problem}.", place, hook, exact=False)
+        self._note(rule, message, place, hook, exact=False)
+
+    def _is_silenced(self, rule: str, message: str, place: Place | None) -> bool:
+        reason = None if place is None else reason_of_silence(place[0], place[1], rule)
+        if place is None or reason is None:
+            return False
+        found = Finding(rule, self._degrees[rule], message, None, None, "", "", 1, self.step)
+        self._silenced.setdefault((rule, place), (_at(found, place), reason))
+        return True
 
     def _note(self, rule: str, message: str, place: Place | None, subject: Hashable, exact: bool) -> None:
         self.serial += 1
@@ -191,11 +206,11 @@ class BrokenRules:
 
     def copy(self) -> tuple[Any, ...]:
         """The present rows, for `put_back`."""
-        return dict(self._rows), self.more
+        return dict(self._rows), dict(self._silenced), self.more
 
     def put_back(self, kept: tuple[Any, ...]) -> None:
         """Restore rows: another version was tried and not taken."""
-        self._rows, self.more = kept
+        self._rows, self._silenced, self.more = kept
         self.serial += 1
 
     def edited(self, place_now: Callable[[Finding], tuple[str, int] | None]) -> None:
@@ -204,7 +219,7 @@ class BrokenRules:
         Args:
             place_now: file and line of a row in the new version; None where its function changed.
         """
-        rows, self._rows = self._rows, {}
+        rows, self._rows, self._silenced = self._rows, {}, {}
         self.serial += 1
         for (rule, subject), row in rows.items():
             was = row.finding
@@ -214,10 +229,6 @@ class BrokenRules:
             there = (*place, was.function)
             key = rule, there if subject == (was.file, was.line, was.function) else subject
             self._rows[key] = replace(row, finding=_at(was, there), confirmed=False)
-
-
-def _is_silenced(place: Place | None, rule: str) -> bool:
-    return place is not None and reason_of_silence(place[0], place[1], rule) is not None
 
 
 def _at(row: Finding, place: Place) -> Finding:

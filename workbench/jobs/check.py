@@ -23,6 +23,7 @@ from workbench.checks.by_hook.run import (
     run_group,
 )
 from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.results import Silenced
 from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.keywords import constructor_arguments
@@ -84,6 +85,8 @@ class CheckUpdate:
     result: RuleResult | None = None
     finding: Finding | None = None
     """Of a rule of GPU simulation."""
+    silenced: Silenced | None = None
+    """Likewise, with a comment that silences it."""
 
 
 @dataclass(frozen=True)
@@ -190,6 +193,7 @@ class _Results:
         self._started = 0.0
         self._results: list[RuleResult] = []
         self._findings: list[Finding] = []
+        self._silenced: list[Silenced] = []
 
     def take(self, update: CheckUpdate) -> None:
         if update.task is not None and self._task is None:
@@ -201,11 +205,13 @@ class _Results:
             self._on_result(update.result)
         if update.finding is not None:
             self._findings.append(update.finding)
+        if update.silenced is not None:
+            self._silenced.append(update.silenced)
 
     def report(self, began: float, stopped: bool) -> CheckReport:
         # Stopped before the task was imported: nothing is known of it.
         task = self._task or CheckedTask("", "", None)
-        results = [*self._results, *core_results(self._findings, self._degrees)]
+        results = [*self._results, *core_results(self._findings, self._silenced, self._degrees)]
         by_rule: dict[str, list[RuleResult]] = {}
         for result in results:
             by_rule.setdefault(result.rule, []).append(result)
@@ -278,12 +284,14 @@ def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
 
 
 def _check_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree], queue: ItemQueue) -> None:
-    known = len(checkup.findings)
+    known, silenced = len(checkup.findings), len(checkup.silenced)
     run = run_core if group.name == CORE_GROUP else run_group
     for result in run(group, checkup, degrees):
         queue.send_update(CheckUpdate(result=result))
     for finding in checkup.findings[known:]:
         queue.send_update(CheckUpdate(finding=finding))
+    for one in checkup.silenced[silenced:]:
+        queue.send_update(CheckUpdate(silenced=one))
 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:

@@ -22,15 +22,20 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
         for loop in _loops_over_envs(function):
             place = module.place(loop.iter, function.name)
             found.setdefault(place[:2], place)
+    # Before anything runs: of a task that raises they are known too.
+    yield from map(_found_loop, found.values())
     for place in checkup.tensor_uses.iterated:
-        if _is_loop(checkup, place):
-            found.setdefault(place[:2], place)
-    for place in found.values():
-        yield Found(
-            f"{place[2]}() goes through the envs one by one in Python, at every step. Write it once for the whole "
-            "batch: pose.p is (N, 3), torch.linalg.norm(x, dim=1) gives (N,), torch.where(mask, a, b) chooses by env.",
-            place,
-        )
+        if _is_loop(checkup, place) and place[:2] not in found:
+            found[place[:2]] = place
+            yield _found_loop(place)
+
+
+def _found_loop(place: Place) -> Found:
+    return Found(
+        f"{place[2]}() goes through the envs one by one in Python, at every step. Write it once for the whole "
+        "batch: pose.p is (N, 3), torch.linalg.norm(x, dim=1) gives (N,), torch.where(mask, a, b) chooses by env.",
+        place,
+    )
 
 
 def device_copies(checkup: Checkup) -> Iterator[Found | Note]:

@@ -72,7 +72,7 @@ def observation_constant(checkup: Checkup) -> Iterator[Found | Note]:
         if not together.size or not np.isfinite(together).all() or np.ptp(together, axis=0).max() > 0:
             continue
         value = together[0]
-        if np.isin(value, (0.0, 1.0)).all() or name.startswith("agent/"):
+        if np.isin(value, (0.0, 1.0)).all() or _is_of_the_robot(checkup, name):
             # A flag or a force, which random actions may never raise; or the robot's own, such as a palm that is fixed.
             yield Note(f"{name!r} of the observation is {_text(value)} in all states that were tried")
             continue
@@ -146,6 +146,11 @@ def _place(checkup: Checkup, leaf: str) -> Place | None:
     if owner == "agent":
         return checkup.places.hook("_get_obs_agent")
     return checkup.places.entry(name.partition("/")[0] or leaf, "_get_obs_extra")
+
+
+def _is_of_the_robot(checkup: Checkup, leaf: str) -> bool:
+    """Whether the robot's class makes a leaf, and not the task."""
+    return leaf.startswith("agent/") and checkup.loaded.cls._get_obs_agent is BaseEnv._get_obs_agent
 
 
 def _text(value: NDArray[np.float64]) -> str:

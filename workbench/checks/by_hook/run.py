@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,20 +56,27 @@ CORE_RESETS = 6
 
 def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
     """The result of each rule of the group that is not off, as soon as it is known. Raises what `keep_going` raises."""
+    told: set[object] = set()
     for rule, check in group.checks.items():
         if degrees[rule] == "off":
             continue
         began = time.perf_counter()
+        seen: list[Found | Note] = []
         try:
-            seen = list(check(checkup))
+            for found in check(checkup):
+                seen.append(found)  # one by one: the next may raise
         except CannotCheck as reason:
             yield RuleResult(rule, "skipped", why=str(reason), seconds=time.perf_counter() - began)
             continue
         except TaskError as error:
             seconds = time.perf_counter() - began
-            yield RuleResult(rule, "failed", why=str(error), seconds=seconds)
-            if degrees["runs"] != "off" and rule != "runs":
-                yield result_of("runs", degrees["runs"], [raised(error)])
+            # What it had found before that is true all the same.
+            yield replace(
+                result_of(rule, degrees[rule], seen), state="failed", why=str(error), seconds=seconds
+            )
+            if degrees["runs"] != "off" and rule != "runs" and (cause := raised(error)) not in told:
+                told.add(cause)
+                yield result_of("runs", degrees["runs"], [cause])
             continue
         yield replace(result_of(rule, degrees[rule], seen), seconds=time.perf_counter() - began)
 
@@ -93,12 +100,23 @@ def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> I
             yield result_of("runs", degrees["runs"], [raised(error)])
 
 
-def core_results(findings: list[Finding], degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
+def core_results(
+    findings: list[Finding], silenced: list[Silenced], degrees: Mapping[str, Degree]
+) -> Iterator[RuleResult]:
     """The results of the rules of GPU simulation, of what was seen while the others were checked."""
     for rule in _core_rules(degrees):
         of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
         once = {each.key: each for each in of_rule}
-        yield RuleResult(rule, "broken" if once else "kept", tuple(once.values()))
+        off = {
+            each.finding.key: replace(each, finding=replace(each.finding, degree=degrees[rule]))
+            for each in silenced
+            if each.finding.rule == rule
+        }
+        yield RuleResult(rule, _state(once, off), tuple(once.values()), tuple(off.values()))
+
+
+def _state(findings: Sized, silenced: Sized) -> State:
+    return "broken" if findings else "silenced" if silenced else "kept"
 
 
 def _core_rules(degrees: Mapping[str, Degree]) -> list[str]:
@@ -118,6 +136,5 @@ def result_of(rule: str, degree: Degree, seen: list[Found | Note]) -> RuleResult
             findings.append(finding)
         else:
             silenced.append(Silenced(finding, reason))
-    state: State = "broken" if findings else "silenced" if silenced else "kept"
     notes = tuple(each.message for each in seen if isinstance(each, Note))
-    return RuleResult(rule, state, tuple(findings), tuple(silenced), notes)
+    return RuleResult(rule, _state(findings, silenced), tuple(findings), tuple(silenced), notes)

@@ -20,10 +20,12 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
 from workbench.checks.evidence.places import Places
 from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
+from workbench.checks.results import Silenced
 from workbench.core.backends import find_renderer
-from workbench.core.broken_rule import Place
+from workbench.core.broken_rule import BrokenRules, Place
 from workbench.core.capture.inspect_env import list_contacts
 from workbench.core.env import actions
+from workbench.core.env.assets import MissingAssets
 from workbench.core.env.evaluate_entries import flat_entries
 from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
@@ -166,6 +168,8 @@ class Checkup:
         self.merges: list[Merged] = []
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
+        self._built_with_renderer = False
+        self._rules: BrokenRules | None = None
         self._looked: dict[Callable[[Checkup], Any], Any] = {}
 
     def close(self) -> None:
@@ -187,7 +191,7 @@ class Checkup:
             render: False makes no renderer, unless the task needs one to be built.
             kwargs: keyword arguments of the task class in place of the given ones.
         """
-        task = self._made(num_envs or self.num_envs, render, rules, kwargs)
+        task = self._made(num_envs or self.num_envs, render or self._needs_renderer, rules, kwargs)
         try:
             yield task
         finally:
@@ -195,11 +199,39 @@ class Checkup:
 
     @evidence
     def task(self) -> TaskEnv:
-        """`num_envs` envs without a renderer, which check the rules of GPU simulation. Whoever uses it resets it first."""
+        """`num_envs` envs, which check the rules of GPU simulation, without a renderer unless the task needs one to be
+        built. Whoever uses it resets it first."""
         with noting_builds(self.builds, self.merges, self.files):
-            made = self._made(self.num_envs, False, "warn", {})
+            try:
+                made = self._made(self.num_envs, False, "warn", {})
+            except TaskError as error:
+                # What a task wants of a renderer can fail in many ways: only trying says whether that was it.
+                if isinstance(error.__cause__, (MissingAssets, ImportError)) or not self._may_render:
+                    raise
+                for noted in (self.findings, self.builds, self.merges):
+                    noted.clear()
+                made = self._made(self.num_envs, True, "warn", {})
+                self._built_with_renderer = True
         self._open.append(made)
+        self._rules = made.broken_rules
         return made
+
+    @property
+    def silenced(self) -> list[Silenced]:
+        """Breaches of the rules of GPU simulation that a comment silences, seen so far."""
+        known = () if self._rules is None else self._rules.silenced
+        return [Silenced(finding, reason) for finding, reason in known]
+
+    @property
+    def _needs_renderer(self) -> bool:
+        """Whether the task cannot be built without one."""
+        return bool(self.task) and self._built_with_renderer
+
+    @property
+    def _may_render(self) -> bool:
+        """Whether a build without a renderer can be made with one: an argument may name one, or none."""
+        given = {**self.loaded.default_kwargs, **self.env_kwargs}
+        return "render_backend" not in given and find_renderer() is not None
 
     @evidence
     def pictured(self) -> TaskEnv:

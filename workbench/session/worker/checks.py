@@ -85,7 +85,7 @@ class WorkerChecks:
             }
             results = run_group(GROUPS[question.group], checkup, left)  # type: ignore[arg-type]
         else:
-            results = core_results(checkup.findings, degrees)
+            results = core_results(checkup.findings, checkup.silenced, degrees)
         for done, result in enumerate(results, 1):
             on_result(done, total, result)
         if question.group >= len(GROUPS):

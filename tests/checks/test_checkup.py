@@ -1,0 +1,47 @@
+"""What checks share: envs with a renderer where there must be one, and what is told of a task that raises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.checks.checked import EXAMPLE, Checked
+from workbench.authoring.loading.load import load_task, undo_load
+from workbench.checks.by_hook.run import GROUPS, run_group
+from workbench.checks.evidence.checkup import Checkup
+
+
+def test_a_task_that_cannot_be_built_without_a_renderer_gets_one(renderer: None) -> None:
+    loaded = load_task("PushT-v1")
+    checkup = Checkup(loaded, num_envs=2, seeds=2)
+    try:
+        with checkup.env(1) as task:
+            assert checkup.reset(task, 0).poses.shape[0] == 1
+        names = [each.name for each in checkup.builds if each.place is not None]
+        assert names and len(names) == len(set(names)), "the build that raised is forgotten"
+    finally:
+        checkup.close()
+        undo_load(loaded)
+
+
+def test_a_task_that_raises_with_a_renderer_too_is_told_once(renderer: None, tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    file.write_text(EXAMPLE.read_text().replace('name="goal"', "name=self.gone"))
+    loaded = load_task(str(file))
+    checkup = Checkup(loaded, num_envs=2, seeds=2)
+    try:
+        group = next(group for group in GROUPS if "loop-over-envs" in group.checks)
+        results = list(run_group(group, checkup, dict.fromkeys(("runs", *group.checks), "warn")))
+    finally:
+        checkup.close()
+        undo_load(loaded)
+    (runs,) = (result for result in results if result.rule == "runs")
+    assert "self.gone" in runs.findings[0].code
+    assert {result.state for result in results if result is not runs} == {"failed"}
+
+
+def test_a_loop_in_the_source_is_told_where_the_task_cannot_be_built(checked: Checked) -> None:
+    at = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
+    loop = "        for i in range(self.num_envs): pass\n"
+    result = checked("loop-over-envs", (at, at + loop), ('name="goal"', "name=self.gone"))
+    assert result.state == "failed" and "gone" in result.why
+    assert [finding.code for finding in result.findings] == [loop.strip()]

@@ -1,0 +1,166 @@
+"""All rules of `workbench check` over every id in ManiSkill's registry that needs no download.
+
+    python -m tests.sweeps.check_tasks                  all ids, into check_tasks.json
+    python -m tests.sweeps.check_tasks PickCube-v1 ...  some ids
+
+Each id gets a process of its own: a task that ends the process or never returns is one row. Nothing can be asked
+there and nothing fetched, and ManiSkill's folder for downloads is an empty one. What is found is read by a person and
+told in web_assets/docs/reference/checked_tasks.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tests.sweeps.task_ids import refuse_the_network, registered_ids
+
+FILE = Path("check_tasks.json")
+NUM_ENVS = 4
+SEEDS = 8
+LIMIT = 900.0
+"""Seconds for one id: the slowest needs 60 alone on a core, and a tenth of a core on a busy machine."""
+CRASHES = ("crashed", "hung")
+
+
+def sweep(ids: Sequence[str], workers: int, limit: float = LIMIT) -> Iterator[dict[str, Any]]:
+    """A row for each id, as they are done."""
+    with tempfile.TemporaryDirectory() as nothing_downloaded, ThreadPoolExecutor(workers) as pool:
+        os.environ["MS_ASSET_DIR"] = nothing_downloaded
+        # Forked from a process that has imported all, which takes ten seconds, and has used nothing.
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["mani_skill.envs", "workbench.jobs.check"])
+        for done in as_completed([pool.submit(_row, context, env_id, limit) for env_id in ids]):
+            yield done.result()
+
+
+def _row(context: Any, env_id: str, limit: float) -> dict[str, Any]:
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=check_here, args=(env_id, sender))
+    begun = time.monotonic()
+    child.start()
+    sender.close()
+    try:
+        row = (
+            receiver.recv()
+            if receiver.poll(limit)
+            else {"outcome": "hung", "why": f"nothing in {limit:.0f} s"}
+        )
+    except EOFError:
+        child.join()
+        row = {"outcome": "crashed", "why": f"the process ended with status {child.exitcode}"}
+    child.kill()
+    child.join()
+    return {"env_id": env_id, "wall": round(time.monotonic() - begun, 1), **row}
+
+
+# --- in the child ------------------------------------------------------------------------------------
+
+
+def check_here(env_id: str, sender: Any) -> None:
+    """Send the row of one id."""
+    # What the task prints is not wanted, and it can ask nothing.
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):
+        os.dup2(nothing, stream)
+    refuse_the_network()
+    try:
+        row = _needs(env_id) or _checked(env_id)
+    except Exception:
+        row = {"outcome": "crashed", "why": traceback.format_exc()}
+    sender.send(row)
+
+
+def _needs(env_id: str) -> dict[str, Any] | None:
+    """The row of an id that cannot be built without a download or a further package."""
+    import mani_skill.envs  # noqa: F401  registers the ids
+    from mani_skill.utils.registration import REGISTERED_ENVS
+
+    from workbench.core.env.assets import MissingAssets
+    from workbench.core.env.task_env import EnvOptions, make_env
+
+    spec = REGISTERED_ENVS[env_id]
+    options = EnvOptions(1, "cpu", render=False, rules="off")
+    with suppress(Exception):  # the checks say it
+        try:
+            make_env(
+                spec.cls, options, asset_ids=spec.asset_download_ids or (), default_kwargs=spec.default_kwargs
+            ).close()
+        except MissingAssets as missing:
+            return {"outcome": "download", "why": ", ".join(missing.names) or str(missing)}
+        except ImportError as missing:
+            return {"outcome": "package", "why": str(missing)}
+    return None
+
+
+def _checked(env_id: str) -> dict[str, Any]:
+    from workbench.jobs.check import CheckOptions, check
+    from workbench.jobs.task import TaskOptions
+
+    what = CheckOptions(env_id, TaskOptions(num_envs=NUM_ENVS), seeds=SEEDS, workers=1)
+    report = check(what)
+    return {
+        "outcome": "checked",
+        "seconds": round(report.seconds - report.start_seconds, 1),
+        "states": dict(Counter(result.state for result in report.results)),
+        "findings": [asdict(finding) for finding in report.findings],
+        "silenced": [asdict(one) for result in report.results for one in result.silenced],
+        "notes": {result.rule: list(result.notes) for result in report.results if result.notes},
+        "undecided": {result.rule: result.why for result in report.of_state("failed")},
+        "skipped": {result.rule: result.why for result in report.of_state("skipped")},
+        "slowest": {
+            result.rule: round(result.seconds, 1)
+            for result in sorted(report.results, key=lambda result: -result.seconds)[:5]
+        },
+    }
+
+
+# --- the report --------------------------------------------------------------------------------------
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """What came of one id, for the terminal."""
+    if row["outcome"] != "checked":
+        return f"{row['env_id']}: {row['outcome']}: {row['why']}"
+    rules = Counter(finding["rule"] for finding in row["findings"])
+    found = ", ".join(f"{rule} ({count})" for rule, count in rules.items()) or "nothing"
+    undecided = f"; not decided: {', '.join(row['undecided'])}" if row["undecided"] else ""
+    return f"{row['env_id']}: {found}{undecided}; {row['seconds']} s"
+
+
+def main(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.sweeps.check_tasks",
+        description="All rules over every id that needs no download.",
+    )
+    parser.add_argument("ids", nargs="*")
+    parser.add_argument("--json", type=Path, default=FILE)
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for one id")
+    given = parser.parse_args(arguments)
+    rows: list[dict[str, Any]] = []
+    for row in sweep(given.ids or registered_ids(), given.workers, given.limit):
+        print(line_of(row), flush=True)
+        rows.append(row)
+        given.json.write_text(json.dumps(rows, indent=1))
+    outcomes = Counter(row["outcome"] for row in rows)
+    findings = sum(len(row.get("findings", ())) for row in rows)
+    print(f"{dict(outcomes)}, {findings} findings. Written to {given.json}.")
+    return int(any(outcomes[crash] for crash in CRASHES))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
