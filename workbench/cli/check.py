@@ -145,6 +145,8 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     words += [f"{counts[state]} {state}" for state in ("silenced", "skipped") if counts[state]]
     words += [f"{counts['failed']} not decided"] if counts["failed"] else []
     seconds = f"{report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
+    if report.picture_seconds:
+        seconds += f" and {report.picture_seconds:.1f} s for the first pictures"
     _print(f"{_safe(report.task.env_id)}: {', '.join(words)}. {seconds}.")
 
 

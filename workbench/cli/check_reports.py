@@ -77,6 +77,7 @@ def as_json(said: Reported) -> str:
             "first_seed": what.options.seed,
             "seconds": round(report.seconds, 3),
             "start_seconds": round(report.start_seconds, 3),
+            "picture_seconds": round(report.picture_seconds, 3),
             "fail_on": said.fail_on,
             "fails": report.fails(said.fail_on),
             "counts": dict(Counter(result.state for result in report.results)),

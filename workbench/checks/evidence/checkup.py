@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import linecache
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -150,6 +151,8 @@ class Checkup:
         self.builds: list[Built] = []
         """What `task` has built."""
         self.merges: list[Merged] = []
+        self.picture_seconds = 0.0
+        """For the first pictures: a process compiles its shaders then."""
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
         self._built_with_renderer = False
@@ -230,8 +233,10 @@ class Checkup:
             raise CannotCheck("it has no observations with pictures")
         if find_renderer() is None:
             raise CannotCheck("there is nothing to render with")
+        began = time.monotonic()
         made = self._made(PICTURED_ENVS, True, "off", {"obs_mode": wanted[0]})
         self._open.append(made)
+        self.picture_seconds = time.monotonic() - began
         return made
 
     def look(self, see: Callable[[Checkup], _Value]) -> _Value:
