@@ -42,7 +42,7 @@ class Options:
 def measure(num_envs: int, steps: int) -> str:
     task = TaskEnv(make_env(PickCubeEnv, EnvOptions(num_envs=num_envs, backend="cpu", render=False)), 50)
     rng = np.random.default_rng(0)
-    table = EnvTable(read_geometry(task.env), task.reset(seed=0), task.control_dt, task.env.reward_mode)
+    table = EnvTable(read_geometry(task.env), task.reset(seed=0), task.control_dt, task.env.reward_mode, {})
     packer, history = SnapshotPacker(), History(table, 2**40)
     laps: dict[str, list[float]] = {"step": [], "snapshot": [], "parts": [], "message": [], "keep": []}
     sizes: list[int] = []

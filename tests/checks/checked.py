@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from workbench.authoring.loading.load import load_task, undo_load
+from workbench.checks.by_hook.run import GROUPS, RuleResult, core_results, run_group
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.rules import RULES
-from workbench.checks.run import GROUPS, RuleResult, core_results, run_group
 from workbench.core.rules import Finding
 
 EXAMPLE = Path(__file__).parents[2] / "tasks" / "push_cube.py"

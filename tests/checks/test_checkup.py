@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tests.checks.checked import EXAMPLE, Checked
 from workbench.authoring.loading.load import load_task, undo_load
+from workbench.checks.by_hook.run import GROUPS, run_group
 from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.run import GROUPS, run_group
 
 
 def test_a_task_that_cannot_be_built_without_a_renderer_gets_one(renderer: None) -> None:

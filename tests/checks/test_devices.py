@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.checks.checked import Checked, the_finding
-from workbench.checks.run import RuleResult
+from workbench.checks.by_hook.run import RuleResult
 
 AT = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 WITH_DEVICE = "        with torch.device(self.device):\n            b = len(env_idx)\n"

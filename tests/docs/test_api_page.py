@@ -10,7 +10,7 @@ import workbench
 from tests.docs.pages import DOCS
 
 
-def test_what_is_importable_by_promise_is_on_its_page() -> None:
+def test_what_is_importable_by_promise_is_on_its_page(child_process: None) -> None:
     told = re.findall(r"^\| `workbench\.(\w+)\(", (DOCS / "reference" / "api.md").read_text(), re.M)
     assert sorted(told) == sorted(workbench.__all__)
     for name in workbench.__all__:

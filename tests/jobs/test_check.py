@@ -9,8 +9,8 @@ import pytest
 from mani_skill.utils import assets
 
 from workbench.authoring.problem import TaskError
+from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
-from workbench.checks.run import RuleResult
 from workbench.core.rules import Finding
 from workbench.jobs.check import CheckOptions, CheckReport, check, comments_without_effect, merged
 from workbench.jobs.pool import Processes

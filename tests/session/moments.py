@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.ui.scenes import OUTLIER_FINDINGS
 from workbench.core.env.step_result import StepResult
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.jobs.task import Restored, Stepped
@@ -42,7 +43,7 @@ def table(first: StepResult | None = None) -> EnvTable:
     count, bodies = first.poses.shape[:2]
     names = tuple(f"body {k}" for k in range(bodies))
     geometry = SceneGeometry(count, names, ("static",) * bodies, (False,) * bodies, ())
-    return EnvTable(geometry, first, 0.05, "dense")
+    return EnvTable(geometry, first, 0.05, "dense", OUTLIER_FINDINGS)
 
 
 def mask_of(envs: tuple[int, ...]) -> np.ndarray:

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode, Outlier, OutlierKind
+from workbench.core.capture.outliers import Outlier, OutlierKind
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
 
 FELL = Outlier(OutlierKind.DROPPED, 12, "cube dropped 0.90 m")
 

@@ -9,7 +9,9 @@ import trimesh
 
 from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraInfo, CameraKind
+from workbench.core.capture.outliers import OUTLIER_RULES
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
 from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.jobs.task import ActionDimension, TaskDescription
 from workbench.session.live.view import SessionView
@@ -35,6 +37,9 @@ def visual(
     envs = np.arange(num_envs, dtype=np.int32)
     return Visual(name, mesh, Material(colour, texture=texture), envs, np.full(num_envs, body, np.int32))
 
+
+OUTLIER_FINDINGS = {rule: Finding(rule, "warn", "", None, None, "", "", 0, 0) for rule in OUTLIER_RULES}
+"""`TaskDescription.outlier_rules` of a task without files."""
 
 BODIES: tuple[tuple[str, BodyKind], ...] = (
     ("ground", "static"),

@@ -244,7 +244,7 @@ def check_step_returns(
         reward: (N,) real numbers, or bools, which the rule `reward-rows` reports; None if no reward was computed.
 
     With one env shape () is allowed too. Tensors may be on any device. The problem's stage is ``returns``; its place is in
-    `source_files`, or None if the hook is inherited. NaN has the right shape: `session.history.env_table` marks it.
+    `source_files`, or None if the hook is inherited. NaN has the right shape: `core.capture.outliers` tells of it.
     """
     from workbench.core.env.evaluate_entries import (  # torch, which the server does without
         no_reward,

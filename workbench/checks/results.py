@@ -65,40 +65,42 @@ def counts(results: Iterable[RuleResult]) -> Counter[State]:
 
 @dataclass(frozen=True)
 class HookTime:
-    """Time of one hook in a control step."""
+    """What a hook, or a part of ManiSkill's own, takes of a control step; without the hooks that it calls."""
+
+    name: str
+    """As ``evaluate``, or ``physics``."""
+    milliseconds: float
+    share: float
+    """Of the step, 0 to 1."""
+    place: tuple[str, int, str] | None = None
+    """File, line and name where the author defines it; None for ManiSkill's own."""
+
+
+@dataclass(frozen=True)
+class LineTime:
+    """What a line of the author's takes of a control step, with what it calls outside the author's files."""
 
     hook: str
-    """Its name; ``physics`` and ``other`` for what is ManiSkill's own."""
+    """The hook that ran it."""
+    file: str
+    line: int
+    """1-based."""
+    code: str
+    """Its text, stripped."""
     milliseconds: float
-    """Of one control step of the batch, on average."""
     share: float
     """Of the step, 0 to 1."""
 
 
 @dataclass(frozen=True)
-class LineTime:
-    """Time of one line of the author in a control step, with all that it calls."""
-
-    file: str
-    line: int
-    code: str
-    milliseconds: float
-    """As `HookTime.milliseconds`."""
-    share: float
-    hook: str = ""
-    """The hook that it is in."""
-
-
-@dataclass(frozen=True)
 class StepProfile:
-    """Where a control step goes."""
+    """The mean of some control steps."""
 
     num_envs: int
     steps: int
-    """Control steps that were timed."""
     milliseconds: float
-    """Of one control step of the batch, on average."""
+    """Of one step of all envs."""
     hooks: tuple[HookTime, ...]
-    """Longest first."""
+    """Longest first; their shares add up to 1."""
     lines: tuple[LineTime, ...]
-    """Longest first; those that matter."""
+    """Longest first."""

@@ -220,6 +220,13 @@ _TABLE = (
         "Quaternions are in the order w, x, y, z.",
         "Bodies lie on their sides or upside down (x, y, z, w is SciPy's and ROS's order).",
     ),
+    Rule(
+        "bodies-stay",
+        "warn",
+        "While the task runs, bodies neither fly off nor fall out of the scene.",
+        "An episode without the body cannot be solved, and its numbers leave the range of all others.",
+        "step",
+    ),
     # --- evaluate --------------------------------------------------------------------------------------------
     Rule(
         "success-at-reset",
@@ -261,6 +268,13 @@ _TABLE = (
         "warn",
         "Every entry of evaluate() has a row for each env.",
         "Vectorised wrappers and loggers cannot slice it by env, and fail or drop it.",
+        "evaluate",
+    ),
+    Rule(
+        "entries-finite",
+        "warn",
+        "Numbers that evaluate() returns are finite.",
+        "A mean over envs or episodes is NaN as soon as one of them is, and a comparison with NaN is false.",
         "evaluate",
     ),
     # --- rewards ---------------------------------------------------------------------------------------------

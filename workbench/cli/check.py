@@ -11,8 +11,8 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
 from workbench.authoring.problem import TaskError
+from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
-from workbench.checks.run import RuleResult
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
 from workbench.core.rules import Degree, Finding
@@ -145,6 +145,8 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     words += [f"{counts[state]} {state}" for state in ("silenced", "skipped") if counts[state]]
     words += [f"{counts['failed']} not decided"] if counts["failed"] else []
     seconds = f"{report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
+    if report.picture_seconds:
+        seconds += f" and {report.picture_seconds:.1f} s for the first pictures"
     _print(f"{_safe(report.task.env_id)}: {', '.join(words)}. {seconds}.")
 
 

@@ -14,8 +14,8 @@ from typing import Any
 from urllib.parse import quote
 from xml.etree import ElementTree
 
+from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
-from workbench.checks.run import RuleResult
 from workbench.core.rules import DEGREES, Degree, Finding
 from workbench.jobs.check import CheckOptions, CheckReport
 from workbench.ui.app.help_pages import find_topic
@@ -77,6 +77,7 @@ def as_json(said: Reported) -> str:
             "first_seed": what.options.seed,
             "seconds": round(report.seconds, 3),
             "start_seconds": round(report.start_seconds, 3),
+            "picture_seconds": round(report.picture_seconds, 3),
             "fail_on": said.fail_on,
             "fails": report.fails(said.fail_on),
             "counts": dict(Counter(result.state for result in report.results)),

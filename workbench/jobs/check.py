@@ -12,10 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, undo_load
-from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.results import Silenced
-from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
-from workbench.checks.run import (
+from workbench.checks.by_hook.run import (
     CORE_GROUP,
     GROUPS,
     Group,
@@ -25,6 +22,9 @@ from workbench.checks.run import (
     run_core,
     run_group,
 )
+from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.results import Silenced
+from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.keywords import constructor_arguments
 from workbench.core.rules import DEGREES, Degree, Finding, silences
@@ -85,6 +85,8 @@ class CheckUpdate:
     result: RuleResult | None = None
     finding: Finding | None = None
     """Of a rule of GPU simulation."""
+    picture_seconds: float = 0.0
+    """For the first pictures of a process."""
     silenced: Silenced | None = None
     """Likewise, with a comment that silences it."""
 
@@ -99,6 +101,8 @@ class CheckReport:
     seconds: float
     start_seconds: float
     """Of those, until the first process had imported the task."""
+    picture_seconds: float = 0.0
+    """Of those, for the first pictures: shaders are compiled then."""
     stopped: bool = False
 
     @property
@@ -191,6 +195,7 @@ class _Results:
         self._degrees, self._on_activity, self._on_result = degrees, on_activity, on_result
         self._task: CheckedTask | None = None
         self._started = 0.0
+        self._picture_seconds = 0.0
         self._results: list[RuleResult] = []
         self._findings: list[Finding] = []
         self._silenced: list[Silenced] = []
@@ -205,6 +210,7 @@ class _Results:
             self._on_result(update.result)
         if update.finding is not None:
             self._findings.append(update.finding)
+        self._picture_seconds = max(self._picture_seconds, update.picture_seconds)
         if update.silenced is not None:
             self._silenced.append(update.silenced)
 
@@ -217,7 +223,8 @@ class _Results:
             by_rule.setdefault(result.rule, []).append(result)
         ordered = tuple(merged(by_rule[rule]) for rule in RULES if rule in by_rule)
         now = time.monotonic()
-        return CheckReport(task, ordered, now - began, (self._started or now) - began, stopped)
+        started = (self._started or now) - began
+        return CheckReport(task, ordered, now - began, started, self._picture_seconds, stopped)
 
 
 def merged(results: Iterable[RuleResult]) -> RuleResult:
@@ -275,6 +282,7 @@ def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
                 number = taken
                 queue.send_update(CheckUpdate(activity=groups[number].name))
                 _check_group(groups[number], checkup, degrees, queue)
+                queue.send_update(CheckUpdate(picture_seconds=checkup.picture_seconds))
                 queue.send_result(number, None)
         except _Stopped:
             pass

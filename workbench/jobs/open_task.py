@@ -25,6 +25,7 @@ from workbench.authoring.problem import (
     check_step_returns,
     shorten,
 )
+from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
 from workbench.core.broken_rule import BrokenRule, class_is_installed, warn_of
 from workbench.core.cameras.render import list_cameras, recorded_pictures, segmentation_names, take_pictures
@@ -207,7 +208,11 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
         description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
-        description = replace(description, notices=notices_of(loaded, options))
+        description = replace(
+            description,
+            notices=notices_of(loaded, options),
+            outlier_rules=rules_of_outliers(loaded, options.rules),
+        )
         clock.lap("geometry")
     except BaseException:
         env.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,7 @@ from workbench.core.camera_data import CameraInfo, CameraKey, Picture
 from workbench.core.cameras.report import ObjectToSee
 from workbench.core.env.keywords import HowMade
 from workbench.core.env.step_result import StepResult
-from workbench.core.rules import Degree
+from workbench.core.rules import Degree, Finding
 from workbench.core.scene.shapes import SceneGeometry
 
 Backend = Literal["auto", "cpu", "gpu"]
@@ -132,6 +133,9 @@ class TaskDescription:
     """Notices about a task that works, as sentences."""
     parse_cameras: str = "parse_camera_configs"
     """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
+    outlier_rules: Mapping[str, Finding] = field(default_factory=dict)
+    """The rules that an outlier can break, by id, each as a finding without a breach at the hook that it guards; without
+    those that are off, or silenced there."""
     made: HowMade = HowMade()
     """How the envs are made: robot, modes and the task's own keyword arguments."""
 

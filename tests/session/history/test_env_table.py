@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.ui.scenes import step_of, table_scene
+from tests.ui.scenes import OUTLIER_FINDINGS, step_of, table_scene
+from workbench.core.capture.outliers import OutlierKind
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped
 from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, EnvTable, Outcome
@@ -72,7 +73,7 @@ def past() -> History:
     geometry, poses = table_scene(N)
     first = step_of(poses, success=np.zeros(N, bool), fail=np.zeros(N, bool))
     first = replace(first, elapsed_steps=np.zeros(N, np.int32))
-    return History(EnvTable(geometry, first, 0.05, "dense"), 10**9)
+    return History(EnvTable(geometry, first, 0.05, "dense", OUTLIER_FINDINGS), 10**9)
 
 
 NO = {"success": False, "fail": False, "near": False}
@@ -237,6 +238,41 @@ def told(step: StepResult, jumped: tuple[int, ...], restored: Restored | None) -
 
 def outlier_steps(history: History) -> dict[int, list[int]]:
     return {env: [o.step for o in seen] for env, seen in history.env_rows().outliers.items()}
+
+
+def test_a_body_that_a_reset_puts_elsewhere_has_not_moved() -> None:
+    geometry, poses = table_scene(2)
+    table = History(EnvTable(geometry, step_of(poses), 0.05, "dense", OUTLIER_FINDINGS), 10**9)
+    there = poses.copy()
+    there[0, 3, 0] += 100.0
+    moved = replace(step_of(there), elapsed_steps=np.array([0, 7], np.int32))
+    table.add(Stepped(moved, np.array([True, False])))
+    table.add(Stepped(replace(moved, elapsed_steps=np.array([1, 8], np.int32)), np.zeros(2, bool)))
+    assert not table.env_rows().outliers
+    back = replace(step_of(poses), elapsed_steps=np.array([2, 9], np.int32))
+    table.add(Stepped(back, np.zeros(2, bool)))
+    assert [o.kind for o in table.env_rows().outliers[0]] == [OutlierKind.FAST]
+
+
+def test_a_rule_that_is_off_flags_no_env_and_one_that_is_on_is_a_finding() -> None:
+    only = {"reward-finite": OUTLIER_FINDINGS["reward-finite"]}
+    geometry, poses = table_scene(3)
+    table = EnvTable(geometry, step_of(poses), 0.05, "dense", only)
+    far, lost = poses.copy(), np.array([0, np.nan, np.nan], np.float32)
+    far[0, 3, 0] += 100.0
+    history = History(table, 10**9)
+    for number in (1, 2):
+        steps = np.full(3, number, np.int32)
+        history.add(Stepped(replace(step_of(far), reward=lost, elapsed_steps=steps), np.zeros(3, bool)))
+    assert {env: [o.kind.rule for o in seen] for env, seen in history.env_rows().outliers.items()} == {
+        1: ["reward-finite"],
+        2: ["reward-finite"],
+    }
+    (finding,) = history.findings
+    assert (finding.rule, finding.count, finding.first_step) == ("reward-finite", 4, 0)
+    assert finding.message == "the reward is NaN, in env 1 at step 1 of its episode"
+    history.begin_version({})
+    assert history.findings == () and len(history.env_rows().outliers) == 2
 
 
 def test_what_was_odd_goes_with_the_moment_that_an_env_is_put_to() -> None:

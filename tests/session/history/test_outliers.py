@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, live_session, wait_until
+from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
 from workbench.session.history.curves import Group
-from workbench.session.history.env_table import Outcome, OutlierKind
+from workbench.session.history.env_table import Outcome
 from workbench.session.history.history import REWARD_NONFINITE
 from workbench.session.live.session import Session
 
@@ -102,12 +103,12 @@ def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each
     found = {env: {o.kind for o in outliers} for env, outliers in one_of_each.env_rows().outliers.items()}
     assert found == {
         1: {OutlierKind.FAST},
-        2: {OutlierKind.NOT_A_NUMBER},
+        2: {OutlierKind.ENTRY_NOT_FINITE},
         3: {OutlierKind.UNDER_FLOOR, OutlierKind.DROPPED},
         4: {OutlierKind.DROPPED},
-        5: {OutlierKind.REWARD},
-        6: {OutlierKind.NOT_A_NUMBER},
-        7: {OutlierKind.NOT_A_NUMBER},
+        5: {OutlierKind.REWARD_OUT_OF_RANGE},
+        6: {OutlierKind.REWARD_NOT_FINITE},
+        7: {OutlierKind.OBSERVATION_NOT_FINITE},
     }
 
 
@@ -123,6 +124,16 @@ def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     one_of_each.change(selected_env=6)
     [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & REWARD_NONFINITE]
     assert odd[0] == one_of_each.view().timeline.first + 1
+
+
+def test_each_is_a_finding_of_its_rule_at_the_hook(
+    one_of_each: Session,
+) -> None:
+    found = {finding.rule: finding for finding in one_of_each.view().odd}
+    assert found.keys() == OUTLIER_RULES
+    assert found["entries-finite"].code == "def evaluate(self):" and found["entries-finite"].degree == "warn"
+    assert found["bodies-stay"].function == "_initialize_episode" and found["bodies-stay"].count > 20
+    assert found["reward-finite"].message == "the reward is NaN, in env 6 at step 1 of its episode"
 
 
 def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_each: Session) -> None:

@@ -220,7 +220,7 @@ def test_what_nobody_waits_for_or_was_begun_before_gives_way_and_is_done_again_a
     job.report = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
     with ThreadPoolExecutor(2) as threads:
         # It would go on for ever if it did not give way.
-        side = threads.submit(background.in_turns, job, lambda: side_work(job), aside)
+        side = threads.submit(background.in_turns, job, lambda: side_work(job), "low" if aside else "person")
         assert under_way.wait(90)
         threads.submit(somebody_waits, waiting).result(timeout=90)
         side.result(timeout=90)
@@ -251,7 +251,9 @@ def test_what_was_begun_last_is_left_alone_by_what_waits_behind_it(
     with ThreadPoolExecutor(2) as threads:
         asked = threads.submit(background.in_turns, job, first)
         assert has_it.wait(90)
-        threads.submit(background.in_turns, behind, lambda: done.append("behind"), aside).result(timeout=90)
+        threads.submit(
+            background.in_turns, behind, lambda: done.append("behind"), "low" if aside else "person"
+        ).result(90)
         assert asked.result(timeout=90) == "what it comes to"
     assert done == ["first", "behind"]
 

@@ -7,7 +7,6 @@ import pytest
 from workbench.checks.results import RuleResult
 from workbench.core.rules import Degree, Finding
 from workbench.session.checks.checks import ChecksView
-from workbench.session.protocol.messages import RulesBroken
 from workbench.ui.checks.findings import cards, count, summary, times
 from workbench.ui.checks.rule_pages import as_html, rule_page, sections
 
@@ -33,30 +32,30 @@ DONE = ChecksView(
 
 
 def test_what_stops_comes_first_and_the_findings_of_a_rule_are_together() -> None:
-    shown = cards(DONE, RulesBroken((PLAYED,)))
+    shown = cards(DONE, [PLAYED])
     assert [card.rule.id for card in shown] == ["success-at-reset", "reward-changes", "not-applied"]
     assert [len(card.rows) for card in shown] == [1, 2, 1] and count(shown) == 4
     assert summary(DONE, shown) == "1 stop, 3 warn, 1 kept, 1 not applicable"
 
 
 def test_what_was_seen_while_playing_says_how_often_and_since_when_and_is_no_second_row() -> None:
-    (played,) = cards(ChecksView(), RulesBroken((PLAYED,)))
+    (played,) = cards(ChecksView(), [PLAYED])
     assert played.rows[0].played == "while playing 10 times and more, first at step 3"
     of_check = ChecksView("done", results=(RuleResult("not-applied", "broken", (PLAYED,)),))
-    (both,) = cards(of_check, RulesBroken((PLAYED,)))
+    (both,) = cards(of_check, [PLAYED])
     assert len(both.rows) == 1 and both.rows[0].played
 
 
 def test_a_rule_that_is_broken_while_playing_is_not_counted_as_kept() -> None:
     kept = ChecksView("done", results=(RuleResult("not-applied", "kept"), RuleResult("entry-name", "kept")))
-    assert summary(kept, cards(kept, RulesBroken((PLAYED,)))) == "1 warn, 1 kept"
+    assert summary(kept, cards(kept, [PLAYED])) == "1 warn, 1 kept"
 
 
 def test_findings_of_the_version_before_come_last_and_count() -> None:
     view = ChecksView(
         "checking", before=(STOPS,), results=(RuleResult("reward-changes", "broken", (WARNS,)),)
     )
-    shown = cards(view, None)
+    shown = cards(view)
     assert [(card.rule.id, card.old) for card in shown] == [
         ("reward-changes", False),
         ("success-at-reset", True),

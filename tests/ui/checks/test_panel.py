@@ -179,7 +179,7 @@ PROFILED = StepProfile(
     200,
     21.0,
     (HookTime("evaluate", 10.5, 0.5), HookTime("physics", 5.2, 0.25)),
-    (LineTime("/home/me/push.py", 88, "x < <i>", 7.35, 0.35, "evaluate"),),
+    (LineTime("evaluate", "/home/me/push.py", 88, "x < <i>", 7.35, 0.35),),
 )
 
 
@@ -205,6 +205,12 @@ def test_where_a_step_goes_is_asked_for_and_shown_by_hook_and_line(shown: Shown)
         assert words in text
     assert "of the version before" not in text
     assert "of the version before" in profile_html(ProfileView("done", 3, PROFILED, stale=True))
+
+
+def test_lines_that_take_next_to_nothing_are_left_out_but_for_the_first() -> None:
+    lines = tuple(LineTime("evaluate", "/home/me/push.py", 90 + k, "x", 0.05, 0.004) for k in range(9))
+    text = profile_html(ProfileView("done", 1, replace(PROFILED, lines=(*PROFILED.lines, *lines))))
+    assert "0.4 %" in text and "push.py:93" in text and "push.py:94" not in text
 
 
 def test_a_profile_that_failed_says_why() -> None:

@@ -78,14 +78,17 @@ def test_cells_say_how_an_env_stands() -> None:
     assert (solved.state, solved.first_true, solved.last) == ("success", ("33", "20"), "")
     assert (cut.state, cut.total) == ("truncated", "")
     assert after.last == "fail 9" and after.first_true == ("", "")
-    assert odd.flags == ("cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
+    assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
 
 
 def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
     last = LastEpisode(np.zeros(6, np.int8), np.full(6, 13, np.int32), np.zeros(6), {2: (FELL,)})
     rows = rows_of(outliers={}, last=last)
     row = cells_of(rows, np.array([2]))[0]
-    assert row.flags == ("cube dropped 0.90 m (previous episode, step 12)",) and row.last == "cut short 13"
+    assert (
+        row.flags == ("bodies-stay: cube dropped 0.90 m (previous episode, step 12)",)
+        and row.last == "cut short 13"
+    )
     assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
 
 

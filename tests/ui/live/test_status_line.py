@@ -5,7 +5,7 @@ from dataclasses import replace
 from tests.drive.panels import Panels
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import EMPTY, problem, running
-from workbench.session.history.env_table import Outlier, OutlierKind
+from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.ui.live.status_line import StatusLine, flagged_text, status_values
 from workbench.ui.widgets.templates import render
 
@@ -56,13 +56,16 @@ def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_f
     panels: Panels,
 ) -> None:
     """A reward that was NaN in most envs left a green "running"."""
-    lost = Outlier(OutlierKind.NOT_A_NUMBER, 3, "the reward is <b>NaN</b>")
+    lost = Outlier(OutlierKind.REWARD_NOT_FINITE, 3, "the reward is <b>NaN</b>")
     rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), []
     line = StatusLine(panels.server, lambda: rows, lambda: went.append("first"))
     line.draw(running(6))
     (standing,) = (html for html in panels.htmls() if "data-press" in html.content)
     content = standing.content
-    assert "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content and "In env 2, step 3:" in content
+    assert (
+        "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content
+        and "In env 2, step 3: reward-finite: the reward" in content
+    )
     assert "wb-running wb-marked" in panels.html()
     line.draw(running(6, steps_per_second=21.0))
     assert standing.content is content, "it stays under the finger that presses"

@@ -9,7 +9,8 @@ import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.episodes import Episodes
 from workbench.core.env.actions import hold_action
 from workbench.machine.text import listed, of
 
@@ -114,6 +115,24 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+def entries_finite(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts."""
+    episodes = checkup.random
+    for name, rows in episodes.evaluate.items():
+        if rows.dtype.kind != "f":
+            continue
+        bad = ~np.isfinite(rows.reshape(*rows.shape[:2], -1)).all(axis=2)
+        if bad.any():
+            step, env = (int(i) for i in np.argwhere(bad)[0])
+            yield Found(
+                f"{name!r} is not finite in {of(int(bad.any(axis=0).sum()), bad.shape[1], 'random episode')}, first at step "
+                f"{step} of seed {episodes.seeds[env]}. Look for a division or a square root of what can be 0, and clamp "
+                "it; for what is not known, return 0 and a bool beside it.",
+                checkup.places.entry(name.rpartition("/")[2]),
+                int(bad.sum()),
+            )
+
+
 def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
     """(T + 1, K)"""
     rows = episodes.evaluate.get(name)
@@ -134,4 +153,5 @@ CHECKS: Mapping[str, Check] = {
     "info-rows": info_rows,
     "success-and-fail": success_and_fail,
     "success-flickers": success_flickers,
+    "entries-finite": entries_finite,
 }

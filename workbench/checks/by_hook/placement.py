@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.episodes import SeenOutlier
 from workbench.core.broken_rule import Place
 from workbench.core.env.actions import random_action
 from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
@@ -294,6 +295,24 @@ def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], P
             yield each.name, each.quaternions, each.place
 
 
+def bodies_stay(checkup: Checkup) -> Iterator[Found | Note]:
+    """Over random rollouts, each until its end."""
+    rollouts = checkup.random
+    of_owner: dict[str, list[SeenOutlier]] = {}
+    for seen in sorted(rollouts.outliers, key=lambda seen: (seen.step, seen.seed)):
+        if seen.kind.rule == "bodies-stay":
+            of_owner.setdefault(seen.body.split("/", 1)[0], []).append(seen)
+    for owner, every in of_owner.items():
+        first, seeds = every[0], sorted({seen.seed for seen in every})
+        yield Found(
+            f"{first.reason} at step {first.step} of seed {first.seed}. {owner} flies off or falls in "
+            f"{of(len(seeds), len(rollouts.seeds), 'random episode')} (seed {listed(seeds)}). Let nothing overlap, leave "
+            "out speeds and forces that are too high, or end such an episode with `fail`.",
+            _where_placed(checkup, first.body),
+            len(seeds),
+        )
+
+
 def _where_placed(checkup: Checkup, body: str) -> Place | None:
     """The author's line that sets its pose in a reset."""
     owner = body.split("/", 1)[0]
@@ -363,6 +382,8 @@ def _immovable(checkup: Checkup) -> set[str]:
     return found
 
 
+RUN_CHECKS: Mapping[str, Check] = {"bodies-stay": bodies_stay}
+"""They look at random rollouts."""
 CHECKS: Mapping[str, Check] = {
     "overlap-at-reset": overlap_at_reset,
     "falls-at-reset": falls_at_reset,

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.checks.by_hook.evaluate import flags
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Episodes, Found, Note
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.episodes import Episodes
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states
 from workbench.machine.text import of
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import linecache
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Any, TypeVar
 
@@ -18,12 +19,14 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
+from workbench.checks.evidence.episodes import Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.places import Places
 from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.checks.results import Silenced
 from workbench.core.backends import find_renderer
 from workbench.core.broken_rule import BrokenRules, Place
 from workbench.core.capture.inspect_env import list_contacts
+from workbench.core.capture.outliers import OutlierWatch
 from workbench.core.env import actions
 from workbench.core.env.assets import MissingAssets
 from workbench.core.env.evaluate_entries import flat_entries
@@ -32,7 +35,9 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.maniskill_private import apply_and_fetch, fetch
 from workbench.core.rules import Degree, Finding
+from workbench.core.scene.read_scene import read_geometry
 from workbench.core.scene.scene_index import scene_index
+from workbench.core.scene.shapes import SceneGeometry
 
 ROLLOUT_STEPS = 50
 """Most control steps of an episode that is rolled out."""
@@ -113,26 +118,6 @@ class Alone:
     """Where everything is built, before the first reset."""
 
 
-@dataclass
-class Episodes:
-    """What was seen of K episodes over T control steps; episode k began with seed ``seeds[k]``. Leading dimension T + 1 for
-    states, T for rewards. An episode that has ended goes on, as in stock ManiSkill: `length` says where it ended."""
-
-    seeds: list[int] = field(default_factory=list)
-    poses: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0, 0, 7), np.float32))
-    """(T + 1, K, B, 7) position in metres, quaternion wxyz; bodies as `Checkup.bodies`."""
-    qpos: NDArray[np.float32] | None = None
-    """(T + 1, K, J); None without joints."""
-    evaluate: dict[str, NDArray] = field(default_factory=dict)
-    """(T + 1, K, ...) each."""
-    reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """(T, K)"""
-    obs: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    """(T + 1, K, D) by leaf, pictures left out."""
-    length: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(K,) control steps until the episode ended; T if it did not."""
-
-
 class Checkup:
     """One version of a task under check. Close it in the end.
 
@@ -166,6 +151,8 @@ class Checkup:
         self.builds: list[Built] = []
         """What `task` has built."""
         self.merges: list[Merged] = []
+        self.picture_seconds = 0.0
+        """For the first pictures: a process compiles its shaders then."""
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
         self._built_with_renderer = False
@@ -246,8 +233,10 @@ class Checkup:
             raise CannotCheck("it has no observations with pictures")
         if find_renderer() is None:
             raise CannotCheck("there is nothing to render with")
+        began = time.monotonic()
         made = self._made(PICTURED_ENVS, True, "off", {"obs_mode": wanted[0]})
         self._open.append(made)
+        self.picture_seconds = time.monotonic() - began
         return made
 
     def look(self, see: Callable[[Checkup], _Value]) -> _Value:
@@ -328,6 +317,7 @@ class Checkup:
         return self._episodes(
             lambda task, step: actions.random_action(task.parts, task.num_envs, rng),
             min(self.loaded.max_episode_steps or ROLLOUT_STEPS, ROLLOUT_STEPS),
+            watched=True,
         )
 
     @evidence
@@ -386,10 +376,18 @@ class Checkup:
             task.env.scene.step()
             fetch(task.env)
 
-    def _episodes(self, choose: Callable[[TaskEnv, int], Any], steps: int) -> Episodes:
+    def _episodes(self, choose: Callable[[TaskEnv, int], Any], steps: int, watched: bool = False) -> Episodes:
         together: list[Episodes] = []
+        geometry: SceneGeometry | None = None
         for seeds in self.batches():
             states = [self.reset(self.task, seeds)]
+            seen = None
+            if watched:
+                env = self.task.env
+                if geometry is None or env.reconfiguration_freq:
+                    geometry = read_geometry(env)
+                watch = OutlierWatch(geometry, states[0], self.task.control_dt, env.reward_mode)
+                seen = SeenOutliers(watch, seeds)
             obs = [read_obs(self.task)]
             rewards: list[NDArray[np.float32]] = []
             length = np.full(len(seeds), steps)
@@ -402,8 +400,11 @@ class Checkup:
                 ended = (now.terminated | now.truncated) & ~over
                 length[ended] = step + 1
                 over |= ended
-            together.append(_stacked(seeds, states, rewards, obs, length))
-        return _joined(together)
+                if seen is not None:
+                    seen.take(step + 1, now, over)
+            outliers = () if seen is None else seen.all()
+            together.append(stacked(seeds, states, rewards, obs, length, outliers))
+        return joined(together)
 
 
 def put_where_built(task: TaskEnv) -> None:
@@ -460,47 +461,3 @@ def finding_of(rule: str, degree: Degree, found: Found) -> Finding:
     file, line, function = found.place or (None, None, "")
     code = "" if file is None or line is None else linecache.getline(file, line).strip()
     return Finding(rule, degree, found.message, file, line, code, function, found.count, 0)
-
-
-def _stacked(
-    seeds: list[int],
-    states: list[StepResult],
-    rewards: list[NDArray[np.float32]],
-    obs: list[dict[str, NDArray[np.float64]]],
-    length: NDArray[np.int64],
-) -> Episodes:
-    names = [name for name in states[0].evaluate if all(name in state.evaluate for state in states)]
-    # The reward's terms exist from the first step on.
-    late = [name for name in states[-1].evaluate if name not in names]
-    leaves = [name for name in obs[0] if all(name in one for one in obs)]
-    return Episodes(
-        seeds=list(seeds),
-        poses=np.stack([state.poses for state in states]),
-        qpos=None if states[0].qpos is None else np.stack([s.qpos for s in states if s.qpos is not None]),
-        evaluate={
-            **{name: np.stack([state.evaluate[name] for state in states]) for name in names},
-            **{
-                name: np.stack([state.evaluate[name] for state in [states[1], *states[1:]]])
-                for name in late
-                if all(name in state.evaluate for state in states[1:])
-            },
-        },
-        reward=np.stack(rewards) if rewards else np.zeros((0, len(seeds)), np.float32),
-        obs={name: np.stack([one[name] for one in obs]) for name in leaves},
-        length=length,
-    )
-
-
-def _joined(parts: list[Episodes]) -> Episodes:
-    names = [name for name in parts[0].evaluate if all(name in part.evaluate for part in parts)]
-    leaves = [name for name in parts[0].obs if all(name in part.obs for part in parts)]
-    qpos = [part.qpos for part in parts if part.qpos is not None]
-    return Episodes(
-        seeds=[seed for part in parts for seed in part.seeds],
-        poses=np.concatenate([part.poses for part in parts], axis=1),
-        qpos=np.concatenate(qpos, axis=1) if len(qpos) == len(parts) else None,
-        evaluate={name: np.concatenate([part.evaluate[name] for part in parts], axis=1) for name in names},
-        reward=np.concatenate([part.reward for part in parts], axis=1),
-        obs={name: np.concatenate([part.obs[name] for part in parts], axis=1) for name in leaves},
-        length=np.concatenate([part.length for part in parts]),
-    )

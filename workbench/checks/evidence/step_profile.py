@@ -7,7 +7,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.checks.evidence.checkup import Checkup
-from workbench.core.broken_rule import Place
+from workbench.checks.results import HookTime, LineTime, StepProfile
 from workbench.core.env import actions
 from workbench.core.env.task_env import TaskEnv
 
@@ -37,49 +36,6 @@ _PARTS = (
     ("agent", "get_proprioception", "the robot's observation"),
 )
 """Object of the env, its method, and how it is called here."""
-
-
-@dataclass(frozen=True)
-class HookTime:
-    """What a hook, or a part of ManiSkill's own, takes of a control step; without the hooks that it calls."""
-
-    name: str
-    """As ``evaluate``, or ``physics``."""
-    milliseconds: float
-    share: float
-    """Of the step, 0 to 1."""
-    place: Place | None
-    """Where the author defines it; None for ManiSkill's own."""
-
-
-@dataclass(frozen=True)
-class LineTime:
-    """What a line of the author's takes of a control step, with what it calls outside the author's files."""
-
-    hook: str
-    """The hook that ran it."""
-    file: str
-    line: int
-    """1-based."""
-    code: str
-    """Its text, stripped."""
-    milliseconds: float
-    share: float
-    """Of the step, 0 to 1."""
-
-
-@dataclass(frozen=True)
-class StepProfile:
-    """The mean of some control steps."""
-
-    num_envs: int
-    steps: int
-    milliseconds: float
-    """Of one step of all envs."""
-    hooks: tuple[HookTime, ...]
-    """Longest first; their shares add up to 1."""
-    lines: tuple[LineTime, ...]
-    """Longest first."""
 
 
 def profile_step(checkup: Checkup, num_envs: int = NUM_ENVS, steps: int = STEPS) -> StepProfile:

@@ -1,16 +1,20 @@
-"""Threads that report what they raise, and start again."""
+"""Threads that report what they raise, and start again; and threads that leave the cores to others."""
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 logger = logging.getLogger(__name__)
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.05, 5.0
 """Seconds before a thread starts again; doubled at each failure."""
+_LOOK = 0.05
+"""Seconds between two looks whether somebody waits."""
 
 _listeners: list[Callable[[str], None]] = []
 _lock = threading.Lock()
@@ -65,3 +69,37 @@ def stop_listening(listener: Callable[[str], None]) -> None:
     with _lock:
         if listener in _listeners:
             _listeners.remove(listener)
+
+
+@contextmanager
+def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
+    """Within this, the threads of this process, and those that they start, run only on cores that nobody else wants.
+
+    A nice value is not enough: of two cores that physics fills, a process at nice 10 took a third.
+
+    Args:
+        wanted: asked often; after True they run as before, since somebody waits for this process.
+    """
+    done = threading.Event()
+    low = {int(thread) for thread in os.listdir("/proc/self/task")}
+
+    def watch() -> None:
+        while not done.wait(_LOOK) and not wanted():
+            pass
+        _schedule(os.SCHED_OTHER, {int(thread) for thread in os.listdir("/proc/self/task")})
+
+    watching = threading.Thread(target=watch, name="on-free-cores", daemon=True)
+    watching.start()
+    _schedule(os.SCHED_IDLE, low)
+    try:
+        yield
+    finally:
+        done.set()
+        watching.join()
+
+
+def _schedule(policy: int, threads: set[int]) -> None:
+    for thread in threads:
+        # It may have ended; a container may forbid it.
+        with suppress(OSError):
+            os.sched_setscheduler(thread, policy, os.sched_param(0))

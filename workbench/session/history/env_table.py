@@ -4,193 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from enum import Enum, IntEnum
-from typing import Any
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.capture.outliers import Outlier, OutlierSighting, OutlierWatch
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.jobs.task import Restored, Stepped
 
-FASTEST = 20.0
-"""m/s, as a mean over a control step; robots of the field move at a tenth of it."""
-UNDER_EVERYTHING = 0.2
-"""Metres under the lowest point of all static bodies."""
-DEEPEST_DROP = 0.5
-"""Metres below the start of the episode, of a body that is not part of an articulation: more than off a block, less than
-off a table."""
-REWARD_RANGES: dict[str, tuple[float, float]] = {"sparse": (-1.0, 1.0), "normalized_dense": (-1.0, 1.0)}
-"""By reward mode, where ManiSkill defines a range: sparse is success minus fail, normalized is divided by its maximum (some
-tasks take penalties, so it may be negative). A plain dense reward has none."""
-ROUNDING = 1e-4
-"""3.0000002 / 3 is not out of range."""
-
-
-class OutlierKind(Enum):
-    NOT_A_NUMBER = "NaN or infinite"
-    FAST = "fast"
-    UNDER_FLOOR = "under the floor"
-    DROPPED = "dropped"
-    REWARD = "reward"
-
-
-@dataclass(frozen=True)
-class Outlier:
-    """The first outlier of a kind in an env's episode."""
-
-    kind: OutlierKind
-    step: int
-    """Control step of the episode."""
-    reason: str
-    """Text such as ``cube moved at 134 m/s``."""
-
-
-@dataclass(frozen=True)
-class OutlierSighting:
-    """The envs with an outlier of one kind in one control step."""
-
-    kind: OutlierKind
-    envs: NDArray[np.bool_]
-    """(N,)"""
-    reason: Callable[[int], str]
-    """The text for one of these envs. Called only for the first outlier of a kind: texts cost more than the checks."""
-
-
-class OutlierWatch:
-    """Checks the control steps of one task, in order, for what no healthy task does: NaN and infinite numbers, bodies that
-    fly off or fall, rewards out of range. The limits are meant to report nothing on every task that works."""
-
-    def __init__(
-        self, geometry: SceneGeometry, first: StepResult, control_dt: float, reward_mode: str
-    ) -> None:
-        """
-        Args:
-            first: the state after the first reset; bodies that an env lacks are NaN there.
-        """
-        kinds = np.array(geometry.body_kinds)
-        self._names = geometry.body_names
-        self._present = np.isfinite(first.poses).all(axis=2)
-        self._moves = self._present & np.isin(kinds, ("dynamic", "link"))
-        self._loose = self._present & (kinds == "dynamic")
-        self._dt = control_dt
-        self._low, self._high = REWARD_RANGES.get(reward_mode, (-np.inf, np.inf))
-        self._floor = lowest_still_point(geometry, first.poses) - UNDER_EVERYTHING
-        self._before = first.poses[..., :3].copy()
-        self._start = self._before[..., 2].copy()
-
-    def begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """These envs (N,) were reset or put back to a moment: the jump does not count as movement."""
-        if step.poses.shape[:2] == self._present.shape:
-            self._before[envs] = step.poses[envs, :, :3]
-            self._start[envs] = step.poses[envs, :, 2]
-
-    def check(self, step: StepResult) -> list[OutlierSighting]:
-        """The kinds of outlier in a control step, each with at least one env."""
-        # With `reconfiguration_freq` a reset may change the bodies without notice: poses are skipped then.
-        found = self._check_poses(step) if step.poses.shape[:2] == self._present.shape else []
-        for name, values in _numbers(step):
-            wrong: Any = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-            found.append(
-                OutlierSighting(
-                    OutlierKind.NOT_A_NUMBER,
-                    wrong,
-                    lambda env, of=values, name=name: f"{name} {_nan_text(of[env])}",
-                )
-            )
-        if step.sound_obs is not None:
-            found.append(
-                OutlierSighting(
-                    OutlierKind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is NaN or infinite"
-                )
-            )
-        with np.errstate(invalid="ignore"):
-            out = (step.reward < self._low - ROUNDING) | (step.reward > self._high + ROUNDING)
-        out &= np.isfinite(step.reward)
-        found.append(
-            OutlierSighting(OutlierKind.REWARD, out, lambda env: self._reward_text(float(step.reward[env])))
-        )
-        return [sight for sight in found if sight.envs.any()]
-
-    def _check_poses(self, step: StepResult) -> list[OutlierSighting]:
-        place = step.poses[..., :3]
-        # An env that blew up has NaN and 1e30 in its poses: these are to be found, not to warn about.
-        with np.errstate(invalid="ignore", over="ignore"):
-            speed = np.where(self._moves, np.linalg.norm(place - self._before, axis=2) / self._dt, 0.0)
-            drop = np.where(self._loose, self._start - place[..., 2], 0.0)
-            lost: Any = self._present & ~np.isfinite(step.poses).all(axis=2)
-            fast: Any = speed > FASTEST
-            dropped: Any = drop > DEEPEST_DROP
-            under: Any = self._moves & (place[..., 2] < self._floor)
-        self._before = place.copy()
-
-        def first(bodies: NDArray[np.bool_], env: int) -> str:
-            return self._names[int(bodies[env].argmax())]
-
-        def worst(amounts: NDArray, env: int) -> tuple[str, float]:
-            body = int(np.nanargmax(amounts[env]))
-            return self._names[body], float(amounts[env, body])
-
-        return [
-            OutlierSighting(
-                OutlierKind.NOT_A_NUMBER,
-                lost.any(axis=1),
-                lambda e: f"the pose of {first(lost, e)} {_nan_text(step.poses[e, int(lost[e].argmax())])}",
-            ),
-            OutlierSighting(
-                OutlierKind.FAST,
-                fast.any(axis=1),
-                lambda e: "{} moved at {:.3g} m/s".format(*worst(speed, e)),
-            ),
-            OutlierSighting(
-                OutlierKind.UNDER_FLOOR, under.any(axis=1), lambda e: f"{first(under, e)} is under the floor"
-            ),
-            OutlierSighting(
-                OutlierKind.DROPPED,
-                dropped.any(axis=1),
-                lambda e: "{} dropped {:.2f} m".format(*worst(drop, e)),
-            ),
-        ]
-
-    def _reward_text(self, reward: float) -> str:
-        side = f"below {self._low:g}" if reward < self._low else f"above {self._high:g}"
-        return f"the reward is {reward:.3g}, {side}"
-
-
-def _nan_text(values: NDArray) -> str:
-    """Which kind of not finite: some of `values` is NaN or infinite."""
-    return "is NaN" if np.isnan(values).any() else "is infinite"
-
-
-def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> float:
-    """Height in metres of the lowest vertex of any static body; -inf without one."""
-    lowest = [np.inf]
-    static = np.array([kind == "static" for kind in geometry.body_kinds], bool)
-    for visual in geometry.visuals:
-        instances = np.flatnonzero(static[visual.bodies])
-        if not len(instances) or not len(visual.mesh.vertices):
-            continue
-        # All envs have the same ground; they differ in what is on it. So one env is enough.
-        p, (w, x, y, z) = np.split(poses[visual.envs[instances[0]], visual.bodies[instances[0]]], [3])
-        up = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-        lowest.append(float((visual.mesh.vertices @ up).min() + p[2]))
-    finite = [height for height in lowest if np.isfinite(height)]
-    return min(finite) if finite else -np.inf
-
-
-def _numbers(step: StepResult) -> list[tuple[str, NDArray]]:
-    """Numbers that the author's code computes: reward, float entries of ``evaluate``, and a policy's action."""
-    action = [] if step.action is None or not step.action.size else [("the action", step.action)]
-    entries = [(str(name), np.asarray(value)) for name, value in step.evaluate.items()]
-    floats = [(name, value) for name, value in entries if value.dtype.kind == "f" and value.ndim]
-    return [("the reward", step.reward), *action, *floats]
-
-
 KEPT_REWARDS = 100
 """The newest steps of an episode whose rewards a row holds."""
-NONFINITE_REWARD_KEY = (OutlierKind.REWARD, OutlierKind.NOT_A_NUMBER)
-"""Key in `EnvRows.first` of a reward that is NaN or infinite."""
 Outliers = Mapping[int, tuple[Outlier, ...]]
 """By env, oldest first; only envs with outliers."""
 
@@ -244,7 +70,7 @@ class EnvRows:
     """(N,) whether the episode was followed from its start; otherwise `total` is NaN."""
     first: Mapping[Hashable, NDArray[np.int32]]
     """(N,) the first step at which it was true (0: after the reset); -1: never. By bool entry of ``evaluate``, by
-    `OutlierKind`, and by `NONFINITE_REWARD_KEY`."""
+    `OutlierKind`, also of a rule that is off."""
     outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
@@ -277,11 +103,17 @@ class EnvTable:
     """
 
     def __init__(
-        self, geometry: SceneGeometry, first: StepResult, control_dt: float, reward_mode: str
+        self,
+        geometry: SceneGeometry,
+        first: StepResult,
+        control_dt: float,
+        reward_mode: str,
+        rules: Mapping[str, Finding],
     ) -> None:
         """
         Args:
             first: the state that the task was loaded with (a reset of all envs).
+            rules: as `TaskDescription.outlier_rules`; an outlier of any other rule flags no env.
         """
         count = len(first.reward)
         never, nothing = np.full(count, -1, np.int32), np.zeros(count)
@@ -289,6 +121,7 @@ class EnvTable:
         self._watch = OutlierWatch(geometry, first, control_dt, reward_mode)
         self._rewards = np.full((count, KEPT_REWARDS), np.nan, np.float32)
         self._tick = 0
+        self._rules, self._found = rules, dict[str, Finding]()
         self._now = EnvRows(
             steps=first.elapsed_steps,
             outcome=zero,
@@ -332,6 +165,15 @@ class EnvTable:
         self._step(step)
         return self._now
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The rules that the running version broke by outliers, one a rule."""
+        return tuple(self._found.values())
+
+    def begin_version(self, rules: Mapping[str, Finding]) -> None:
+        """The code changes: its findings begin anew, and the rows stay."""
+        self._rules, self._found = rules, {}
+
     def rows(self) -> EnvRows:
         """The table as it is now."""
         oldest_first = np.arange(self._tick, self._tick + KEPT_REWARDS) % KEPT_REWARDS
@@ -341,9 +183,11 @@ class EnvTable:
         now, first, outliers = self._now, dict(self._now.first), self._now.outliers
         for name, so in _flags(step):
             _note_first(first, name, so, step)
-        _note_first(first, NONFINITE_REWARD_KEY, ~np.isfinite(step.reward), step)
         for sight in self._watch.check(step):
-            for env in np.flatnonzero(_note_first(first, sight.kind, sight.envs, step)).tolist():
+            new = _note_first(first, sight.kind, sight.envs, step)
+            if sight.kind.rule is not None and not self._break(sight.kind.rule, sight, step):
+                continue
+            for env in np.flatnonzero(new).tolist():
                 outlier = Outlier(sight.kind, int(step.elapsed_steps[env]), sight.reason(env))
                 outliers = {**outliers, env: (*outliers.get(env, ()), outlier)}
         same = all(steps is now.first.get(what) for what, steps in first.items())
@@ -368,6 +212,18 @@ class EnvTable:
                 ended=now.ended + ends,
                 succeeded=now.succeeded + (ends & success),
             )
+
+    def _break(self, rule: str, sight: OutlierSighting, step: StepResult) -> bool:
+        """Count a breach; False if the rule is off."""
+        if (whole := self._rules.get(rule)) is None:
+            return False
+        known, count = self._found.get(rule), int(np.count_nonzero(sight.envs))
+        if known is None:
+            env = int(sight.envs.argmax())
+            message = f"{sight.reason(env)}, in env {env} at step {step.elapsed_steps[env]} of its episode"
+            known = replace(whole, message=message, first_step=self._tick - 1)
+        self._found[rule] = replace(known, count=known.count + count)
+        return True
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
         """Start a new episode in these envs (N,); the one before becomes `EnvRows.last`."""

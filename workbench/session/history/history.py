@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraKind, Picture
+from workbench.core.capture.outliers import OutlierKind
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
 from workbench.core.snapshots.packing import WholeSnapshot
 from workbench.jobs.task import NO_MOMENT, Restored, Stepped
 from workbench.session.history.curves import Columns, StepCurves
-from workbench.session.history.env_table import KEPT_REWARDS, NONFINITE_REWARD_KEY, EnvRows, EnvTable
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, EnvTable
 from workbench.session.protocol.messages import PastPictures, Pictures, ReplayPath
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
@@ -329,6 +331,15 @@ class History:
         """The table of the envs as it is now."""
         return self._table.rows()
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """See `EnvTable.findings`."""
+        return self._table.findings
+
+    def begin_version(self, rules: Mapping[str, Finding]) -> None:
+        """See `EnvTable.begin_version`."""
+        self._table.begin_version(rules)
+
     def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
         """Events of this env between two moments, both included: serials and flags (`RESET` ... added up)."""
         low = max(low, self.first)
@@ -484,7 +495,8 @@ class History:
             # Success or fail in a restored state is no event of this moment: it happened at the origin.
             return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
         event_flags = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
-        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, NONFINITE_REWARD_KEY)):
+        lost = OutlierKind.REWARD_NOT_FINITE
+        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, lost)):
             if what in rows.first:
                 event_flags[rows.first[what] == step.elapsed_steps] |= flag
         return event_flags

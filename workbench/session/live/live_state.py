@@ -124,6 +124,8 @@ class LiveState:
             self._new_scene(task, event.first, its_past_stays=same)
         elif self.timeline is not None:
             self.set(step=self.timeline.history.replace_last(event.first))
+            if before is None or before.source != task.source:
+                self.timeline.history.begin_version(task.outlier_rules)
         if report is None or report.level not in ("same", "patched"):
             self.set(cameras_serial=self.now.cameras_serial + 1)
             self.new_pictures(**{} if kept else {"pictures": {}})
@@ -150,7 +152,7 @@ class LiveState:
         )
         if self.timeline is None or not its_past_stays:
             last = -1 if self.timeline is None else self.timeline.history.last
-            table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode)
+            table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode, task.outlier_rules)
             self.timeline = Timeline(table, self.history_bytes, last + 1, task.joints)
 
     def stepped(self, event: Stepped) -> None:
@@ -431,7 +433,8 @@ class LiveState:
             return replace(now, refused=refused, **known)
         env, moment = now.settings.selected_env, timeline.shown
         past, curves = timeline.view(env, now.settings.cameras), timeline.history.steps.curves(env)
-        view = replace(now, refused=refused, curves=curves, timeline=past, **known)
+        odd = timeline.history.findings
+        view = replace(now, refused=refused, curves=curves, timeline=past, odd=odd, **known)
         if moment is None:
             return view
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))

@@ -9,6 +9,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
 from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioView
 from workbench.session.checks.checks import ChecksView
@@ -114,6 +115,8 @@ class SessionView:
     rules: RulesBroken | None = None
     """Rules of GPU simulation that the running version has broken; None for none."""
     rules_serial: int = 0
+    odd: tuple[Finding, ...] = ()
+    """Rules that the running version broke by outliers, one a rule."""
     inspection: Inspection | None = None
     """The newest answer to `Session.inspect`, of the env that was selected then."""
     recording: RecordingStatus = RecordingStatus()
@@ -146,6 +149,11 @@ class SessionView:
             studio.selected,
             studio.preview_scale != 1.0,
         )
+
+    @property
+    def played(self) -> tuple[Finding, ...]:
+        """What was found while playing."""
+        return (*(() if self.rules is None else self.rules.rows), *self.odd)
 
     @property
     def selected_env(self) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from workbench.checks.results import StepProfile
 from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.watched_thread import on_free_cores
 from workbench.session.protocol.messages import CannotAnswer
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, ProfileStep
 
@@ -55,8 +56,11 @@ class WorkerChecks:
         checkup = self._checkup_of(opened.loaded, options)
         try:
             if isinstance(question, CheckGroup):
-                return self._check(checkup, question, on_result)
-            return _profile(checkup)
+                with on_free_cores(self._waits):
+                    return self._check(checkup, question, on_result)
+            from workbench.checks.evidence.step_profile import profile_step
+
+            return profile_step(checkup)
         except _Ended:
             raise CannotAnswer("another request came") from None
 
@@ -67,7 +71,7 @@ class WorkerChecks:
         self._checkup = self._of = None
 
     def _check(self, checkup: Checkup, question: CheckGroup, on_result: OnResult) -> CheckedGroup:
-        from workbench.checks.run import CORE_GROUP, GROUPS, core_results, run_group
+        from workbench.checks.by_hook.run import CORE_GROUP, GROUPS, core_results, run_group
 
         degrees = question.degrees
         checked = {rule for group in GROUPS for rule in group.checks} | _core_rules()
@@ -111,7 +115,3 @@ def _core_rules() -> set[str]:
     from workbench.core.rules import RULES
 
     return set(RULES)
-
-
-def _profile(checkup: Checkup) -> StepProfile:
-    raise CannotAnswer("a step cannot be timed yet")

@@ -14,6 +14,7 @@ from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.problem import Interrupted, TaskError
 from workbench.authoring.reload.call_graph import line_in
 from workbench.authoring.reload.level import RESET_HOOKS, Change, find_change, inherited_names
+from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.broken_rule import BrokenRules
 from workbench.core.cameras.render import list_cameras
 from workbench.core.env import actions
@@ -254,6 +255,7 @@ def _exchange(
         others=loaded.others,
         in_place_of=None,
         notices=notices_of(loaded, running.request.options),
+        outlier_rules=rules_of_outliers(loaded, running.request.options.rules),
     )
     if change.level == "cameras":
         description = replace(description, cameras=list_cameras(env))

@@ -9,7 +9,6 @@ from workbench.checks.results import RuleResult, counts
 from workbench.checks.rules import RULES
 from workbench.core.rules import DEGREES, Degree, Finding, Rule
 from workbench.session.checks.checks import ChecksView
-from workbench.session.protocol.messages import RulesBroken
 from workbench.ui.checks.rule_pages import RulePage, rule_page
 
 MOST_SHOWN = 5
@@ -50,10 +49,14 @@ class Card:
         return f"# workbench: off[{self.rule.id}] "
 
 
-def cards(checks: ChecksView, played: RulesBroken | None) -> list[Card]:
-    """What stops first, then what warns, then findings of an earlier version."""
+def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
+    """What stops first, then what warns, then findings of an earlier version.
+
+    Args:
+        played: what was found while playing.
+    """
     rows = {finding.key: Row(finding) for finding in checks.findings}
-    for finding in () if played is None else played.rows:
+    for finding in played:
         known = rows.get(finding.key)
         rows[finding.key] = Row(finding if known is None else known.finding, _played(finding))
     for finding in checks.before:

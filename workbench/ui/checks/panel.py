@@ -64,11 +64,12 @@ class ChecksPanel(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         checks = view.checks
-        return checks.serial, checks.waits, view.rules_serial, tuple(sorted(self._open)), view.task_serial
+        seen = view.rules_serial, view.odd
+        return checks.serial, checks.waits, seen, tuple(sorted(self._open)), view.task_serial
 
     def draw(self, view: SessionView) -> None:
         checks = view.checks
-        found = cards(checks, view.rules)
+        found = cards(checks, view.played)
         set_tab_label(self._tab, f"{TAB} {count(found)}" if found else TAB)
         self._status.content = status_html(checks, found, self._link)
         self._stop.visible = checks.state in RUNNING
@@ -104,10 +105,10 @@ class ChecksMark(PagePart[SessionView]):
         """By page: the element that opened the tab last."""
 
     def key(self, view: SessionView) -> object:
-        return view.checks.serial, view.rules_serial
+        return view.checks.serial, view.rules_serial, view.odd
 
     def draw(self, view: SessionView) -> None:
-        found = cards(view.checks, view.rules)
+        found = cards(view.checks, view.played)
         self._html.visible = bool(found)
         if found:
             self._html.content = mark_html(found, self._press)

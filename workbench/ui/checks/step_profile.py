@@ -14,6 +14,8 @@ from workbench.ui.widgets.templates import render
 TITLE = "Where does a step go"
 PROFILE, STOP_PROFILE = "Time a step", "Stop timing"
 MOST_HOOKS, MOST_LINES = 12, 12
+FEWEST_LINES, SMALL = 5, 0.01
+"""Lines beyond the first ones are shown down to this share."""
 
 
 class StepProfilePanel(PagePart[SessionView]):
@@ -55,9 +57,15 @@ class StepProfilePanel(PagePart[SessionView]):
 
 def profile_html(shown: ProfileView, link: LinkTo = no_links) -> str:
     """The tables, or what to do for them."""
-    return render(
-        "step_profile", shown=shown, link=link, most_hooks=MOST_HOOKS, most_lines=MOST_LINES, ms=milliseconds
-    )
+    lines = () if shown.profile is None else shown.profile.lines[:MOST_LINES]
+    lines = [line for place, line in enumerate(lines) if place < FEWEST_LINES or line.share >= SMALL]
+    known = {"lines": lines, "most_hooks": MOST_HOOKS, "ms": milliseconds, "part": share_text}
+    return render("step_profile", shown=shown, link=link, **known)
+
+
+def share_text(share: float) -> str:
+    """``35 %``, ``0.4 %``."""
+    return f"{100 * share:.0f} %" if share >= SMALL else f"{100 * share:.1f} %"
 
 
 def milliseconds(value: float) -> str:

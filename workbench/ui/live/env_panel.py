@@ -127,10 +127,10 @@ def make_rows(
         state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
         had_one = rows.last.steps[env] >= 0
         before = [
-            f"{outlier.reason} (previous episode, step {outlier.step})"
+            f"{outlier.text} (previous episode, step {outlier.step})"
             for outlier in rows.last.outliers.get(env, ())
         ]
-        now = [f"{outlier.reason} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
+        now = [f"{outlier.text} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
         made.append(
             {
                 "env": env,

@@ -100,7 +100,7 @@ def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
     when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the previous episode")
     envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
     press = "Click to see it" if env in rows.outliers else "Click to select it"
-    hint = f"In env {env}, {when}: {outlier.reason}. {press}; the table of envs (B) has them all."
+    hint = f"In env {env}, {when}: {outlier.text}. {press}; the table of envs (B) has them all."
     return f"⚑ {envs}flagged: {outlier.reason}", hint
 
 

@@ -40,7 +40,7 @@ class Group:
 GROUPS: tuple[Group, ...] = (
     Group("source", {**source.CHECKS, **files.CHECKS}),
     Group("resets", placement.CHECKS),
-    Group("success", evaluate.CHECKS),
+    Group("success", {**evaluate.CHECKS, **placement.RUN_CHECKS}),
     Group("rewards", reward.CHECKS),
     Group("tensors", devices.CHECKS),
     Group("the same again", reproduce.CHECKS),

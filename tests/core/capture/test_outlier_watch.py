@@ -1,4 +1,4 @@
-"""What the watch calls an outlier and what not, in steps that are made by hand; `test_outliers` has real ones."""
+"""What the watch calls an outlier and what not, in steps that are made by hand; `session.history.test_outliers` has real ones."""
 
 from __future__ import annotations
 
@@ -8,29 +8,7 @@ import numpy as np
 import pytest
 
 from tests.ui.scenes import step_of, table_scene
-from workbench.jobs.task import Stepped
-from workbench.session.history.env_table import (
-    FASTEST,
-    EnvTable,
-    OutlierKind,
-    OutlierWatch,
-    lowest_still_point,
-)
-from workbench.session.history.history import History
-
-
-def test_a_body_that_a_reset_puts_elsewhere_has_not_moved() -> None:
-    geometry, poses = table_scene(2)
-    table = History(EnvTable(geometry, step_of(poses), 0.05, "dense"), 10**9)
-    there = poses.copy()
-    there[0, 3, 0] += 100.0
-    moved = replace(step_of(there), elapsed_steps=np.array([0, 7], np.int32))
-    table.add(Stepped(moved, np.array([True, False])))
-    table.add(Stepped(replace(moved, elapsed_steps=np.array([1, 8], np.int32)), np.zeros(2, bool)))
-    assert not table.env_rows().outliers
-    back = replace(step_of(poses), elapsed_steps=np.array([2, 9], np.int32))
-    table.add(Stepped(back, np.zeros(2, bool)))
-    assert [o.kind for o in table.env_rows().outliers[0]] == [OutlierKind.FAST]
+from workbench.core.capture.outliers import FASTEST, OutlierKind, OutlierWatch, lowest_still_point
 
 
 def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np.ndarray]:
