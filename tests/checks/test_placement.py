@@ -32,6 +32,13 @@ def test_a_cube_in_the_table(checked: Checked) -> None:
     assert finding.code == CUBE_POSE and finding.function == "_initialize_episode"
 
 
+def test_a_robot_in_the_table_is_what_is_to_be_moved(checked: Checked) -> None:
+    low = f"{CUBE_POSE}\n            self.agent.robot.set_pose(sapien.Pose([-0.615, 0, -0.2]))"
+    result = checked("overlap-at-reset", (CUBE_POSE, low), seeds=4)
+    (message,) = (one.message for one in result.findings if "table-workspace are" in one.message)
+    assert message.startswith("panda/") and "reset it to joint positions" in message
+
+
 def test_a_cube_above_the_table(checked: Checked) -> None:
     finding = the_finding(checked("falls-at-reset", (HEIGHT, "cube[:, 2] = 0.08\n")))
     assert "cube falls 0.06 m" in finding.message and finding.code == CUBE_POSE

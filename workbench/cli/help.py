@@ -13,7 +13,7 @@ from rich.table import Table
 
 from workbench.cli.terminal import Exit, out, refuse
 from workbench.machine.text import plain_text
-from workbench.ui.app.help_pages import GROUPS, Topic, by_path, find_topic, topics, topics_about
+from workbench.ui.app.help_pages import GROUPS, RULE_PAGES, Topic, by_path, find_topic, topics, topics_about
 
 WIDEST = 100
 """Columns: longer lines are hard to read."""
@@ -42,7 +42,7 @@ def show_help(name: str) -> int:
 
 
 def _list_topics() -> None:
-    longest = max(len(topic.name) for topic in topics())
+    longest = max(len(topic.name) for topic in topics() if topic.group != RULE_PAGES)
     for _, group in GROUPS:
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
         table.add_column(style="cyan", no_wrap=True, min_width=longest)

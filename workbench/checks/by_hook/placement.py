@@ -100,7 +100,8 @@ def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
         deepest.setdefault(frozenset(body.split("/", 1)[0] for body in pair), pair)
     for first, second in deepest.values():
         seeds = seeds_of[first, second]
-        mover = second if first in fixed or "/" in first else first
+        loose = [body for body in (first, second) if body not in fixed]
+        mover = min(loose, key=lambda body: "/" in body)
         still = [body for body in (first, second) if body in fixed and "/" not in body]
         if "/" in mover:
             advice = "Raise its root, or reset it to joint positions with which it touches nothing."
