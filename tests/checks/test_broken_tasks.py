@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from tests.checks.checked import check_rules, the_finding
-from workbench.checks.by_hook.run import GROUPS
-from workbench.checks.rules import CHECK_RULES, RULES
-from workbench.core import rules as core_rules
-from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
+from workbench.checks.rules import RULES
 
 FOLDER = Path(__file__).parents[2] / "tasks" / "broken"
 BROKEN = {
@@ -37,18 +33,6 @@ BESIDES = {
     "nudge_ball": {"loop-over-envs"},
 }
 """Rules that the same mistake breaks too."""
-
-
-def test_each_rule_of_the_table_has_one_check_and_each_check_is_of_the_table() -> None:
-    checked = Counter(rule for group in GROUPS for rule in group.checks)
-    assert set(checked) == set(CHECK_RULES) and max(checked.values()) == 1
-    assert set(RULES) - set(CHECK_RULES) == set(core_rules.RULES)
-    assert not set(CHECK_RULES) & set(core_rules.RULES)
-
-
-def test_each_outlier_is_of_a_rule_that_is_checked_but_an_action_which_no_task_makes() -> None:
-    without = {kind for kind in OutlierKind if kind.rule is None}
-    assert without == {OutlierKind.ACTION_NOT_FINITE} and set(CHECK_RULES) >= OUTLIER_RULES
 
 
 def test_every_small_task_is_listed() -> None:
