@@ -52,6 +52,16 @@ def test_other_entries_are_no_typo(checked: Checked) -> None:
     assert checked("entry-name").state == "kept"
 
 
+def test_an_entry_that_is_nan(checked: Checked) -> None:
+    edit = '"cube_height": height', '"cube_height": torch.log(height - 1)'
+    finding = the_finding(checked("entries-finite", edit))
+    assert (
+        "'cube_height' is not finite in 8 of 8 random episodes, first at step 0 of seed 0" in finding.message
+    )
+    assert finding.code.startswith('"cube_height"') and finding.degree == "warn"
+    assert checked("entries-finite").state == "kept"
+
+
 def test_success_and_fail_together(checked: Checked) -> None:
     edits = (
         ('"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)'),

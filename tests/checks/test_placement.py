@@ -20,6 +20,7 @@ HEIGHT = "cube[:, 2] = CUBE_HALF_SIZE\n"
         "unit-quaternion",
         "robot-holds",
         "outside-reach",
+        "bodies-stay",
     ],
 )
 def test_the_example_keeps_each(checked: Checked, rule: str) -> None:
@@ -121,3 +122,18 @@ def test_a_cube_that_is_sometimes_too_far(checked: Checked) -> None:
     )
     finding = the_finding(checked("outside-reach", edit))
     assert "cube is up to" in finding.message and 0 < finding.count < 8 and finding.code == CUBE_POSE
+
+
+def test_a_cube_that_flies_off(checked: Checked) -> None:
+    thrown = "            self.cube.set_linear_velocity(torch.tensor([0.0, 0.0, 60.0]).repeat(b, 1))\n\n"
+    ahead = "            # Ahead of the cube by"
+    finding = the_finding(checked("bodies-stay", (ahead, thrown + ahead)))
+    assert finding.message.startswith("cube moved at ") and "at step 1 of seed 0" in finding.message
+    assert "8 of 8 random episodes" in finding.message and finding.code.startswith("self.cube.set_pose(")
+
+
+def test_a_cube_that_falls_off_the_table_breaks_it_unless_the_episode_ends_there(checked: Checked) -> None:
+    beside = HEIGHT, HEIGHT + "            cube[:, 0] += 2\n"
+    assert checked("bodies-stay", beside).state == "kept"
+    finding = the_finding(checked("bodies-stay", beside, ("height < -0.1", "height < -9")))
+    assert finding.message.startswith("cube dropped 0.")

@@ -28,6 +28,18 @@ def test_a_normalized_reward_above_one(checked: Checked) -> None:
     assert checked("reward-normalized").state == "kept"
 
 
+def test_a_sparse_reward_above_one(checked: Checked) -> None:
+    sparse = (
+        "    def compute_normalized_dense_reward",
+        "    def compute_sparse_reward(self, obs, action, info):\n        return 2.0 - info['cube_to_goal'] * 0\n\n"
+        "    def compute_normalized_dense_reward",
+    )
+    finding = the_finding(checked("reward-normalized", sparse, reward_mode="sparse"))
+    assert "goes from 2 to 2" in finding.message and finding.function == "compute_sparse_reward"
+    assert checked("reward-normalized", reward_mode="sparse").state == "kept"
+    assert checked("reward-normalized", reward_mode="dense").state == "skipped"
+
+
 def test_a_reward_that_is_nan_where_random_actions_do_not_lead(checked: Checked) -> None:
     # The cube comes within a millimetre of the goal only where it is put there.
     nan = "reward = reach + push + torch.sqrt((info['cube_to_goal'] - 0.001).sign())\n"

@@ -107,6 +107,7 @@ def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -
         cameras=cameras,
         segmentation={1: "table"},
         can_render=True,
+        outlier_rules=OUTLIER_FINDINGS,
     )
 
 

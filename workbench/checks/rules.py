@@ -295,7 +295,7 @@ _TABLE = (
     Rule(
         "reward-normalized",
         "warn",
-        "The normalized dense reward lies within -1 and 1.",
+        "The normalized dense reward and the sparse one lie within -1 and 1.",
         "Learning rates and clipping of trainers expect that range.",
         "compute_normalized_dense_reward",
     ),

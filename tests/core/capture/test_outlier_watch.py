@@ -80,6 +80,14 @@ def test_under_the_floor_is_so_far_below_the_lowest_that_stands_still() -> None:
     assert [s.reason(1) for s in watch.check(step_of(there))] == ["arm/hand is under the floor"]
 
 
+def test_a_link_without_a_shape_may_be_anywhere() -> None:
+    geometry, poses = table_scene(2)
+    watch = OutlierWatch(replace(geometry, visuals=geometry.visuals[:2]), step_of(poses), 0.05, "dense")
+    poses = poses.copy()
+    poses[:, 2, 2] = -9.0
+    assert found(watch, poses) == {}
+
+
 def test_a_scene_with_other_bodies_than_before_is_not_compared() -> None:
     watch, poses = watched(2)
     more = np.concatenate([poses, poses[:, :1] + 50.0], axis=1)

@@ -101,6 +101,25 @@ def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> N
     assert (after.selected_env, after.timeline.moments, after.step_serial) == (2, 4, 3)
 
 
+def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that_is_odd_too() -> None:
+    state = running()
+    lost = np.array([0.0, np.nan, 0.0], np.float32)
+    odd = [replace(one, step=replace(one.step, reward=lost)) for one in (stepped(4), stepped(5))]
+    state.stepped(odd[0])
+    (found,) = view(state).odd
+    assert (found.rule, found.count, found.first_step) == ("reward-finite", 1, 3) and view(state).played == (
+        found,
+    )
+    state.loaded(loaded(report("same")), restored=False, stale=False)
+    assert view(state).odd == (found,)
+    state.loaded(loaded(report("patched"), source_hash="b"), restored=False, stale=False)
+    assert view(state).odd == ()
+    state.stepped(odd[1])
+    assert [each.first_step for each in view(state).odd] == [4]
+    state.loaded(loaded(report("rebuilt"), source_hash="b"), restored=False, stale=False)
+    assert view(state).odd == ()
+
+
 def test_another_scene_begins_another_past_whose_moments_count_on() -> None:
     state = running()
     state.change(selected_env=2)

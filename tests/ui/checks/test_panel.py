@@ -174,6 +174,18 @@ def test_rules_seen_while_playing_are_rows_of_the_same_list(shown: Shown) -> Non
     assert "None" not in text and "2 findings" in shown.panels.html("wb-rules-mark")
 
 
+def test_outliers_are_rows_of_the_same_list(shown: Shown) -> None:
+    file, message = "/home/me/push.py", "cube dropped 0.9 m, in env 3"
+    odd = Finding("bodies-stay", "warn", message, file, 70, "def it", "_initialize_episode", 40, 2)
+    shown.draw(DONE, odd=(odd,))
+    text = shown.panels.html("wb-checks")
+    for words in ("bodies-stay", "push.py:70", "cube dropped 0.9 m", "40 times and more, first at step 2"):
+        assert words in text
+    assert "2 findings" in shown.panels.html("wb-rules-mark")
+    shown.draw(DONE)
+    assert "bodies-stay" not in shown.panels.html("wb-checks")
+
+
 PROFILED = StepProfile(
     64,
     200,

@@ -302,12 +302,12 @@ def bodies_stay(checkup: Checkup) -> Iterator[Found | Note]:
     for seen in sorted(rollouts.outliers, key=lambda seen: (seen.step, seen.seed)):
         if seen.kind.rule == "bodies-stay":
             of_owner.setdefault(seen.body.split("/", 1)[0], []).append(seen)
-    for owner, every in of_owner.items():
+    for every in of_owner.values():
         first, seeds = every[0], sorted({seen.seed for seen in every})
         yield Found(
-            f"{first.reason} at step {first.step} of seed {first.seed}. {owner} flies off or falls in "
-            f"{of(len(seeds), len(rollouts.seeds), 'random episode')} (seed {listed(seeds)}). Let nothing overlap, leave "
-            "out speeds and forces that are too high, or end such an episode with `fail`.",
+            f"{first.reason} at step {first.step} of seed {first.seed}; so or otherwise it leaves the scene in "
+            f"{of(len(seeds), len(rollouts.seeds), 'random episode')} (seed {listed(seeds)}). Let nothing overlap and "
+            "nothing be thrown, or end an episode without it: return `fail` from evaluate().",
             _where_placed(checkup, first.body),
             len(seeds),
         )

@@ -12,6 +12,7 @@ from workbench.checks.by_hook.evaluate import flags
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.episodes import Episodes
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states
+from workbench.core.capture.outliers import REWARD_RANGES, ROUNDING
 from workbench.machine.text import of
 
 REWARD_HOOKS = {**DENSE_HOOKS, "sparse": "compute_sparse_reward"}
@@ -71,17 +72,31 @@ def reward_changes(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def reward_normalized(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts, where the reward is the normalized one."""
-    if checkup.task.env.reward_mode != "normalized_dense":
-        raise CannotCheck("it has no normalized dense reward")
+    """Over random rollouts, where the reward is the normalized or the sparse one."""
+    mode = checkup.task.env.reward_mode
+    if mode not in REWARD_RANGES:
+        raise CannotCheck("its reward is neither normalized nor sparse")
     reward = _rewards(checkup)
-    outside = np.abs(np.nan_to_num(reward)) > LARGEST
+    least, most = REWARD_RANGES[mode]
+    known = np.nan_to_num(reward)
+    outside = (known < least - ROUNDING) | (known > most + ROUNDING)
     if outside.any():
         low, high = float(np.nanmin(reward)), float(np.nanmax(reward))
+        sparse = mode == "sparse"
         yield Found(
-            f"the normalized reward goes from {low:.3g} to {high:.3g} in random episodes. Divide the dense reward by "
-            "the largest that an episode can reach in one step.",
-            checkup.places.hook("compute_normalized_dense_reward", "compute_dense_reward"),
+            f"the {'sparse' if sparse else 'normalized'} reward goes from {low:.3g} to {high:.3g} in random episodes. "
+            + (
+                "Return 1 at success, -1 at fail and 0 elsewhere."
+                if sparse
+                else "Divide the dense reward by the largest that an episode can reach in one step."
+            ),
+            checkup.places.hook(
+                *(
+                    [REWARD_HOOKS[mode]]
+                    if sparse
+                    else ["compute_normalized_dense_reward", "compute_dense_reward"]
+                )
+            ),
             int(outside.sum()),
         )
 

@@ -95,8 +95,10 @@ class OutlierWatch:
         kinds = np.array(geometry.body_kinds)
         self._names = geometry.body_names
         self._present = np.isfinite(first.poses).all(axis=2)
-        self._moves = self._present & np.isin(kinds, ("dynamic", "link"))
-        self._loose = self._present & (kinds == "dynamic")
+        # The links without a shape that a free root is made of may be anywhere.
+        shaped = np.isin(np.arange(len(kinds)), [body for each in geometry.visuals for body in each.bodies])
+        self._moves = self._present & shaped & np.isin(kinds, ("dynamic", "link"))
+        self._loose = self._present & shaped & (kinds == "dynamic")
         self._dt = control_dt
         self._low, self._high = REWARD_RANGES.get(reward_mode, (-np.inf, np.inf))
         self._floor = lowest_still_point(geometry, first.poses) - UNDER_EVERYTHING
@@ -165,9 +167,10 @@ class OutlierWatch:
             def body(env: int) -> int:
                 return int(wrong[env].argmax() if most is None else np.nanargmax(most[env]))
 
+            odd: Any = wrong.any(axis=1)
             return OutlierSighting(
                 kind,
-                np.asarray(wrong.any(axis=1)),
+                odd,
                 lambda env: say(env, body(env)),
                 lambda env: names[body(env)],
             )

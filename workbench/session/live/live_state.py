@@ -124,7 +124,7 @@ class LiveState:
             self._new_scene(task, event.first, its_past_stays=same)
         elif self.timeline is not None:
             self.set(step=self.timeline.history.replace_last(event.first))
-            if before is None or before.source != task.source:
+            if before is None or before.source_hash != task.source_hash:
                 self.timeline.history.begin_version(task.outlier_rules)
         if report is None or report.level not in ("same", "patched"):
             self.set(cameras_serial=self.now.cameras_serial + 1)

@@ -1,0 +1,60 @@
+"""The table of rules: each has one check, and those of outliers have a line."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.checks.checked import EXAMPLE
+from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
+from workbench.checks.by_hook.run import GROUPS
+from workbench.checks.evidence.places import rules_of_outliers
+from workbench.checks.rules import CHECK_RULES, RULES
+from workbench.core import rules as core_rules
+from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
+
+SILENCED = (
+    "    def evaluate(self) -> dict[str, torch.Tensor]:",
+    "    def evaluate(self) -> dict[str, torch.Tensor]:  # workbench: off[entries-finite] NaN is unknown",
+)
+
+
+@pytest.fixture
+def silenced(tmp_path: Path) -> Iterator[LoadedTask]:
+    file = tmp_path / "task.py"
+    assert SILENCED[0] in EXAMPLE.read_text()
+    file.write_text(EXAMPLE.read_text().replace(*SILENCED))
+    loaded = load_task(str(file))
+    yield loaded
+    undo_load(loaded)
+
+
+def test_an_outlier_is_told_at_the_hook_of_its_rule_unless_that_is_silenced_or_off(
+    silenced: LoadedTask,
+) -> None:
+    rules = rules_of_outliers(silenced, None)
+    assert {rule: finding.function for rule, finding in rules.items()} == {
+        "bodies-stay": "_initialize_episode",
+        "observation-finite": "_get_obs_extra",
+        "reward-finite": "compute_dense_reward",
+        "reward-normalized": "compute_normalized_dense_reward",
+    }
+    assert rules["reward-finite"].code.startswith("def compute_dense_reward(")
+    assert (rules["reward-finite"].degree, rules["bodies-stay"].degree) == ("stop", "warn")
+    assert {finding.degree for finding in rules_of_outliers(silenced, "warn").values()} == {"warn"}
+    assert rules_of_outliers(silenced, "off") == {}
+
+
+def test_each_rule_of_the_table_has_one_check_and_each_check_is_of_the_table() -> None:
+    checked = Counter(rule for group in GROUPS for rule in group.checks)
+    assert set(checked) == set(CHECK_RULES) and max(checked.values()) == 1
+    assert set(RULES) - set(CHECK_RULES) == set(core_rules.RULES)
+    assert not set(CHECK_RULES) & set(core_rules.RULES)
+
+
+def test_each_outlier_is_of_a_rule_that_is_checked_but_an_action_which_no_task_makes() -> None:
+    without = {kind for kind in OutlierKind if kind.rule is None}
+    assert without == {OutlierKind.ACTION_NOT_FINITE} and set(CHECK_RULES) >= OUTLIER_RULES
