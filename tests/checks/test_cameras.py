@@ -19,10 +19,16 @@ def test_a_camera_that_looks_past_the_objects(checked: Checked, renderer: None) 
     assert checked("camera-sees").state == "kept"
 
 
-def test_one_camera_of_several_may_see_an_object(checked: Checked, renderer: None) -> None:
+def test_an_object_needs_one_camera_of_several_and_a_fixed_camera_an_object(
+    checked: Checked, renderer: None
+) -> None:
+    above = CAMERA.replace("[", '[CameraConfig("above", pose=pose, width=64, height=64, fov=0.6), ', 1)
+    assert checked("camera-sees", (CAMERA, above)).state == "kept"
     away = "sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[1.5, 0, 0])"
     two = CAMERA.replace("[", f'[CameraConfig("away", pose={away}, width=64, height=64, fov=1.0), ', 1)
-    assert checked("camera-sees", (CAMERA, two)).state == "kept"
+    assert (
+        "'away' has none of the task's objects" in the_finding(checked("camera-sees", (CAMERA, two))).message
+    )
 
 
 def test_a_body_that_only_carries_a_camera_need_not_be_seen(renderer: None) -> None:

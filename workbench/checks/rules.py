@@ -388,7 +388,7 @@ _TABLE = (
     Rule(
         "camera-sees",
         "warn",
-        "Each sensor camera, or one of them, sees the objects of the task.",
+        "Each object of the task is seen by a sensor camera, and each fixed sensor camera sees one.",
         "What a policy must act on is not in its pictures.",
         "_default_sensor_configs",
     ),

@@ -129,6 +129,16 @@ def test_a_camera_that_is_turned_keeps_the_distance_of_what_it_looks_at(name: st
         assert math.dist(new_eye, new_target) == pytest.approx(math.dist(old_eye, old_target), abs=2e-4)
 
 
+def test_the_target_that_was_placed_is_the_one_that_is_written() -> None:
+    source = WRITTEN["a list, positional to the end"]
+    before = real_settings({FILE: source}, "cam")
+    eye, point = before.position, (1.5, 0.25, 0.3)
+    after = dataclasses.replace(before, quaternion=looking(eye, point), distance=math.dist(eye, point))
+    plan = planned(plan_edit, {FILE: source}, KEY, before, after, run_class)
+    assert isinstance(plan, SourceEdit)
+    assert math.dist(_look_at_numbers(plan.new_text)[1], point) < 1e-3
+
+
 def test_a_target_that_was_at_the_eye_comes_to_stand_before_it() -> None:
     source = WRITTEN["a list, positional to the end"].replace(
         "target=[-0.1, 0, 0.1]", "target=[0.29, 0, 0.6]"

@@ -468,7 +468,7 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
 def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(
     opened: tuple[Session, Copied],
 ) -> None:
-    _, copied = opened
+    session, copied = opened
     view = copied.refused
     assert view.studio.edit_state.can_copy and "is installed" in view.studio.edit_state.message
     view, file = copied.planned, copied.folder / "push_cube_2.py"
@@ -477,6 +477,7 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
     assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
     assert view.studio.edit_state.message.startswith(f"This is your copy of the task, {file}. This changes")
     assert moved(view) == {BASE}, "the placement is lost"
+    assert str(session.present_reference).startswith(str(file)), "its command line opens the copy"
     view = copied.ended
     assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
     assert (copied.folder / "push_cube.py").read_text() == "somebody's own"

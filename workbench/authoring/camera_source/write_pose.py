@@ -68,7 +68,7 @@ def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> No
     """Edit `pose` to that of `after`, in its own form or else with a quaternion.
 
     A ``look_at`` stays one while the camera is level and does not look along `up`: the target stays if the camera still
-    looks at it, else it moves along the new line of sight at its old distance. ManiSkill's ``look_at`` gives no unit
+    looks at it, else it is on the new line of sight at the distance of `after`, or its old one. ManiSkill's ``look_at`` gives no unit
     quaternion straight down or up (its `left` is the zero vector there), so those poses get a quaternion.
     """
     if pose.function == "look_at":
@@ -142,7 +142,7 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
         if error(_written_values(eye, after.position, decimals), target.numbers) <= ANGLE_STEP:
             _vector(changes, eye, after.position, decimals)
             return True
-    distance = max(_LEAST_DISTANCE, math.dist(pose.numbers[:3], target.numbers))
+    distance = max(_LEAST_DISTANCE, after.distance or math.dist(pose.numbers[:3], target.numbers))
     for decimals in _METRES:
         from_eye = _written_values(eye, after.position, decimals)
         requested = [a + distance * b for a, b in zip(from_eye, forward, strict=True)]

@@ -66,6 +66,18 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             )
         elif not np.any(uncovered[name]):
             covered.append(name)
+    env = checkup.pictured.env
+    for key, report in reports.items():
+        things = report.wanted_objects(None)
+        # Where it is the only one, each object says so.
+        one_of_several = len(reports) > 1 and mount_of(env, cameras_of(env)[key]) is None
+        if one_of_several and not any((thing.alone > 0).any() for thing in things):
+            yield Found(
+                f"sensor camera {key[1]!r} has none of the task's objects in any picture after a reset "
+                f"({listed([thing.name for thing in things])}). Aim it at them: `sapien_utils.look_at(eye=..., "
+                "target=...)`, or leave it out.",
+                _place(checkup, key),
+            )
     if covered:
         yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
 

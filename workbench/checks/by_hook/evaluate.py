@@ -121,7 +121,7 @@ def entries_finite(checkup: Checkup) -> Iterator[Found | Note]:
     for name, rows in episodes.evaluate.items():
         if rows.dtype.kind != "f":
             continue
-        bad = ~np.isfinite(rows.reshape(*rows.shape[:2], -1)).all(axis=2)
+        bad = np.asarray(~np.isfinite(rows.reshape(*rows.shape[:2], -1)).all(axis=2))
         if bad.any():
             step, env = (int(i) for i in np.argwhere(bad)[0])
             yield Found(

@@ -167,7 +167,7 @@ class OutlierWatch:
 
             return OutlierSighting(
                 kind,
-                wrong.any(axis=1),
+                np.asarray(wrong.any(axis=1)),
                 lambda env: say(env, body(env)),
                 lambda env: names[body(env)],
             )

@@ -164,6 +164,11 @@ class Session:
 
     # --- reading -----------------------------------------------------------------------------------
 
+    @property
+    def present_reference(self) -> TaskName:
+        """The task as it is named now: another class of the file, or a copy of the file, may have been chosen since."""
+        return self._state.reference
+
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
         known = {

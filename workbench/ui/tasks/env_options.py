@@ -86,7 +86,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
         changed = self._is_changed(view)
         self._apply.disabled = not changed or view.state == "stopped"
         self._discard.visible = changed or view.options_refused is not None
-        self._html.content = options_html(self._session.reference, view, self._reset)
+        self._html.content = options_html(self._session.present_reference, view, self._reset)
 
     # --- the form --------------------------------------------------------------------------------
 
