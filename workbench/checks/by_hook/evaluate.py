@@ -121,11 +121,7 @@ def entries_finite(checkup: Checkup) -> Iterator[Found | Note]:
     for name, rows in episodes.evaluate.items():
         if rows.dtype.kind != "f":
             continue
-<<<<<<< HEAD
-        bad = np.asarray(~np.isfinite(rows.reshape(*rows.shape[:2], -1)).all(axis=2))
-=======
         bad = np.logical_or.reduce(~np.isfinite(rows.reshape(*rows.shape[:2], -1)), axis=2)
->>>>>>> 694eb9bc999252fe7b981c7cc3469c384948cd53
         if bad.any():
             step, env = (int(i) for i in np.argwhere(bad)[0])
             yield Found(
