@@ -7,7 +7,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
+from mani_skill.utils.registration import REGISTERED_ENVS
 
 from workbench.authoring.loading.load import load_task, undo_load
 from workbench.checks.by_hook.run import GROUPS, RuleResult, core_results, run_group
@@ -21,11 +23,16 @@ Checked = Callable[..., RuleResult]
 
 
 @pytest.fixture
-def checked(tmp_path: Path) -> Checked:
+def checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
     """``checked(rule, (old, new), ..., text=..., num_envs=4, seeds=8, **env_kwargs)``: the rule's result.
 
     Each `old` must be in the text, which is the example's by default.
     """
+
+    # Other tests of the process leave the example's id registered, by another file.
+    for known in (REGISTERED_ENVS, gymnasium.registry):
+        for env_id in ("WorkbenchPushCube-v1", "WorkbenchPushCube"):
+            monkeypatch.delitem(known, env_id, raising=False)
 
     def check(
         rule: str,

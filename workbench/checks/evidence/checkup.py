@@ -334,7 +334,8 @@ class Checkup:
     def tensor_uses(self) -> TensorUses:
         """What the author's lines do with tensors: at a build, a reset and three steps."""
         watch = TensorWatch({str(file) for file in self.loaded.source_files})
-        with watch, self.env(NUM_ENVS) as task:
+        render = self._needs_renderer  # it builds `task`, which is not to be watched here
+        with watch, self.env(NUM_ENVS, render=render) as task:
             self.reset(task, self.seeds[0])
             rng = np.random.default_rng(0)
             for _ in range(3):
@@ -349,7 +350,8 @@ class Checkup:
         seeds = [FIRST_BUILT_SEED + i for i in range(min(SEEDS_ALONE, self.num_envs))]
         built: list[Built] = []
         shapes: dict[int, tuple[Any, ...]] = {}
-        with noting_builds(built, [], self.files), self.env(1) as task:
+        render = self._needs_renderer  # it builds `task`, which is not to be noted here
+        with noting_builds(built, [], self.files), self.env(1, render=render) as task:
             rebuilds = task.env.reconfiguration_freq != 0
             for seed in seeds:
                 if shapes:
