@@ -10,7 +10,7 @@ from tests.drive.page import picture_of_view
 from tests.drive.waiting import until
 
 WIDTH, HEIGHT = 1080, 640
-VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 390, "height": HEIGHT - 200}
+VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 430, "height": HEIGHT - 200}
 """The 3-D view, less what lies over it."""
 
 
