@@ -26,6 +26,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
         yield Desk(page, errors, file, opened)
 
 
+@pytest.mark.slow
 def test_a_task_that_keeps_the_rules_says_how_many_were_checked(desk: Desk) -> None:
     desk.page.get_by_role("tab", name="Checks", exact=True).click()
     expect(desk.page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=180_000)

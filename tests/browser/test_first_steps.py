@@ -44,6 +44,7 @@ def charts(desk: Desk) -> Locator:
     return desk.page.locator(".u-over:visible")
 
 
+@pytest.mark.slow
 def test_the_first_page_has_hints_that_are_closed_for_good(desk: Desk) -> None:
     hints = desk.page.locator(".wb-hints")
     expect(hints.locator("li")).to_have_count(4)

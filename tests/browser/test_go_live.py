@@ -56,6 +56,7 @@ def timeline_width(page: Page) -> float:
     return page.evaluate(f"() => {panel}?.getBoundingClientRect().width ?? 0")
 
 
+@pytest.mark.slow
 def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
     address: str, author: Path, browser: Browser
 ) -> None:

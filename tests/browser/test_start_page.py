@@ -77,6 +77,7 @@ def open_list(page: Page) -> None:
         expect(page.get_by_role("dialog").locator(".wb-tasks")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_from_the_start_page_to_a_task_to_another_and_back(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -135,6 +136,7 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         assert errors == []
 
 
+@pytest.mark.slow
 def test_options_are_applied_on_the_page_and_bad_ones_leave_the_envs(
     started: Opened, browser: Browser
 ) -> None:

@@ -75,6 +75,7 @@ def printed_by_open(folder: Path, end: str) -> str:
     return log.read_text()
 
 
+@pytest.mark.slow
 def test_what_has_moved_is_named_with_what_it_disables_and_the_task_opens(tmp_path: Path) -> None:
     moved = {"_cached_local_pose": "_cached_local", "_hidden_objects": "_concealed_objects"}
     copy_of_maniskill(tmp_path, moved)

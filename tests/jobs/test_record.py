@@ -480,6 +480,7 @@ def test_a_recording_that_cannot_be_made_ends_with_a_sentence(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_page_that_cannot_be_opened_ends_with_a_sentence(tmp_path: Path) -> None:
     """As a process: the door is open by then, and a worker is there."""
     done = subprocess.run(
@@ -495,6 +496,7 @@ def test_a_page_that_cannot_be_opened_ends_with_a_sentence(tmp_path: Path) -> No
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_page_of_an_id_says_where_it_is_once() -> None:
     with open_workbench(
         "PickCube-v1", "--num-envs", "1", "--no-spare", "--env", "render_backend=none"

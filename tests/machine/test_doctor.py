@@ -47,6 +47,7 @@ def test_versions_are_shown_and_what_they_mean(findings: dict[str, DoctorFinding
     assert ("nightly" in findings["ManiSkill"].what) == (maniskill[0] == "mani_skill-nightly")
 
 
+@pytest.mark.slow
 def test_a_version_that_was_not_tested_is_named_with_the_way_back(
     child_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +109,7 @@ def test_a_taken_port_is_said_with_the_option_to_change_it(monkeypatch: pytest.M
     assert finding.advice and "--port" in finding.advice
 
 
+@pytest.mark.slow
 def test_a_question_that_fails_is_told_and_the_others_are_answered(
     child_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -187,6 +187,7 @@ def test_open_warns_of_the_mix_and_goes_on(mixed: None, capsys: pytest.CaptureFi
     assert "are both installed" in said and "pip uninstall" in said and "there is no file" in said
 
 
+@pytest.mark.slow
 def test_doctor_says_both(
     child_process: None, mixed: None, lacking: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

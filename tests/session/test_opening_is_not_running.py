@@ -240,6 +240,7 @@ def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
     os.close(terminal)
 
 
+@pytest.mark.slow
 def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorded: Path) -> None:
     asked: list[TrustQuestion] = []
     answers = iter([Consent.NO, Consent.ONCE])

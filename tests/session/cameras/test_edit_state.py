@@ -86,6 +86,7 @@ def names(session: Session) -> list[str]:
     return [c.key[1] for c in session.view().studio.cameras if c.key[0] == "human"]
 
 
+@pytest.mark.slow
 def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_each_time(
     session: Session, task_file: Path
 ) -> None:

@@ -107,6 +107,7 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
     return reached
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_step_of_undo(
     session: Session,
 ) -> None:
@@ -394,6 +395,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
     assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
 
 
+@pytest.mark.slow
 def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
     studio = session.studio
     studio.reports.measure(3)
@@ -443,6 +445,7 @@ def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
         session.studio.import_pose(BASE, "{}", None, None)
 
 
+@pytest.mark.slow
 def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
     session: Session, task_file: Path
 ) -> None:

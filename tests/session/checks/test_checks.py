@@ -222,6 +222,7 @@ def test_a_version_that_cannot_be_loaded_there_is_told_with_its_problem(
 # --- with processes -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_clears_it(
     child_process: None, task_file: Path
 ) -> None:

@@ -43,6 +43,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     os.chdir(before)
 
 
+@pytest.mark.slow
 def test_a_task_of_a_package_opens_and_is_followed(project: Path) -> None:
     class_name = "MinimalEnv"
     session = Session(

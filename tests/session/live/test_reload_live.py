@@ -213,6 +213,7 @@ def test_the_same_id_twice_is_told_with_both_lines(session: Session, task_file: 
 # --- recording ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
     session: Session, task_file: Path, good: str
 ) -> None:

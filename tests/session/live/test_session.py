@@ -232,6 +232,7 @@ def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
     assert np.allclose(view.step.action, 0.25) and view.problem is None
 
 
+@pytest.mark.slow
 def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session: Session) -> None:
     settle(session)
     sensor = next(c for c in session.view().task.cameras if c.kind == "sensor")

@@ -198,6 +198,7 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
     assert not after(session, lambda: session.past.continue_from_shown("into all")).timeline.not_carried
 
 
+@pytest.mark.slow
 def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     start = fresh(session)
     written = session.view().recording.episodes_written
@@ -250,6 +251,7 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     session.set_clients(0)
 
 
+@pytest.mark.slow
 def test_the_episodes_go_on_as_they_stand_with_a_worker_that_takes_over(session: Session) -> None:
     fresh(session)
     step(session, 4)

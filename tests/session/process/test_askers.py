@@ -152,6 +152,7 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
     assert background.pid is not None
 
 
+@pytest.mark.slow
 def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job_that_asked(
     background: Background, tmp_path: Path
 ) -> None:
@@ -300,6 +301,7 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
     assert pids[1] == pids[2] == background.pid != pids[0]
 
 
+@pytest.mark.slow
 def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

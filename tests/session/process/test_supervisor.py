@@ -159,6 +159,7 @@ def test_the_end_says_what_it_was_at_and_where() -> None:
         assert "in leave" in death.stack
 
 
+@pytest.mark.slow
 def test_the_third_death_in_a_row_is_the_last_until_somebody_asks() -> None:
     with minded() as one:
         for times in (1, 2, 3):
@@ -404,6 +405,7 @@ def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> 
         assert "--memory-limit" in death.why and not death.asked
 
 
+@pytest.mark.slow
 def test_every_worker_listens_for_a_debugger_and_only_the_first_waits_for_it() -> None:
     with minded(WorkerOptions(debug_port=1234, debug_wait=True)) as one:
         assert one.events[0] == Loading("debugger at 1234, waits: True")

@@ -274,6 +274,7 @@ def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, risk
     wait_until(session, lambda v: v.state == "paused", "the version again")
 
 
+@pytest.mark.slow
 def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: Path) -> None:
     file = write_task(tmp_path)
     provoke(file, "import", "abort")
@@ -290,6 +291,7 @@ def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: P
     assert not psutil.pid_exists(waiting)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_while_it_waits_comes_back(session: Session) -> None:
     before = session.view()
     os.kill(session.worker_pid, signal.SIGKILL)

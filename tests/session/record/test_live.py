@@ -96,6 +96,7 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
         assert_same(episode, kept[episode.info.env_index])
 
 
+@pytest.mark.slow
 def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> None:
     count = session.view().recording.episodes_written
     for steps in (3, 1):
@@ -121,6 +122,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     session.change(action_source="random")
 
 
+@pytest.mark.slow
 def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(session: Session) -> None:
     """A keep to a camera that is judged over seeds; that, and a search, to a keep."""
     reports = session.studio.reports
@@ -181,6 +183,7 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
         assert came() == of
 
 
+@pytest.mark.slow
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
     before = session.view().recording.episodes_written
     session.start_recording((1,), next_episode=True)

@@ -197,6 +197,7 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
         np.testing.assert_array_equal(curve.new, factor * curve.old)
 
 
+@pytest.mark.slow
 def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
     loops = desk.file.with_name("loops")
     loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"

@@ -33,6 +33,7 @@ class HidesItsCube(PushCubeEnv):
 CAMERA = ("sensor", "base_camera")
 
 
+@pytest.mark.slow
 def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     file.write_text(TASK)

@@ -285,6 +285,7 @@ def test_the_command_renews_at_a_signal_and_ends_at_another(child_process: None,
         process.communicate()
 
 
+@pytest.mark.slow
 def test_the_palette_of_the_page_renews_and_the_page_is_closed(child_process: None, tmp_path):
     process = subprocess.Popen(
         [*python_command("-m", "workbench.cli.main"), "review", str(tmp_path), "--port", "0"],

@@ -67,6 +67,7 @@ class Told:
         return self.making.view()
 
 
+@pytest.mark.slow
 def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_path: Path) -> None:
     told, (source,) = Told(), find_all_sources([recordings])
     assert told.making.start(MakeRequest("sheet", (source,), tmp_path))

@@ -136,6 +136,7 @@ def test_a_recordings_name_is_text_and_no_script(
     assert "<b>" not in page
 
 
+@pytest.mark.slow
 def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
     gated_server: GatedServer, pages: RerunPages, recording: Path, browser: Browser
 ) -> None:

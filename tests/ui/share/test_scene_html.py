@@ -50,6 +50,7 @@ def episode() -> Episode:
     )
 
 
+@pytest.mark.slow
 def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Browser) -> None:
     path, done = tmp_path / "a.html", []
     write_scene_html(path, episode, on_progress=done.append)

@@ -66,7 +66,7 @@ PRIVATE_NAMES = (
     "messages.Message",
     *(f"messages.{name}" for name in (*sorted(KINDS), *REFUSED_FROM_CLIENTS)),
     "gui.AssignablePropsBase._queue_update",
-    "gui.GuiTabGroupHandle._rebuild_tab_props",
+    "gui._TabContainerMixin._rebuild_tab_props",
 )
 """Names that this module relies on.
 
