@@ -96,7 +96,9 @@ class OwnRobotEnv(BaseEnv):
             self.agent.reset(rest + 0.1 * torch.rand((b, 3)) * torch.tensor([1, 1, 0]))
             angle = 2 * torch.rand(b) - 1
             distance = REACH[0] + (REACH[1] - REACH[0]) * torch.rand(b)
-            place = torch.stack([distance * angle.cos(), distance * angle.sin(), torch.full((b,), 0.002)], dim=1)
+            place = torch.stack(
+                [distance * angle.cos(), distance * angle.sin(), torch.full((b,), 0.002)], dim=1
+            )
             self.mark.set_pose(Pose.create_from_pq(place))
 
     def evaluate(self) -> dict[str, torch.Tensor]:

@@ -100,8 +100,8 @@ class SwingUpEnv(BaseEnv):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=[0.3, -1.8, 1.2], target=[0, 0, 0.6])
-        return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=0.9, near=0.01, far=10)]
+        pose = sapien_utils.look_at(eye=[0.2, -1.3, 1.3], target=[0, 0, 0.6])
+        return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         with torch.device(self.device):

@@ -13,7 +13,21 @@ import pytest
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 FOLDER = Path(__file__).parents[2] / "tasks"
-IDS = {"push_cube": "WorkbenchPushCube-v1", "minimal": "WorkbenchMinimal-v1"}
+IDS = {
+    "push_cube": "WorkbenchPushCube-v1",
+    "minimal": "WorkbenchMinimal-v1",
+    "articulated": "WorkbenchArticulated-v1",
+    "cameras": "WorkbenchCameras-v1",
+    "custom_scene": "WorkbenchCustomScene-v1",
+    "different_objects": "WorkbenchDifferentObjects-v1",
+    "fail_conditions": "WorkbenchFailConditions-v1",
+    "obs_history": "WorkbenchObsHistory-v1",
+    "own_robot": "WorkbenchOwnRobot-v1",
+    "reward_terms": "WorkbenchRewardTerms-v1",
+    "swing_up": "WorkbenchSwingUp-v1",
+    "task_state": "WorkbenchTaskState-v1",
+    "two_robots": "WorkbenchTwoRobots-v1",
+}
 
 
 def import_file(name: str) -> None:
