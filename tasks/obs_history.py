@@ -82,7 +82,9 @@ class ObsHistoryEnv(BaseEnv):
         self.past = torch.cat([self.past[:, 1:], self.ball.pose.p[:, None]], dim=1)
 
     def get_state_dict(self) -> dict[str, Any]:
-        return {**super().get_state_dict(), "task": {"past": self.past.flatten(1)}}
+        state: dict[str, Any] = super().get_state_dict()  # type: ignore[assignment]
+        state["task"] = {"past": self.past.flatten(1)}
+        return state
 
     def set_state_dict(self, state: dict[str, Any], env_idx: torch.Tensor | None = None) -> None:
         super().set_state_dict(state, env_idx)

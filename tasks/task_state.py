@@ -78,7 +78,9 @@ class TaskStateEnv(BaseEnv):
             self.wanted[env_idx] = torch.randint(len(COLORS), (b,))
 
     def get_state_dict(self) -> dict[str, Any]:
-        return {**super().get_state_dict(), "task": {"wanted": self.wanted[:, None].clone()}}
+        state: dict[str, Any] = super().get_state_dict()  # type: ignore[assignment]
+        state["task"] = {"wanted": self.wanted[:, None].clone()}
+        return state
 
     def set_state_dict(self, state: dict[str, Any], env_idx: torch.Tensor | None = None) -> None:
         super().set_state_dict(state, env_idx)

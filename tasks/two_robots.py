@@ -35,7 +35,7 @@ LIFTED = 0.1
 class TwoRobotsEnv(BaseEnv):
     """Success: the bar is `LIFTED` above the ground and level, and both robots hold it."""
 
-    SUPPORTED_ROBOTS = [("panda", "panda")]
+    SUPPORTED_ROBOTS = [("panda", "panda")]  # type: ignore[assignment]
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
     agent: MultiAgent[tuple[Panda, Panda]]
 

@@ -1,4 +1,4 @@
-"""What holds for every example task: in stock ManiSkill, with the workbench, and by the rules of `workbench check`."""
+"""What holds for every example task: in stock ManiSkill, and with the workbench."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 import torch
 
 import workbench
-from tests.checks.checked import check_rules
 from tests.tasks.conftest import FOLDER, IDS
-from workbench.checks.rules import RULES
 
 Make = Callable[..., Any]
 EXAMPLES = ("push_cube", "minimal")
@@ -144,7 +142,7 @@ def test_stock_maniskill_makes_and_steps_it_without_a_warning(
 @pytest.mark.filterwarnings("ignore:.*which belonged to another task")  # the class that the fixture imported
 @pytest.mark.parametrize("name", IDS)
 def test_the_workbench_steps_several_envs_of_it_and_resets_one(name: str) -> None:
-    env = workbench.make(
+    env: Any = workbench.make(
         FOLDER / f"{name}.py",
         num_envs=2,
         backend="cpu",
@@ -155,8 +153,8 @@ def test_the_workbench_steps_several_envs_of_it_and_resets_one(name: str) -> Non
     try:
         env.action_space.seed(0)
         env.reset(seed=0)
-        for _ in range(3):
-            obs, reward, *_ = env.step(env.action_space.sample())
+        env.step(env.action_space.sample())
+        obs, reward, *_ = env.step(env.action_space.sample())
         before = [leaf[0].clone() for leaf in numbers(obs)]
         obs, _ = env.reset(seed=1, options={"env_idx": torch.tensor([1])})
         assert reward.shape == (2,) and torch.isfinite(reward).all()
@@ -164,10 +162,3 @@ def test_the_workbench_steps_several_envs_of_it_and_resets_one(name: str) -> Non
             torch.testing.assert_close(leaf[0], left)
     finally:
         env.close()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", IDS)
-def test_no_rule_is_broken_by_it(name: str, renderer: None) -> None:
-    results = check_rules(RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=8)
-    assert {each: result for each, result in results.items() if result.state in ("broken", "failed")} == {}
