@@ -10,10 +10,27 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 FOLDER = Path(__file__).parents[2] / "tasks"
-IDS = {"push_cube": "WorkbenchPushCube-v1", "minimal": "WorkbenchMinimal-v1"}
+IDS = {
+    "push_cube": "WorkbenchPushCube-v1",
+    "minimal": "WorkbenchMinimal-v1",
+    "articulated": "WorkbenchArticulated-v1",
+    "cameras": "WorkbenchCameras-v1",
+    "custom_scene": "WorkbenchCustomScene-v1",
+    "different_objects": "WorkbenchDifferentObjects-v1",
+    "fail_conditions": "WorkbenchFailConditions-v1",
+    "obs_history": "WorkbenchObsHistory-v1",
+    "own_robot": "WorkbenchOwnRobot-v1",
+    "reward_terms": "WorkbenchRewardTerms-v1",
+    "swing_up": "WorkbenchSwingUp-v1",
+    "task_state": "WorkbenchTaskState-v1",
+    "two_robots": "WorkbenchTwoRobots-v1",
+}
+ROBOTS = ("workbench_pen_arm", "workbench_pendulum")
+"""Those that the examples register."""
 
 
 def import_file(name: str) -> None:
@@ -22,13 +39,22 @@ def import_file(name: str) -> None:
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def example_tasks() -> None:
-    for name, env_id in IDS.items():
-        # Another test may have left an edited version, which ManiSkill would not replace.
+def forget_examples() -> None:
+    for env_id in IDS.values():
         gym.registry.pop(env_id, None)
         REGISTERED_ENVS.pop(env_id, None)
+    for uid in ROBOTS:
+        REGISTERED_AGENTS.pop(uid, None)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def example_tasks() -> Iterator[None]:
+    # Another test may have left an edited version, which ManiSkill would not replace.
+    forget_examples()
+    for name in IDS:
         import_file(name)
+    yield
+    forget_examples()
 
 
 @pytest.fixture

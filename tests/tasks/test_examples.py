@@ -1,4 +1,4 @@
-"""What holds for every example task in stock ManiSkill."""
+"""What holds for every example task: in stock ManiSkill, and with the workbench."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ from typing import Any
 import pytest
 import torch
 
+import workbench
+from tests.tasks.conftest import FOLDER, IDS
+
 Make = Callable[..., Any]
 EXAMPLES = ("push_cube", "minimal")
+"""Those that a reader begins with; the other files of `IDS` have one idea each."""
 REWARD_MODES = {"push_cube": ("normalized_dense", "dense", "sparse", "none"), "minimal": ("sparse", "none")}
 WITH_REWARD = [(name, mode) for name, modes in REWARD_MODES.items() for mode in modes]
 
@@ -105,3 +109,56 @@ def test_it_builds_and_steps_with_rendering(name: str, make: Make, renderer: Non
     _, reward, terminated, _, info = env.step(env.action_space.sample())
     assert torch.isfinite(reward).all() and reward.shape == terminated.shape
     assert info["elapsed_steps"].unique().tolist() == [1]
+
+
+# --- one idea a file --------------------------------------------------------------------------------
+
+
+def numbers(found: Any) -> list[torch.Tensor]:
+    """The leaves of an observation or an action."""
+    if isinstance(found, dict):
+        return [leaf for each in found.values() for leaf in numbers(each)]
+    return [torch.as_tensor(found)]
+
+
+def test_every_example_is_listed() -> None:
+    assert {file.stem for file in FOLDER.glob("*.py")} == IDS.keys()
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_stock_maniskill_makes_and_steps_it_without_a_warning(
+    name: str, make: Make, mani_skill_log: list[str]
+) -> None:
+    env = make(name, obs_mode="state_dict")
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(5):
+        obs, reward, terminated, _, _ = env.step(env.action_space.sample())
+        assert all(leaf.shape[0] == 1 and torch.isfinite(leaf).all() for leaf in numbers(obs))
+        assert reward.shape == terminated.shape == (1,) and torch.isfinite(reward).all()
+    assert mani_skill_log == []
+
+
+@pytest.mark.filterwarnings("ignore:.*which belonged to another task")  # the class that the fixture imported
+@pytest.mark.parametrize("name", IDS)
+def test_the_workbench_steps_several_envs_of_it_and_resets_one(name: str) -> None:
+    env: Any = workbench.make(
+        FOLDER / f"{name}.py",
+        num_envs=2,
+        backend="cpu",
+        render_backend="none",
+        obs_mode="state_dict",
+        rules="stop",
+    )
+    try:
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        obs, reward, *_ = env.step(env.action_space.sample())
+        before = [leaf[0].clone() for leaf in numbers(obs)]
+        obs, _ = env.reset(seed=1, options={"env_idx": torch.tensor([1])})
+        assert reward.shape == (2,) and torch.isfinite(reward).all()
+        for left, leaf in zip(before, numbers(obs), strict=True):
+            torch.testing.assert_close(leaf[0], left)
+    finally:
+        env.close()
