@@ -190,6 +190,9 @@ def run_python(fence: Fence, names: dict[str, object], out: io.StringIO, wanted:
 
 
 def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) -> None:
+    if words[:2] == ["workbench", "new"]:
+        # The desk has a task for pages that take one for granted.
+        (desk / f"{words[2]}.py").unlink(missing_ok=True)
     if wanted is None and words[:1] == ["workbench"] and words[1] in OPENS_A_PAGE:
         opens(words, desk)
         return
