@@ -17,6 +17,8 @@ from workbench.authoring.templates.new_task import (
     CannotBegin,
     Template,
     camel_case,
+    fill_blank_file,
+    is_blank,
     maniskill_ids,
     why_not_name,
     write_new_task,
@@ -143,3 +145,23 @@ def test_words_of_a_name_are_joined() -> None:
     assert [camel_case(name) for name in ("stack_two", "stackTwo", "pick3d", "_a__b", "2 push")] == [
         "StackTwo", "StackTwo", "Pick3d", "AB", "Task2Push",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("content", "blank"),
+    [(b"", True), (b"\n  # a\n\t\n", True), (b"pass", False), (b'"""A task."""', False), (b"\xff", False)],
+)
+def test_only_a_file_of_comments_and_blank_lines_is_filled(
+    tmp_path: Path, content: bytes, blank: bool
+) -> None:
+    file = tmp_path / "my-first.py"
+    file.write_bytes(content)
+    assert is_blank(file) == blank and not is_blank(tmp_path / "gone.py")
+    if blank:
+        fill_blank_file(file)
+        assert read_task_file(file) == TaskFile(file, ("MyFirst-v1",), ("MyFirstEnv",))
+        assert file.read_bytes().startswith(content.rstrip())
+    else:
+        with pytest.raises(CannotBegin, match="not empty any more"):
+            fill_blank_file(file)
+        assert file.read_bytes() == content

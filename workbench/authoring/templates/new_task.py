@@ -16,10 +16,12 @@ from workbench.authoring.loading.copy_task import CannotCopy, NewNames, copied_t
 from workbench.authoring.loading.find_tasks import find_task_files, read_task_file
 from workbench.authoring.loading.library_names import is_library
 from workbench.authoring.loading.modules import read_exactly
-from workbench.machine.files import create_file
+from workbench.machine.files import create_file, read_regular_file, replace_file
 from workbench.machine.folders import example_tasks
 
 LONGEST_NAME = 60
+_MOST_BLANK = 64 * 1024
+"""Bytes of a file that may be filled; one with more holds something."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _WORD = re.compile(r"[A-Za-z0-9]+")
 
@@ -81,6 +83,41 @@ def write_new_task(name: str, origin: str, folder: Path) -> NewTask:
     if not created:
         raise CannotBegin(_taken(file))
     return made
+
+
+def is_blank(file: Path) -> bool:
+    """Whether a file holds nothing but comments and blank lines; False if it cannot be read."""
+    return _blank_content(file) is not None
+
+
+def fill_blank_file(file: Path) -> None:
+    """Write the first template into a file that holds nothing but comments and blank lines; they stay above it.
+
+    Class and id are made of the file's name.
+
+    Raises:
+        CannotBegin: the file is unchanged.
+    """
+    content = _blank_content(file)
+    if content is None:
+        raise CannotBegin(f"{file.name} is not empty any more, and was not written over.")
+    text, _, _ = _new_text(file, camel_case(file.stem), TEMPLATES[0].name)
+    above = content.rstrip()
+    try:
+        done = replace_file(file, (above + b"\n\n" if above else b"") + text.encode(), expected=content)
+    except OSError as error:
+        raise CannotBegin(f"{file} cannot be written: {error.strerror}.") from error
+    if not done:
+        raise CannotBegin(f"{file.name} was saved meanwhile, and was not written over.")
+
+
+def _blank_content(file: Path) -> bytes | None:
+    try:
+        content = read_regular_file(file, _MOST_BLANK)
+        lines = content.decode().splitlines()
+    except (OSError, ValueError):
+        return None
+    return content if all(not line.strip() or line.lstrip().startswith("#") for line in lines) else None
 
 
 def why_not_name(name: str, folder: Path) -> str:
