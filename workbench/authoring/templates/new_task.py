@@ -59,7 +59,7 @@ class NewTask:
         return self.file.name if self.is_default else f"{self.file.name}:{self.class_name}"
 
 
-class CannotBegin(Exception):
+class CannotBegin(ValueError):
     """No task was written; the message is a sentence that says what to do."""
 
 
