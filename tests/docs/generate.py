@@ -35,6 +35,7 @@ RULES_PAGE = DOCS / "batched_env.md"
 ALL_RULES = DOCS / "reference" / "rules.md"
 COMMANDS = (
     "start",
+    "new",
     "open",
     "review",
     "record",

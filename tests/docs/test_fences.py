@@ -39,7 +39,7 @@ RUN = ("", "slow", "wrong")
 OPENS_A_PAGE = ("open", "review")
 COMMANDS = {"open": main.open_page} | {
     name: getattr(main, name)
-    for name in ("record", "check", "review", "rescore", "share", "export", "view", "doctor")
+    for name in ("new", "record", "check", "review", "rescore", "share", "export", "view", "doctor")
 }
 TYPED = [
     page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))
@@ -190,6 +190,9 @@ def run_python(fence: Fence, names: dict[str, object], out: io.StringIO, wanted:
 
 
 def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) -> None:
+    if words[:2] == ["workbench", "new"]:
+        # The desk has a task for pages that take one for granted.
+        (desk / f"{words[2]}.py").unlink(missing_ok=True)
     if wanted is None and words[:1] == ["workbench"] and words[1] in OPENS_A_PAGE:
         opens(words, desk)
         return

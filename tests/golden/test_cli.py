@@ -28,6 +28,7 @@ TEXTS = Path(__file__).parent / "cli"
 COMMANDS = (
     "start",
     "open",
+    "new",
     "record",
     "check",
     "review",
@@ -59,6 +60,15 @@ CALLS = {
         "open push.py --memory-limit much",
         "open push.py --host 0.0.0.0 --no-token",
         "open push.py --debug --socket here",
+    ],
+    "new": [
+        "new push",
+        "new push-it",
+        "new class",
+        "new torch",
+        "new pick_cube",
+        "new base",
+        "new stack_two --from nonsense",
     ],
     "record": [
         "record gone.py",

@@ -155,6 +155,24 @@ def open_page(
 
 
 @app.command
+def new(
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = "",
+    /,
+    *,
+    origin: Annotated[str, tyro.conf.arg(name="from", metavar="TEMPLATE")] = "",
+) -> int:
+    """Write NAME.py into this folder: a task that opens and passes its checks, to go on from. Asks for what is not given.
+
+    Args:
+        name: of the file, such as stack_two, whose class is StackTwoEnv and whose id is StackTwo-v1.
+        origin: minimal (also if not given), tabletop, or the id of a task of ManiSkill, such as PickCube-v1, which is copied.
+    """
+    from workbench.cli.new import new_in_terminal
+
+    return new_in_terminal(name, origin)
+
+
+@app.command
 def record(
     recording: Annotated[RecordArguments, tyro.conf.PositionalRequiredArgs],
     envs: EnvArguments = _FEW,

@@ -220,3 +220,13 @@ def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
     until(desk.place.is_idle, "a paused task")
     monkeypatch.setattr(workplace, "ENOUGH_MEMORY", 1 << 60)
     assert not desk.place.is_idle()
+
+
+def test_a_new_task_is_written_where_the_workbench_was_started_and_opened(desk: Desk) -> None:
+    for name in ("push", "../elsewhere/mine", "class"):
+        with pytest.raises(ValueError):
+            desk.place.open_task.create(name, 0)
+    desk.place.open_task.create("stack_two", 1)
+    desk.session_of("stack_two.py")
+    assert "class StackTwoEnv" in (desk.folder / "work" / "stack_two.py").read_text()
+    assert desk.row("stack_two.py").section is Section.FOLDER

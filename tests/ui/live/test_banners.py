@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
-from workbench.ui.live.banners import DOING, Banner, banner_html
+from workbench.ui.live.banners import DOING, FILL, Banner, banner_html
 
 RESTART = "Restart the worker"
 EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
@@ -65,3 +66,27 @@ def test_dead_worker_can_be_started_again(panels: Panels) -> None:
     banner.draw(replace(EMPTY, problem=problem(), problem_serial=1, state="stopped"))
     panels.press(RESTART)
     assert asked == ["restart"]
+
+
+def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(
+    panels: Panels, tmp_path: Path
+) -> None:
+    file = tmp_path / "stack_two.py"
+    file.write_text("# mine\n\n")
+    banner = Banner(panels.server, lambda: None, lambda: None, is_own=str(file).__eq__)
+    view = replace(EMPTY, problem=replace(problem(), file=str(file)), problem_serial=1, state="error")
+    banner.draw(view)
+    assert panels.shows(FILL) and file.read_text() == "# mine\n\n"
+    file.write_text("x = 1\n")
+    panels.press(FILL)
+    assert file.read_text() == "x = 1\n" and "not empty any more" in panels.client.notices[0]
+    file.write_text("# mine\n\n")
+    panels.press(FILL)
+    assert file.read_text().startswith('# mine\n\n"""The least') and "class StackTwoEnv" in file.read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["stack_two.py"]
+    banner.draw(replace(view, problem_serial=2))
+    assert not panels.shows(FILL), "it holds a task"
+    other = tmp_path / "other.py"
+    other.touch()
+    banner.draw(replace(view, problem=replace(problem(), file=str(other)), problem_serial=3))
+    assert not panels.shows(FILL), "it is not the task's"

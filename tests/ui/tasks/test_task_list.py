@@ -12,7 +12,15 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.session.tasks.recents import RecentTasks
 from workbench.session.tasks.registered import NotDrawn, RegisteredTasks, RegisteredView
-from workbench.ui.tasks.task_list import MOST_RECENT, OPEN, OpenDialog, TaskList, picture_route, tasks_html
+from workbench.ui.tasks.task_list import (
+    CREATE,
+    MOST_RECENT,
+    OPEN,
+    OpenDialog,
+    TaskList,
+    picture_route,
+    tasks_html,
+)
 
 PUSH = Entry(1, Section.FOLDER, "push.py", "Push-v1", "/w/push.py", Path("/w/push.py"))
 PICK = Entry(2, Section.REGISTERED, "PickCube-v1", "", "PickCube-v1", env_id="PickCube-v1")
@@ -25,9 +33,15 @@ class Chosen:
     def __init__(self, catalogue: Catalogue) -> None:
         self.catalogue, self.numbers = catalogue, list[int]()
         self.says = ""
+        self.created: list[tuple[str, int]] = []
 
     def choose(self, number: int) -> None:
         self.numbers.append(number)
+
+    def create(self, name: str, template: int) -> None:
+        if name == "taken":
+            raise ValueError("There is a file taken.py already.")
+        self.created.append((name, template))
 
     def doing(self) -> str:
         return self.says
@@ -92,6 +106,21 @@ def test_the_search_leaves_what_has_all_words_and_can_be_cleared(
     clock.passes()
     listed.draw()
     assert "pull.py" in panels.html("wb-tasks") and panels.control("Search").value == ""
+
+
+def test_a_new_task_is_asked_for_by_its_name_and_the_number_of_a_template(
+    panels: Panels, chosen: Chosen, clock: Clock
+) -> None:
+    done: list[bool] = []
+    TaskList(panels.server, chosen, lambda: done.append(True), clock)
+    panels.set("Name", "taken")
+    panels.press(CREATE)
+    assert panels.client.notices == ["There is a file taken.py already."]
+    assert chosen.created == [] and done == []
+    panels.set("Name", " stack_two ")
+    panels.set("Template", panels.control("Template").options[1])
+    panels.press(CREATE)
+    assert chosen.created == [("stack_two", 1)] and done == [True]
 
 
 def html(view: CatalogueView, words: str = "", doing: str = "") -> str:

@@ -6,7 +6,7 @@ import ast
 import importlib.util
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from workbench.authoring.loading.modules import module_name, read_exactly
@@ -19,6 +19,15 @@ _VERSION = re.compile(r"-v\d+$")
 
 class CannotCopy(Exception):
     """The task cannot be copied; the message is the end of a sentence."""
+
+
+@dataclass(frozen=True)
+class NewNames:
+    """Names that a copy has in place of the original's."""
+
+    ids: dict[str, str] = field(default_factory=dict)
+    """By the original's id; one that is not in it is renamed as in any copy."""
+    classes: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,9 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
     raise CannotCopy(f"{folder} has {MOST_COPIES} copies of {source.name} already")
 
 
-def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tuple[str, str], ...]]:
+def copied_text(
+    source: Path, text: str, number: int = 1, names: NewNames | None = None
+) -> tuple[str, tuple[tuple[str, str], ...]]:
     """The text of the copy, and pairs of the original's and the copy's id.
 
     Only what depends on the file's place and ids changes: relative imports name their package, `__file__` becomes the
@@ -64,6 +75,7 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.
         number: of the copy; it is part of the ids from 2 on.
+        names: chosen for the copy; they stand in its docstrings too.
 
     Raises:
         CannotCopy: it cannot be copied, such as a file without a package that imports modules of its folder relatively.
@@ -95,10 +107,44 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
             raise CannotCopy(
                 f"line {call.lineno} registers an id that is computed, so its copy would take the id of the original"
             )
-        new = _new_id(uid.value, number)
+        new = (names.ids.get(uid.value) if names else None) or _new_id(uid.value, number)
         changes.append(Replacement(*file.inner_span(uid), f'"{new}"'))
         ids.append((uid.value, new))
+    if names is not None:
+        changes += _renamed(file, names)
     return file.replaced(changes), tuple(ids)
+
+
+def _renamed(file: SourceFile, names: NewNames) -> Iterator[Replacement]:
+    """The classes where they are defined and named, and ids and classes within docstrings.
+
+    Raises:
+        CannotCopy: the file has another meaning for a new name.
+    """
+    used = {_bound(node) for node in file.nodes}
+    for new in names.classes.values():
+        if new in used:
+            raise CannotCopy(f"{file.name} uses the name {new} already: choose another name")
+    words = {**names.ids, **names.classes}
+    any_word = re.compile(rf"(?<![\w-])(?:{'|'.join(map(re.escape, words))})(?![\w-])")
+    for node in file.nodes:
+        if isinstance(node, ast.ClassDef) and node.name in names.classes:
+            start = file.token_after(file.token_after(file.inner_span(node)[0], "class"), node.name)
+            yield Replacement(start, start + len(node.name), names.classes[node.name])
+        elif isinstance(node, ast.Name) and node.id in names.classes:
+            yield Replacement(*file.inner_span(node), names.classes[node.id])
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            # A text that stands alone: a docstring, or what is written below a constant.
+            start, end = file.inner_span(node.value)
+            for found in any_word.finditer(file.text, start, end):
+                yield Replacement(*found.span(), words[found[0]])
+
+
+def _bound(node: ast.AST) -> str:
+    """The name that a node uses or defines; empty for none."""
+    if isinstance(node, ast.alias):
+        return node.asname or node.name
+    return getattr(node, "id", None) or (node.name if isinstance(node, ast.ClassDef) else "")
 
 
 def _absolute(file: SourceFile, node: ast.ImportFrom, package: list[str]) -> Replacement:

@@ -135,8 +135,11 @@ def missing_class(requested: str, found: object, name: str, file: Path, names: l
 
 def _no_class(module: ModuleType, file: Path, text: str) -> TaskError:
     name = file.name
-    if not text.strip():
-        return task_error(f"{name} is empty; a task is a class that inherits BaseEnv", file)
+    if all(not line.strip() or line.lstrip().startswith("#") for line in text.splitlines()):
+        return task_error(
+            f"{name} is empty; a task is a class that inherits BaseEnv, as the minimal task is that `workbench new` writes",
+            file,
+        )
     imported = [value for value in vars(module).values() if registry.is_task(value)]
     robots = [
         value
@@ -153,7 +156,7 @@ def _no_class(module: ModuleType, file: Path, text: str) -> TaskError:
         hint = f"{cls.__name__} is imported from {cls.__module__}: name that file, or inherit from it here"
     else:
         hint = (
-            "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from "
-            "tasks/minimal.py"
+            "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin with "
+            "`workbench new`"
         )
     return task_error(f"no class in {name} inherits BaseEnv; {hint}", file)

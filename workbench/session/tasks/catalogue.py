@@ -139,6 +139,15 @@ class Catalogue:
         """The listed row of this number; None if there is none."""
         return next((entry for entry in self.view().entries if entry.number == number), None)
 
+    def add_file(self, file: Path, env_id: str) -> Entry:
+        """List a task file of the folder that was just written; returns its row."""
+        task = TaskFile(file, (env_id,), ())
+        with self._lock:
+            if all(known.path != file for known in self._found.files):
+                self._found = replace(self._found, files=(task, *self._found.files))
+                self._changes += 1
+            return self._of_folder(task)
+
     def close(self) -> None:
         """End the search and the process of the pictures."""
         self._closing.set()

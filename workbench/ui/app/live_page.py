@@ -106,7 +106,8 @@ class Page:
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
-        banner = Banner(server, session.versions.reload, session.versions.restart_worker, self._link)
+        versions = session.versions
+        banner = Banner(server, versions.reload, versions.restart_worker, self._link, self._is_own)
         busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
@@ -120,6 +121,9 @@ class Page:
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))
         server.scene.on_click()(self._on_scene_click)
+
+    def _is_own(self, file: str) -> bool:
+        return isinstance(self._session.reference, str) and self._session.versions.knows_file(file)
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
         """Returns the Run tab, which gets more content later, and the parts of all tabs."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from workbench.authoring.loading.find_tasks import is_below
 from workbench.authoring.loading.reference import TaskName, file_and_class
+from workbench.authoring.templates.new_task import TEMPLATES, write_new_task
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
 from workbench.machine.processes.watched_thread import watched_thread
@@ -73,11 +74,19 @@ class OpenTask:
     def choose(self, number: int) -> None:
         """Open the row of this number; returns at once. What is not listed is refused."""
         entry = self.catalogue.entry(number)
-        if entry is None:
-            return
+        if entry is not None:
+            self._want(entry)
+
+    def _want(self, entry: Entry) -> None:
         with self._wake:
             self._wish = entry
             self._wake.notify_all()
+
+    def create(self, name: str, template: int) -> None:
+        """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
+        made = write_new_task(name, TEMPLATES[template].name, self.catalogue.folder)
+        # Not by its number: a search that began before it was written may end now, and list it not.
+        self._want(self.catalogue.add_file(made.file, made.env_id))
 
     def doing(self) -> str:
         """What it is doing, for the page; empty if nothing."""

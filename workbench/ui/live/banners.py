@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import viser
 
 from workbench.authoring.problem import Problem
+from workbench.authoring.templates.new_task import CannotBegin, fill_blank_file, is_blank
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP
@@ -16,6 +20,7 @@ WIDEST, BUSY_WIDEST = 520, 460
 """Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
 version is still used."""
 
+FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
 SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
@@ -59,19 +64,31 @@ class Banner(PagePart[SessionView]):
         reload: Asks the session to load the file again.
         restart: Asks the session for a new worker process.
         link: Links the line in the file.
+        is_own: Whether a file may be written into: the task's, and named by a person, not by a recording.
     """
 
-    def __init__(self, server: viser.ViserServer, reload, restart, link: LinkTo = no_links) -> None:
-        self._link = link
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        reload,
+        restart,
+        link: LinkTo = no_links,
+        is_own: Callable[[str], bool] = lambda file: False,
+    ) -> None:
+        self._link, self._is_own = link, is_own
+        self._blank: Path | None = None
+        """The file that is offered to be filled."""
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
+            self._fill = server.gui.add_button(FILL, icon=viser.Icon.FILE_PLUS, visible=False)
             self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
             self._restart = server.gui.add_button(
                 "Restart the worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
         # At the right edge of the view: on the left are viser's own notifications.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
+        self._fill.on_click(self._on_fill)
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
         self._drawn: tuple[int, str] | None = None
@@ -89,9 +106,21 @@ class Banner(PagePart[SessionView]):
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:
             self._drawn = drawn
+            file = Path(problem.file) if problem.file and self._is_own(problem.file) else None
+            self._blank = file if view.task is None and file is not None and is_blank(file) else None
+            self._fill.visible = self._blank is not None
             self._html.content = banner_html(problem, view, self._link)
             self._panel.visible = True
             self._panel.expand()
+
+    def _on_fill(self, event: viser.GuiEvent) -> None:
+        if self._blank is None:
+            return
+        try:
+            fill_blank_file(self._blank)
+        except CannotBegin as error:
+            if event.client is not None:
+                event.client.add_notification("Nothing was written", str(error), color="orange")
 
 
 def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:

@@ -9,10 +9,12 @@ from typing import Protocol
 
 import viser
 
+from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.ui.library.dialogs import Dialog
+from workbench.ui.server.control_values import limit_text
 from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.inputs import Control, refusals_told
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import render
 
@@ -26,6 +28,7 @@ MOST_RECENT = 6
 TWICE = 4
 """Bit of ``choosable.html`` for the second press of a double click: the first has chosen already."""
 OPEN = "Open…"
+NEW_TASK, CREATE = "New task", "Create"
 
 
 class Chooser(Protocol):
@@ -36,6 +39,17 @@ class Chooser(Protocol):
 
     def choose(self, number: int) -> None:
         """Open this row of the list; returns at once. A number that is not listed is refused."""
+        ...
+
+    def create(self, name: str, template: int) -> None:
+        """Write a new task into the folder of the list, and open it.
+
+        Args:
+            template: its place in `TEMPLATES`.
+
+        Raises:
+            ValueError: nothing was written; the message says why.
+        """
         ...
 
     def doing(self) -> str:
@@ -76,6 +90,15 @@ class TaskList:
             settle=TYPING,
             clock=clock,
         )
+        with server.gui.add_folder(NEW_TASK, expand_by_default=False):
+            self._name = server.gui.add_text(
+                "Name", "", hint="Such as stack_two, which is written to stack_two.py"
+            )
+            limit_text(self._name, LONGEST_WORDS)
+            about = [f"{template.name}: {template.about}" for template in TEMPLATES]
+            self._template = server.gui.add_dropdown("Template", about)
+            create = server.gui.add_button(CREATE, icon=viser.Icon.FILE_PLUS, color="gray")
+            create.on_click(self._on_create)
         self._html = server.gui.add_html("")
         presses = Presses(server)
         self._numbers = presses.number_id("tasks", self._on_row)
@@ -99,6 +122,11 @@ class TaskList:
 
     def _clear_search(self) -> None:
         self._find.handle.value = self._words = ""
+
+    def _on_create(self, event: viser.GuiEvent) -> None:
+        with refusals_told(event.client, "Nothing was written"):
+            self._chooser.create(self._name.value.strip(), self._template.options.index(self._template.value))
+            self._on_chosen()
 
     def _on_row(self, sent: int) -> None:
         number, held = divmod(sent, 8)

@@ -1,0 +1,167 @@
+"""New tasks from templates and installed tasks: their names, what is refused, and that nothing is written over."""
+
+from __future__ import annotations
+
+import ast
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.loading.find_tasks import TaskFile, read_task_file
+from workbench.authoring.loading.load import load_task
+from workbench.authoring.templates.new_task import (
+    LONGEST_NAME,
+    TEMPLATES,
+    CannotBegin,
+    Template,
+    camel_case,
+    fill_blank_file,
+    is_blank,
+    maniskill_ids,
+    why_not_name,
+    write_new_task,
+)
+from workbench.machine.folders import example_tasks
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.name)
+def test_a_template_is_an_example_with_other_names_and_nothing_else(
+    tmp_path: Path, template: Template
+) -> None:
+    made = write_new_task("stack_two", template.name, tmp_path)
+    assert (made.env_id, made.class_name, made.reference) == ("StackTwo-v1", "StackTwoEnv", "stack_two.py")
+    (example,) = (file for file in example_tasks() if file.name == template.example)
+    before = read_task_file(example)
+    assert before is not None
+    text = made.file.read_text()
+    ((old_id,), (old_class,)) = before.ids, before.classes
+    assert old_id not in text and old_class not in text
+    assert text.replace("StackTwo-v1", old_id).replace("StackTwoEnv", old_class) == example.read_text()
+    assert read_task_file(made.file) == TaskFile(made.file, ("StackTwo-v1",), ("StackTwoEnv",))
+    loaded = load_task(str(made.file))
+    assert (loaded.env_id, loaded.class_name) == ("StackTwo-v1", "StackTwoEnv")
+
+
+def test_a_task_of_maniskill_is_copied_with_its_class_wherever_it_is_named(tmp_path: Path) -> None:
+    made = write_new_task("lift_it", "PickCube-v1", tmp_path)
+    task = read_task_file(made.file)
+    assert task is not None and task.classes[0] == "LiftItEnv" and task.ids[0] == "LiftIt-v1"
+    tree = ast.parse(made.file.read_text())
+    assert "PickCubeEnv" not in {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    # The file has tasks for other robots too, the last of which it would open with.
+    assert len(task.ids) > 1 and made.reference == "lift_it.py:LiftItEnv"
+    assert all(uid.startswith("LiftIt") for uid in task.ids)
+    loaded = load_task(f"{made.file}:LiftItEnv")
+    assert (loaded.env_id, loaded.replaced_ids) == ("LiftIt-v1", ())
+
+
+def test_every_literal_id_of_maniskill_can_be_looked_up_without_importing_it() -> None:
+    found = maniskill_ids()
+    assert len(found) > 60 and {"PickCube-v1", "PushT-v1", "MS-AntWalk-v1"} <= set(found)
+    assert all(file.is_file() for file in found.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("push-it", "such as push_it."),
+        ("push_it.py", "such as push_it."),
+        ("../push", "such as push."),
+        ("/etc/push", "such as etc_push."),
+        ("2push", "such as stack_two."),
+        ("class", "such as stack_two."),
+        ("", "such as stack_two."),
+        ("n\u00e4h", "cannot be the name"),
+        ("a" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME}"),
+        ("torch", "is the name of a library"),
+        ("queue", "such as queue_task."),
+        ("taken", "There is a file taken.py already"),
+        (
+            "pick_cube",
+            "PickCube-v1, which is an id of ManiSkill already: take another name, such as my_pick_cube.",
+        ),
+        ("workbench_minimal", "an id of minimal.py already"),
+        ("HERE", "HERE-v1, which is an id of mine.py already"),
+    ],
+)
+def test_a_name_that_is_invalid_or_taken_is_refused_with_what_to_do(
+    tmp_path: Path, name: str, why: str
+) -> None:
+    (tmp_path / "taken.py").write_text("mine")
+    (tmp_path / "mine.py").write_text("@register_env('HERE-v1')\nclass Task(BaseEnv): ...\n")
+    assert why in why_not_name(name, tmp_path)
+    with pytest.raises(CannotBegin) as refused:
+        write_new_task(name, "minimal", tmp_path)
+    assert why in str(refused.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.py", "taken.py"]
+    assert (tmp_path / "taken.py").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "origin", "why"),
+    [
+        ("push", "minimall", "Did you mean minimal?"),
+        ("push", "PickCub-v1", "Did you mean PickCube-v1?"),
+        ("push", "../tasks/minimal.py", "neither a template nor a task"),
+        ("base", "minimal", "uses the name BaseEnv already"),
+    ],
+)
+def test_what_there_is_nothing_to_begin_from_is_refused(
+    tmp_path: Path, name: str, origin: str, why: str
+) -> None:
+    with pytest.raises(CannotBegin, match=why):
+        write_new_task(name, origin, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(CannotBegin, match="push.py cannot be written: No space left"):
+        write_new_task("push", "minimal", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_appears_at_the_last_moment_is_not_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync = os.fsync
+
+    def saved_meanwhile(descriptor: int) -> None:
+        sync(descriptor)
+        (tmp_path / "push.py").write_text("mine")
+
+    monkeypatch.setattr(os, "fsync", saved_meanwhile)
+    with pytest.raises(CannotBegin, match="There is a file push.py already"):
+        write_new_task("push", "minimal", tmp_path)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_words_of_a_name_are_joined() -> None:
+    assert [camel_case(name) for name in ("stack_two", "stackTwo", "pick3d", "_a__b", "2 push")] == [
+        "StackTwo", "StackTwo", "Pick3d", "AB", "Task2Push",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("content", "blank"),
+    [(b"", True), (b"\n  # a\n\t\n", True), (b"pass", False), (b'"""A task."""', False), (b"\xff", False)],
+)
+def test_only_a_file_of_comments_and_blank_lines_is_filled(
+    tmp_path: Path, content: bytes, blank: bool
+) -> None:
+    file = tmp_path / "my-first.py"
+    file.write_bytes(content)
+    assert is_blank(file) == blank and not is_blank(tmp_path / "gone.py")
+    if blank:
+        fill_blank_file(file)
+        assert read_task_file(file) == TaskFile(file, ("MyFirst-v1",), ("MyFirstEnv",))
+        assert file.read_bytes().startswith(content.rstrip())
+    else:
+        with pytest.raises(CannotBegin, match="not empty any more"):
+            fill_blank_file(file)
+        assert file.read_bytes() == content

@@ -1,0 +1,142 @@
+"""``workbench new``: what it says, what it asks in a terminal, and that what it writes passes its checks."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.templates.new_task import TEMPLATES
+from workbench.cli.main import main
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments])
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out, told.err
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("template", [template.name for template in TEMPLATES])
+def test_what_it_writes_breaks_no_rule(
+    place: Path, capsys: pytest.CaptureFixture[str], template: str, renderer: None
+) -> None:
+    code, out, _ = run(capsys, "new", "stack_two", "--from", template)
+    assert code == 0 and out.splitlines() == [
+        "stack_two.py has the task StackTwo-v1, class StackTwoEnv.",
+        "Open it:  workbench open stack_two.py",
+    ]
+    code, out, _ = run(capsys, "check", "stack_two.py", "--seeds", "8", "--workers", "1", "--fail-on", "warn")
+    assert code == 0 and "StackTwo-v1: " in out and ", 0 broken, " in out and "not decided" not in out
+
+
+def test_the_first_template_is_taken_where_none_is_named_and_a_second_time_it_is_refused(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(capsys, "new", "first")[0] == 0
+    text = (place / "first.py").read_text()
+    assert text.startswith('"""The least that a task can be')
+    code, out, err = run(capsys, "new", "first", "--from", "tabletop")
+    assert (code, out) == (2, "") and err.startswith(
+        "There is a file first.py already, and it is not written over"
+    )
+    assert (place / "first.py").read_text() == text
+
+
+def test_a_class_that_the_file_does_not_open_with_is_named(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, out, _ = run(capsys, "new", "lift_it", "--from", "PickCube-v1")
+    assert out.splitlines()[-1] == "Open it:  workbench open lift_it.py:LiftItEnv"
+
+
+def test_without_a_name_and_a_terminal_it_says_what_to_type(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = run(capsys, "new", "--from", "tabletop")
+    assert (code, out) == (2, "") and err.startswith(
+        "Type a name, as in: workbench new stack_two --from minimal"
+    )
+    assert list(place.iterdir()) == []
+
+
+class Terminal:
+    """``workbench new`` at a terminal of its own."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self._ours, theirs = os.openpty()
+        self._said = ""
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "workbench.cli.main", "new", *words],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "NO_COLOR": "1", "TERM": "dumb"},
+        )
+        os.close(theirs)
+
+    def says(self, words: str) -> str:
+        """Wait until it has said them; returns all since the last time."""
+        ends_at = time.monotonic() + 60
+        while words not in self._said:
+            assert select.select([self._ours], [], [], ends_at - time.monotonic())[0], self._said
+            try:
+                self._said += os.read(self._ours, 4096).decode()
+            except OSError:  # it has ended
+                break
+        assert words in self._said, self._said
+        said, self._said = self._said, ""
+        return said
+
+    def type(self, words: str) -> None:
+        os.write(self._ours, words.encode())
+
+    def close(self) -> int:
+        code = self.process.wait(60)
+        os.close(self._ours)
+        return code
+
+
+def test_in_a_terminal_it_asks_for_template_and_name_until_they_will_do(
+    place: Path, child_process: None
+) -> None:
+    (place / "taken.py").write_text("mine")
+    terminal = Terminal(place)
+    said = terminal.says("Enter: minimal): ")
+    assert "1  minimal" in said and "2  tabletop" in said
+    terminal.type("7\n")
+    terminal.says("Type a number from 1 to ")
+    terminal.says("): ")
+    terminal.type("2\n")
+    terminal.says("Name of the task, such as stack_two: ")
+    terminal.type("taken\n")
+    terminal.says("There is a file taken.py already")
+    terminal.type("push it\n")
+    terminal.says("such as push_it.")
+    terminal.type("push_it\n")
+    terminal.says("Open it:  workbench open push_it.py")
+    assert terminal.close() == 0
+    assert "class PushItEnv(BaseEnv)" in (place / "push_it.py").read_text()
+    assert "compute_dense_reward" in (place / "push_it.py").read_text()
+
+
+def test_whoever_ends_the_questions_gets_nothing(place: Path, child_process: None) -> None:
+    terminal = Terminal(place, "--from", "PickCube-v1")
+    terminal.says("Name of the task")
+    terminal.type("\x04")
+    terminal.says("Nothing was written.")
+    assert terminal.close() == 2 and list(place.iterdir()) == []

@@ -1,0 +1,1 @@
+"""New task files, made from the examples and from installed tasks."""
