@@ -51,7 +51,6 @@ def whole(page: Page) -> bool:
     return len(columns) > 1 and columns[0] < 0.3 and columns[-1] > 0.9 and widest_gap(columns) < 0.05
 
 
-@pytest.mark.slow
 def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
     server: viser.ViserServer, browser: Browser
 ) -> None:
