@@ -222,6 +222,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
 ) -> None:
     view = session.view()
     folder = Path(view.recording.folder)
+    folder.mkdir(exist_ok=True)  # nothing may have been recorded yet
     aside = folder.rename(folder.with_name("aside"))
     folder.write_text("in the way")
     session.start_recording((0,))
