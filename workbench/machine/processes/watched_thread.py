@@ -75,7 +75,7 @@ def stop_listening(listener: Callable[[str], None]) -> None:
 def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
     """Within this, the threads of this process, and those that they start, run only on cores that nobody else wants.
 
-    A nice value is not enough: of two cores that physics fills, a process at nice 10 took a third.
+    A nice value is not enough: on two busy cores, play at unlimited speed was slower beside a process at nice 10.
 
     Args:
         wanted: asked often; after True they run as before, since somebody waits for this process.
