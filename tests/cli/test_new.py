@@ -119,8 +119,7 @@ def test_in_a_terminal_it_asks_for_template_and_name_until_they_will_do(
     said = terminal.says("Enter: minimal): ")
     assert "1  minimal" in said and "2  tabletop" in said
     terminal.type("7\n")
-    terminal.says("Type a number from 1 to ")
-    terminal.says("): ")
+    assert "Type a number from 1 to " in terminal.says("): ")
     terminal.type("2\n")
     terminal.says("Name of the task, such as stack_two: ")
     terminal.type("taken\n")
