@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import sapien
 import sapien.physx as physx
 import sapien.render
@@ -108,14 +109,40 @@ def unused_gpu_text(wanted: Backend) -> str | None:
 # --- the render device -------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=1)
+def _brdf_table() -> sapien.render.RenderTexture:
+    """SAPIEN's own, read out of it by ``tests/core/test_brdf_table.py``: (512, 512, 2), scale and bias.
+
+    The file holds (2, 512, 512) float16 as the steps of their bits along a row, which takes a quarter of the bytes.
+    """
+    steps = np.load(Path(__file__).parent / "brdf_table.npz")["steps"]
+    table = np.moveaxis(np.cumsum(steps, axis=2, dtype=np.uint16).view(np.float16), 0, 2)
+    return sapien.render.RenderTexture(
+        np.ascontiguousarray(table, np.float32), 2, "R32G32Sfloat", 1, "linear", "edge"
+    )
+
+
+def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
+    """Give a camera, which is in a scene, the table that its shader looks reflections of the environment up in.
+
+    A camera without one takes its process's, which SAPIEN computes for the first picture, from 268 million samples: 5 to
+    19 s on a software driver, and 0.1 s are left of the first picture with this one. The pictures are the same to the bit.
+    The table is that of the split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN's own
+    takes no time and is left.
+    """
+    scene = camera.entity.scene
+    if not scene.render_system.device.is_cuda():
+        camera.set_texture("BRDFLUT", _brdf_table())
+
+
 _kept: dict[str, sapien.render.RenderSystem] = {}
 
 
 def keep_render_device(device: str) -> None:
     """Keep a render device for the life of the process: ``cpu``, ``cuda``, ``cuda:1``, or ManiSkill's names for them.
 
-    SAPIEN compiles its shaders for a render device (5 to 19 s on a software driver) and drops them with the last
-    ``RenderSystem`` on it. With one idle RenderSystem kept, the next env with cameras is made in about 0.2 s. On NVIDIA
+    SAPIEN compiles its shaders for a render device and drops them with the last ``RenderSystem`` on it. With one idle
+    RenderSystem kept, the next env with cameras is made in about 0.2 s. On NVIDIA
     drivers it may also avoid a failure after some 28 make and close cycles (ManiSkill #1474, #1477).
 
     Raises:

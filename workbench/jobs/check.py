@@ -102,7 +102,7 @@ class CheckReport:
     start_seconds: float
     """Of those, until the first process had imported the task."""
     picture_seconds: float = 0.0
-    """Of those, for the first pictures: shaders are compiled then."""
+    """Of those, for the first pictures."""
     stopped: bool = False
 
     @property

@@ -207,9 +207,7 @@ def _render_device() -> list[DoctorFinding]:
     if probe.env:
         what += f", from {probe.env.get('VK_DRIVER_FILES')}"
     if "llvmpipe" in (probe.name or ""):
-        what += (
-            "; in software: a camera picture of 128 x 128 takes some 50 ms, the first of a process 5 to 19 s"
-        )
+        what += "; in software: a camera picture of 128 x 128 takes some 50 ms"
     return [DoctorFinding(topic, True, what)]
 
 

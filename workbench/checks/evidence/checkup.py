@@ -152,7 +152,7 @@ class Checkup:
         """What `task` has built."""
         self.merges: list[Merged] = []
         self.picture_seconds = 0.0
-        """For the first pictures: a process compiles its shaders then."""
+        """For the first pictures of the process."""
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
         self._built_with_renderer = False

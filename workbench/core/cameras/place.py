@@ -15,6 +15,7 @@ from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from mani_skill.utils.structs.pose import Pose
 
 from workbench.core import maniskill_private
+from workbench.core.backends import give_brdf_table
 from workbench.core.camera_data import NOT_ON_THE_GPU, CameraKey, CameraSettings, why_no_camera
 from workbench.core.cameras.conventions import matrix3, triple
 from workbench.core.simulation.cpu_system import batched_system
@@ -151,6 +152,7 @@ def _exchanged(config: Any, old: list[Any]) -> list[Any]:
         entity = component.entity
         entity.remove_component(component)
         entity.add_component(new)
+        give_brdf_table(new)
         made.append(new)
     return made
 

@@ -9,7 +9,7 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 
-from workbench.core.backends import find_renderer, keep_render_device
+from workbench.core.backends import find_renderer, give_brdf_table, keep_render_device
 from workbench.core.scene.shapes import Material, SceneGeometry, Visual
 from workbench.core.scene.simplify import with_normals
 
@@ -56,6 +56,7 @@ class RecordedScene:
         camera.near, camera.far = NEAR, FAR
         self._eye.add_component(camera)
         self._scene.add_entity(self._eye)
+        give_brdf_table(camera)
         self._camera = camera
 
     def picture(self, poses: NDArray[np.float32], eye: NDArray[np.float32]) -> NDArray[np.uint8]:

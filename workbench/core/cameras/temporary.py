@@ -13,6 +13,7 @@ import sapien.render
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from numpy.typing import ArrayLike, NDArray
 
+from workbench.core.backends import give_brdf_table
 from workbench.core.camera_data import CameraKind, CameraSettings
 from workbench.core.cameras.conventions import intrinsic_of, scaled_intrinsic
 from workbench.core.cameras.render import cameras_of, depth_in_metres, places_to_draw, show_hidden_objects
@@ -97,6 +98,7 @@ def temporary_camera(
             component = sapien.render.RenderCameraComponent(size[0], size[1])
             entity.add_component(component)
             second_scene.add_entity(entity)
+            give_brdf_table(component)
         after.callback(second_scene.remove_entity, entity)
         component.near, component.far = near, far
         component.set_focal_lengths(k[0, 0], k[1, 1])

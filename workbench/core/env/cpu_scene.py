@@ -20,6 +20,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
 
+from workbench.core.backends import give_brdf_table
 from workbench.core.broken_rule import (
     Place,
     frames_of_the_task,
@@ -113,9 +114,12 @@ class BatchedCpuScene(ManiSkillScene):
         # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body does not have; it moves with its entity.
         self.gpu_sim_enabled = False
         try:
-            return super()._sapien_add_camera(*args, **kwargs)
+            camera = super()._sapien_add_camera(*args, **kwargs)
         finally:
             self.gpu_sim_enabled = True
+        for component in camera._render_cameras:
+            give_brdf_table(component)
+        return camera
 
     def _sapien_update_render(
         self, update_sensors: bool = True, update_human_render_cameras: bool = True

@@ -254,7 +254,7 @@ class WorkerCameras:
         if opened is None or wait is None or wait > 0:
             return
         if not self._renderer_ready and self._begun is None:
-            # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
+            # The first picture of a process takes longer than those after it: its shaders are compiled.
             self._on_first(False)
         self._task.heartbeat.begin("drawing")
         try:

@@ -157,7 +157,7 @@ def _doing(busy: Busy) -> str:
         at = f" at {place(busy)}" if busy.file else ""
         return f"by a debugger{at} for {busy.seconds:.0f} s; continue from there, not from this page"
     if busy.getting_ready:
-        return f"a new worker is getting ready (shaders are compiled once per process), {busy.seconds:.0f} s"
+        return f"a new worker is getting ready for {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
 
 

@@ -1,0 +1,79 @@
+"""The table of reflections that our cameras are given is the one that SAPIEN computes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sapien
+import sapien.render
+from PIL import Image
+
+from workbench.core import backends
+from workbench.core.backends import give_brdf_table
+
+SHADERS = Path(sapien.__file__).parent / "vulkan_shader"
+DRAWN = "outColor.rgb = mix(bg, color.rgb, color.a);"
+FILE = Path(backends.__file__).parent / "brdf_table.npz"
+
+
+@pytest.mark.slow
+def test_it_is_the_one_that_sapien_computes_to_the_bit(tmp_path: Path, renderer: None) -> None:
+    """A shader draws the table. ``WORKBENCH_RENEW=1`` writes it into our file."""
+    for pack in ("minimal", "common"):
+        shutil.copytree(SHADERS / pack, tmp_path / pack)
+    shader = tmp_path / "minimal" / "composite0.frag"
+    text = shader.read_text()
+    assert text.count(DRAWN) == 1
+    # What it drew before stays a part of it, or the compiler drops its textures and the renderer misses them.
+    drawn = f"{DRAWN}\n  outColor.rgb = outColor.rgb * 1e-30 + texture(samplerBRDFLUT, inUV).rgb;"
+    shader.write_text(text.replace(DRAWN, drawn))
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
+    before = sapien.render.get_camera_shader_dir()
+    sapien.render.set_camera_shader_dir(str(tmp_path / "minimal"))
+    try:
+        theirs, ours = (scene.add_camera(name, 512, 512, 1.0, 0.01, 10.0) for name in ("theirs", "ours"))
+    finally:
+        sapien.render.set_camera_shader_dir(before)
+    scene.update_render()
+    theirs.take_picture()
+    computed = theirs.get_picture("Color")[..., :2]
+    assert 1 < computed.max() < 2
+    if os.environ.get("WORKBENCH_RENEW"):
+        bits = np.moveaxis(computed.astype(np.float16), 2, 0).copy().view(np.uint16)
+        np.savez_compressed(FILE, steps=np.diff(bits, axis=2, prepend=np.uint16(0)))
+    give_brdf_table(ours)
+    ours.take_picture()
+    assert np.array_equal(ours.get_picture("Color")[..., :2], computed)
+
+
+@pytest.mark.parametrize("pack", ["minimal", "default"])
+def test_a_mirror_is_as_bright_as_the_table_says(tmp_path: Path, pack: str, renderer: None) -> None:
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
+    side = tmp_path / "side.png"
+    Image.new("RGB", (64, 64), (200, 200, 200)).save(side)
+    scene.render_system.cubemap = sapien.render.RenderCubemap(*[str(side)] * 6)
+    builder = scene.create_actor_builder()
+    mirror = sapien.render.RenderMaterial(base_color=[1, 1, 1, 1], metallic=1, roughness=0.1)
+    builder.add_sphere_visual(radius=0.5, material=mirror)
+    builder.set_initial_pose(sapien.Pose([2, 0, 0]))
+    builder.build_static("mirror")
+    before = sapien.render.get_camera_shader_dir()
+    sapien.render.set_camera_shader_dir(str(SHADERS / pack))
+    try:
+        cameras = [scene.add_camera(name, 32, 32, 0.3, 0.01, 10.0) for name in ("lit", "dark")]
+    finally:
+        sapien.render.set_camera_shader_dir(before)
+    scene.update_render()
+    give_brdf_table(cameras[0])
+    nothing = np.zeros((8, 8, 2), np.float32)
+    cameras[1].set_texture("BRDFLUT", sapien.render.RenderTexture(nothing, 2, "R32G32Sfloat"))
+    brightness = []
+    for camera in cameras:
+        camera.take_picture()
+        brightness.append(float(camera.get_picture("Color")[16, 16, :3].mean()))
+    lit, dark = brightness
+    assert dark < 0.05 < 0.5 < lit
