@@ -49,6 +49,17 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
     return Ended(int(ended.value.code or 0), told.out, told.err)
 
 
+def in_a_process(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "workbench.cli.main", *words],
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=250,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+
+
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder ``lab`` of a repository, with a task that works and one that breaks rules."""
@@ -87,7 +98,7 @@ def test_findings_are_told_by_degree_with_line_and_reason(
     assert "2 rules kept, 2 broken, 1 silenced. " in ended.out and "s to start." in ended.out
     assert "printed by the task" in ended.err and "printed by the task" not in ended.out
     comment = line_of(place / "bad.py", "off[reward-rows]")
-    assert f"bad.py:{comment}: off[reward-rows] silences nothing until a reason" in ended.err
+    assert f"comment bad.py:{comment}: off[reward-rows] silences nothing until a reason" in ended.out
     assert "success-and-fail: broken" in ended.err, "a line as it comes, for the log of a job"
 
 
@@ -99,10 +110,173 @@ def test_exit_codes(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code("bad.py", "--select", "success-and-fail") == 0
     assert code("bad.py", "--select", "success-and-fail", "--fail-on", "warn") == 1
     assert code("bad.py", "--select", RULES_OF_IT, "--ignore", "success-at-reset") == 0
+    assert code("bad.py", "--select", RULES_OF_IT, "--fail-on", "never") == 0
     (place / "gone.py").write_text("import nothing_of_this_name\n")
     assert code("gone.py") == code("nowhere.py") == code("good.py", "--select", "nonsense") == 2
-    assert code("good.py", "--json-file", "nowhere/report.json") == 2
-    assert not (place / "nowhere").exists()
+
+
+def test_a_task_that_cannot_be_imported_is_an_error_in_every_report_at_its_line(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "gone.py").write_text('"""A task."""\n\nimport nothing_of_this_name\n')
+    files = ("--junit", "a.xml", "--sarif", "a.sarif", "--json-file", "a.json")
+    ended = run(capsys, "gone.py", "--json", *files, *FEW)
+    assert ended.code == 2 and "gone.py:3: ModuleNotFoundError" in ended.err
+    assert ended.out == (place / "a.json").read_text()
+    said = json.loads(ended.out)
+    assert said["fails"] and (said["error"]["file"], said["error"]["line"]) == ("gone.py", 3)
+    assert said["error"]["code"] == "import nothing_of_this_name" and "nothing_of" in said["error"]["message"]
+    (made,) = json.loads((place / "a.sarif").read_text())["runs"]
+    (result,) = made["results"]
+    at = result["locations"][0]["physicalLocation"]
+    assert (result["level"], at["artifactLocation"]["uri"]) == ("error", "lab/gone.py")
+    assert at["region"]["startLine"] == 3 and "ModuleNotFoundError" in result["message"]["text"]
+    assert made["tool"]["driver"]["rules"][result["ruleIndex"]]["id"] == result["ruleId"]
+    assert made["invocations"][0]["executionSuccessful"] is False
+    (suite,) = ElementTree.parse(place / "a.xml").getroot()
+    (case,) = suite
+    error = case.find("error")
+    assert (suite.get("errors"), case.get("file"), case.get("line")) == ("1", "lab/gone.py", "3")
+    assert error is not None and "ModuleNotFoundError" in error.get("message", "")
+
+
+def test_a_task_that_is_not_there_is_an_error_in_a_report(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended = run(capsys, "nowhere.py", "--json", *FEW)
+    assert ended.code == 2 and "nowhere.py" in json.loads(ended.out)["error"]["message"]
+
+
+def test_folders_of_reports_are_made_before_anything_runs(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "file").write_text("")
+    ended = run(capsys, "good.py", "--json-file", "file/in/report.json", *FEW)
+    assert ended.code == 2 and "file/in/report.json cannot be written" in ended.err
+    assert "is a folder" in run(capsys, "good.py", "--sarif", str(place), *FEW).err
+    ended = run(capsys, "good.py", "--select", "entry-name", "--junit", "reports/today/a.xml", *FEW)
+    assert ended.code == 0 and (place / "reports" / "today" / "a.xml").is_file()
+
+
+def test_what_is_ignored_is_in_the_summary_and_in_each_report(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rules = (
+        "--select",
+        "entry-name,reward-rows,success-and-fail",
+        "--ignore",
+        "success-and-fail,reward-rows",
+    )
+    files = ("--junit", "a.xml", "--sarif", "a.sarif", "--json-file", "a.json")
+    ended = run(capsys, "bad.py", *rules, *files, *FEW)
+    assert ended.code == 0 and "2 ignored: reward-rows, success-and-fail" in ended.out
+    assert "1 rule kept, 0 broken, 2 ignored." in ended.out
+    ignored = ["reward-rows", "success-and-fail"]
+    assert json.loads((place / "a.json").read_text())["ignored"] == ignored
+    cases = {case.get("name"): case for case in ElementTree.parse(place / "a.xml").getroot()[0]}
+    assert [name for name, case in cases.items() if case.find("skipped") is not None] == ignored
+    (made,) = json.loads((place / "a.sarif").read_text())["runs"]
+    off = made["invocations"][0]["ruleConfigurationOverrides"]
+    assert [each["descriptor"]["id"] for each in off] == ignored
+    rules_of = made["tool"]["driver"]["rules"]
+    assert all(rules_of[each["descriptor"]["index"]]["id"] == each["descriptor"]["id"] for each in off)
+
+
+def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of three, with two envs: the fourth is not counted."""
+    few = ("--num-envs", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
+    ended = run(capsys, "bad.py", "--select", "success-at-reset,success-stays-possible", "--json", *few)
+    said = json.loads(ended.out)
+    (finding,) = said["findings"]
+    assert finding["count"] == 3 and "3 of 3 seeds (seed 0, 1, 2)" in finding["message"]
+    (noted,) = (one["notes"] for one in said["rules"] if one["rule"] == "success-stays-possible")
+    assert noted == ["success in 3 of 3 random episodes"]
+
+
+def test_rules_that_one_error_leaves_undecided_stand_below_it(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (place / "good.py").read_text()
+    (place / "raises.py").write_text(text.replace('name="goal"', "name=self.gone"))
+    rules = "reward-finite,reward-changes,success-at-reset,success-and-fail,entry-name"
+    ended = run(capsys, "raises.py", "--select", rules, *FEW)
+    why = ended.out.index("not decided ")
+    assert "'gone'" in ended.out[why:].split("\n")[0]
+    assert "\n    5 rules: success-at-reset, success-and-fail, entry-name, reward-finite" in ended.out[why:]
+    assert ended.err.count("not decided") == 1
+
+
+def test_a_comment_that_silences_nothing_any_more_is_told(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (place / "good.py").read_text()
+    idle = NORMALIZED + "  # workbench: off[reward-normalized, reward-finite] they were odd"
+    (place / "good.py").write_text(text.replace(NORMALIZED, idle))
+    ended = run(capsys, "good.py", "--select", "reward-normalized", "--json", *FEW)
+    assert ended.code == 0
+    (comment,) = json.loads(ended.out)["comments"]
+    assert comment["line"] == line_of(place / "good.py", "off[reward-normalized")
+    assert comment["message"].startswith("off[reward-normalized] silenced nothing in this check")
+    silenced = line_of(place / "bad.py", "off[reward-normalized")
+    ended = run(capsys, "bad.py", "--select", "reward-normalized", "--json", *FEW)
+    assert silenced not in [one["line"] for one in json.loads(ended.out)["comments"]]
+
+
+def test_what_acts_in_further_episodes_is_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "policies.py").write_text(
+        "import torch\n\n\ndef still(obs):\n    return torch.zeros(8)\n\n\n"
+        "def wrong(obs):\n    raise KeyError('no such key')\n"
+    )
+
+    def check(actions: str) -> Ended:
+        return run(capsys, "good.py", "--select", "success-stays-possible,runs", "--actions", actions, *FEW)
+
+    ended = check("policies.py:still")
+    assert ended.code == 0 and "note success-stays-possible: success in 0 of 2 given episodes" in ended.out
+    ended = check("policies.py:wrong")
+    assert ended.code == 1 and "not decided success-stays-possible" in ended.out
+    assert "policies.py:9: KeyError" in ended.out and "1 rule kept, 0 broken" in ended.out
+    ended = check("policies.py:gone")
+    assert ended.code == 2 and "has no function gone" in ended.err
+    assert check("nowhere.npy").code == 2
+
+
+def reads_what_is_drawn(place: Path) -> Path:
+    """A task that cannot be built without a renderer, and has made materials when that shows."""
+    text = (place / "good.py").read_text()
+    reads = 'self.goal = builder.build_kinematic(name="goal")'
+    assert reads in text
+    shape = "self.goal._objs[0].find_component_by_type(sapien.render.RenderBodyComponent).render_shapes[0]"
+    file = place / "drawn.py"
+    file.write_text(text.replace(reads, f"{reads}\n        self.shape = {shape}"))
+    return file
+
+
+def test_a_task_that_needs_a_renderer_and_is_given_none_is_told_so(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = reads_what_is_drawn(place)
+    ended = run(capsys, "drawn.py", "--select", "runs,camera-size", "--json", *FEW)
+    (finding,) = json.loads(ended.out)["findings"]
+    assert ended.code == 1 and finding["line"] == line_of(file, "self.shape")
+    assert "built with render_backend=none: leave that out" in finding["message"]
+
+
+@pytest.mark.slow
+def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None) -> None:
+    """In a process that has rendered nothing before."""
+    reads_what_is_drawn(place)
+    words = ["check", "drawn.py", "--num-envs", "2", "--seeds", "2", "--workers", "1", "--select", "runs"]
+    ended = in_a_process(*words)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_pictures_are_not_asked_of_a_task_that_is_made_without_a_renderer(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended = run(capsys, "good.py", "--select", "ground-truth,camera-sees,runs", "--json", *FEW)
+    states = {one["rule"]: one["state"] for one in json.loads(ended.out)["rules"]}
+    assert ended.code == 0 and states == {"runs": "kept", "ground-truth": "skipped", "camera-sees": "skipped"}
 
 
 def test_json_is_all_that_is_printed_and_equals_the_file(
@@ -172,14 +346,14 @@ def test_junit_has_a_test_case_for_each_rule(place: Path, capsys: pytest.Capture
     for root in (good, bad):
         (suite,) = root
         assert (root.tag, suite.tag, suite.get("tests")) == ("testsuites", "testsuite", "6")
-        cases = {case.get("name"): case for case in suite}
+        cases = {case.get("name"): case for case in suite.findall("testcase")}
         assert cases.keys() == set(rules.split(","))
-        assert all(case.get("classname") and float(case.get("time", "")) >= 0 for case in suite)
+        assert all(case.get("classname") and float(case.get("time", "")) >= 0 for case in cases.values())
         for name in ("failure", "skipped", "error"):
             told = {"failure": "failures", "error": "errors"}.get(name, name)
             assert suite.get(told) == str(sum(case.find(name) is not None for case in suite))
     assert good[0].get("failures") == "0" and good[0].get("skipped") == "1"
-    cases = {case.get("name"): case for case in bad[0]}
+    cases = {case.get("name"): case for case in bad[0].findall("testcase")}
     failure = cases["success-at-reset"].find("failure")
     assert failure is not None and failure.get("type") == "success-at-reset"
     assert "lab/bad.py:" in (failure.text or "") and cases["success-at-reset"].get("file") == "lab/bad.py"
@@ -220,14 +394,7 @@ def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) ->
     """In processes of its own, with an id that has no file here, and no terminal."""
     words = ["check", "PushCube-v1", "--num-envs", "2", "--seeds", "2", "--workers", "2"]
     words += ["--select", "success-at-reset,reward-finite", "--env", "render_backend=none", "--json"]
-    ended = subprocess.run(
-        [sys.executable, "-m", "workbench.cli.main", *words],
-        capture_output=True,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        timeout=250,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )
+    ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stderr
     said = json.loads(ended.stdout)
     assert said["task"]["id"] == "PushCube-v1" and said["counts"] == {"kept": 2}

@@ -13,7 +13,7 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.check import CheckOptions, CheckReport, check, comments_without_effect, merged
+from workbench.jobs.check import CheckOptions, CheckReport, check, merged
 from workbench.jobs.pool import Processes
 from workbench.jobs.task import TaskOptions
 
@@ -167,18 +167,3 @@ def test_what_several_processes_say_of_one_rule_becomes_one_result() -> None:
     assert one == RuleResult("runs", "broken", (again, other), notes=("a", "b"), seconds=1.5)
     undecided = [RuleResult("runs", "kept"), RuleResult("runs", "failed", why="it raised")]
     assert merged(undecided).state == "failed" and merged(undecided).why == "it raised"
-
-
-def test_a_comment_that_silences_nothing_is_told() -> None:
-    text = (
-        "x = 1  # workbench: off[reward-rows]\n"
-        "y = 2  # workbench: off[reward-row] one env only\n"
-        "z = 3  # workbench: off[] because\n"
-        "w = 4  # workbench: off[reward-rows, same-seed] one env only\n"
-    )
-    told = [(one.line, one.message) for one in comments_without_effect("a.py", text)]
-    assert told == [
-        (1, "off[reward-rows] silences nothing until a reason stands behind it"),
-        (2, "no rule is called reward-row"),
-        (3, "the comment names no rule, as in off[reward-rows]"),
-    ]

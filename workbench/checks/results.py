@@ -15,8 +15,12 @@ _WORST: tuple[State, ...] = ("broken", "failed", "silenced", "kept", "skipped")
 
 @dataclass(frozen=True)
 class Silenced:
+    """A finding that a comment in its file silences."""
+
     finding: Finding
     reason: str
+    line: int
+    """Of the comment, 1-based."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Mapping
 
 from workbench.core import rules as core_rules
@@ -449,6 +450,12 @@ RULES: Mapping[str, Rule] = {**core_rules.RULES, **CHECK_RULES}
 """All, by id."""
 
 
+def did_you_mean(rule: str) -> str:
+    """`` (did you mean reward-rows?)`` for an id that no rule has; empty where none is near."""
+    close = difflib.get_close_matches(rule.lower().replace("_", "-"), RULES, n=1, cutoff=0.6)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
 def degree_of_each(
     select: Collection[str] = (), ignore: Collection[str] = (), choice: Degree | None = None
 ) -> dict[str, Degree]:
@@ -464,7 +471,9 @@ def degree_of_each(
     """
     for rule in (*select, *ignore):
         if rule not in RULES:
-            raise ValueError(f"no rule is called {rule!r}; `workbench help rules` lists them")
+            raise ValueError(
+                f"no rule is called {rule!r}{did_you_mean(rule)}; `workbench help rules` lists them"
+            )
     return {
         rule.id: "off" if rule.id in ignore or (select and rule.id not in select) else choice or rule.degree
         for rule in RULES.values()

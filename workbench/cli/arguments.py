@@ -103,7 +103,7 @@ class CheckArguments:
 
     Args:
         num_envs: environments to run at once.
-        seeds: how many seeds are tried.
+        seeds: how many seeds are tried. What compares whole batches takes one for each env.
         seed: the first of them; each further one counts up.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.

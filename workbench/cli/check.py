@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,17 +12,29 @@ from pathlib import Path
 from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
-from workbench.authoring.problem import TaskError
-from workbench.checks.by_hook.run import RuleResult
+from workbench.authoring.loading.reference import named_file
+from workbench.authoring.problem import Problem, TaskError
+from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
-from workbench.core.rules import Degree, Finding
-from workbench.jobs.check import CheckOptions, CheckReport, check, count_rules, degrees_of_request
+from workbench.core.rules import Finding
+from workbench.jobs.check import (
+    CheckedTask,
+    CheckOptions,
+    CheckReport,
+    FailOn,
+    check,
+    count_rules,
+    degrees_of_request,
+)
 from workbench.jobs.pool import PoolError
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
+
+MOST_NAMED = 3
+"""Rules before their common reason."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +46,7 @@ class CheckOutput:
     json_file: Path | None = None
     junit: Path | None = None
     sarif: Path | None = None
-    fail_on: Degree = "stop"
+    fail_on: FailOn = "stop"
     """The lowest degree of a finding that makes the exit code 1."""
 
 
@@ -48,16 +62,18 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
         with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
             row = bar.add_task("opening", total=total)
             done: set[str] = set()
-            told: set[tuple[str, str]] = set()
+            told: set[str] = set()
 
             def show(result: RuleResult) -> None:
                 done.add(result.rule)
                 bar.update(row, completed=len(done))
-                news = result.rule, result.state
-                if result.state in ("broken", "failed") and not err.is_terminal and news not in told:
-                    told.add(news)
+                # What a task raises leaves most rules undecided, for one reason.
+                news = {"broken": f"{result.rule}: broken", "failed": f"not decided: {result.why}"}
+                line = news.get(result.state, "")
+                if line and not err.is_terminal and line not in told:
+                    told.add(line)
                     # A bar in a file or a pipe is drawn once, at the end.
-                    err.print(escape(f"{result.rule}: {result.state}"), soft_wrap=True)
+                    err.print(_safe(line), soft_wrap=True)
 
             try:
                 report = check(
@@ -69,12 +85,16 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
             bar.update(row, completed=len(report.results), description="checked")
     except TaskError as error:
         print_problem(error.problem)
-        return Exit.REFUSED
-    except (OSError, ValueError, PoolError) as error:
+        said = _without_result(what, output, root, error.problem, began)
+    except PoolError as error:
+        refuse(str(error))
+        said = _without_result(what, output, root, Problem("worker", str(error), None, None, None, ""), began)
+    except (OSError, ValueError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted")
-    said = Reported(report, what, root, output.fail_on)
+    else:
+        said = Reported(report, what, root, output.fail_on)
     try:
         with here.again():
             for path, made in (
@@ -88,9 +108,22 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
         return refuse(str(error))
     if output.json:
         print(as_json(said), end="", flush=True)
-    else:
+    elif said.error is None:
         print_report(said)
-    return Exit.FAILED if report.fails(output.fail_on) else Exit.DONE
+    if said.error is not None:
+        return Exit.REFUSED
+    return Exit.FAILED if said.report.fails(output.fail_on) else Exit.DONE
+
+
+def _without_result(
+    what: CheckOptions, output: CheckOutput, root: Path, problem: Problem, began: float
+) -> Reported:
+    """What reports say where nothing was checked."""
+    file = named_file(what.task)
+    named = str(file) if file is not None and file.is_file() else None
+    seconds = time.monotonic() - began
+    report = CheckReport(CheckedTask(what.task, "", named), (), seconds, seconds)
+    return Reported(report, what, root, output.fail_on, problem)
 
 
 # --- text ------------------------------------------------------------------------------------------------
@@ -107,8 +140,6 @@ def print_report(said: Reported) -> None:
         for finding in of_degree:
             _print_finding(finding, said.root, style)
     _print_summary(report, said.root)
-    for comment in report.task.comments:
-        warn(f"{shown_path(comment.file, said.root)}:{comment.line}: {comment.message}")
     for notice in report.task.notices:
         warn(notice)
     if report.task.others:
@@ -129,14 +160,17 @@ def _print_finding(finding: Finding, root: Path, style: str) -> None:
 
 
 def _print_summary(report: CheckReport, root: Path) -> None:
-    for error, rules in _by_reason(report.of_state("failed")).items():
-        _print(f"[red]not decided[/] {', '.join(rules)}: {_safe(error)}")
+    _print_by_reason("[red]not decided[/]", report.of_state("failed"))
     for result in report.results:
         for one in result.silenced:
             file = shown_path(one.finding.file or "", root)
             _print(f"[dim]silenced[/] {file}:{one.finding.line}: {result.rule}: {_safe(one.reason)}")
-    for reason, rules in _by_reason(report.of_state("skipped")).items():
-        _print(f"[dim]skipped[/] {', '.join(rules)}: {_safe(reason)}")
+    for comment in report.comments:
+        place = f"{shown_path(comment.file, root)}:{comment.line}"
+        _print(f"[yellow]comment[/] {_safe(place)}: {_safe(comment.message)}")
+    _print_by_reason("[dim]skipped[/]", report.of_state("skipped"))
+    if report.ignored:
+        _print_names(f"[dim]{len(report.ignored)} ignored[/]:", report.ignored)
     for result in report.results:
         for note in result.notes:
             _print(f"[dim]note[/] {result.rule}: {_safe(note)}")
@@ -144,17 +178,32 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     words = [f"{count_text(counts['kept'], 'rule')} kept", f"{counts['broken']} broken"]
     words += [f"{counts[state]} {state}" for state in ("silenced", "skipped") if counts[state]]
     words += [f"{counts['failed']} not decided"] if counts["failed"] else []
+    words += [f"{len(report.ignored)} ignored"] if report.ignored else []
     seconds = f"{report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
     if report.picture_seconds:
         seconds += f" and {report.picture_seconds:.1f} s for the first pictures"
     _print(f"{_safe(report.task.env_id)}: {', '.join(words)}. {seconds}.")
 
 
-def _by_reason(results: Sequence[RuleResult]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
+def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:
+    """A line for each reason; the reason first where many rules share it."""
+    rules: dict[str, list[str]] = {}
     for result in results:
-        found.setdefault(result.why, []).append(result.rule)
-    return found
+        rules.setdefault(result.why, []).append(result.rule)
+    for why, of in rules.items():
+        if len(of) <= MOST_NAMED:
+            _print(f"{label} {', '.join(of)}: {_safe(why)}")
+        else:
+            _print(f"{label} {_safe(why)}")
+            _print_names(f"    {count_text(len(of), 'rule')}:", of)
+
+
+def _print_names(label: str, names: Sequence[str]) -> None:
+    """The names behind the label, in lines as wide as the terminal."""
+    lines = textwrap.wrap(", ".join(names), max(40, out.width - 6), break_on_hyphens=False)
+    _print(f"{label} {lines[0]}" if len(lines) == 1 else label)
+    for line in lines if len(lines) > 1 else ():
+        _print(f"      {line}")
 
 
 def _safe(text: str) -> str:

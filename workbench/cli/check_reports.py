@@ -14,16 +14,19 @@ from typing import Any
 from urllib.parse import quote
 from xml.etree import ElementTree
 
-from workbench.checks.by_hook.run import RuleResult
+from workbench.authoring.problem import Problem
+from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
-from workbench.core.rules import DEGREES, Degree, Finding
-from workbench.jobs.check import CheckOptions, CheckReport
+from workbench.core.rules import DEGREES, Finding
+from workbench.jobs.check import CheckOptions, CheckReport, FailOn
 from workbench.ui.app.help_pages import find_topic
 
 DISTRIBUTION = "maniskill-workbench"
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 LEVELS = {"stop": "error", "warn": "warning", "off": "none"}
 """Degree to SARIF's level."""
+CANNOT_CHECK = "cannot-check"
+"""In a report the id of what ends a check before a rule is looked at; no rule has it."""
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -35,10 +38,20 @@ class Reported:
     what: CheckOptions
     root: Path
     """The current folder of the command."""
-    fail_on: Degree
+    fail_on: FailOn
+    error: Problem | None = None
+    """Why nothing was checked; the report then has no result."""
 
     def fails(self, finding: Finding) -> bool:
-        return DEGREES.index(finding.degree) <= DEGREES.index(self.fail_on)
+        return self.fail_on != "never" and DEGREES.index(finding.degree) <= DEGREES.index(self.fail_on)
+
+    @property
+    def place_of_error(self) -> tuple[str, int] | None:
+        """File and line of the error; of one that no line is at fault for, the first of the task's file."""
+        error, file = self.error, self.report.task.file
+        if error is not None and error.file is not None:
+            return error.file, error.line or 1
+        return None if file is None else (file, 1)
 
 
 def count_text(count: int, what: str) -> str:
@@ -75,20 +88,36 @@ def as_json(said: Reported) -> str:
             "num_envs": what.options.num_envs,
             "seeds": what.seeds,
             "first_seed": what.options.seed,
+            "actions": what.actions,
             "seconds": round(report.seconds, 3),
             "start_seconds": round(report.start_seconds, 3),
             "picture_seconds": round(report.picture_seconds, 3),
             "fail_on": said.fail_on,
-            "fails": report.fails(said.fail_on),
+            "fails": said.error is not None or report.fails(said.fail_on),
+            "error": _error(said),
             "counts": dict(Counter(result.state for result in report.results)),
             "findings": [_finding(finding, said.root) for finding in report.findings],
             "rules": [_rule(result, said.root) for result in report.results],
+            "ignored": list(report.ignored),
             "comments": [
                 {"file": shown_path(one.file, said.root), "line": one.line, "message": one.message}
-                for one in task.comments
+                for one in report.comments
             ],
         }
     )
+
+
+def _error(said: Reported) -> dict[str, Any] | None:
+    error, place = said.error, said.place_of_error
+    if error is None:
+        return None
+    return {
+        "stage": error.stage,
+        "message": error.message,
+        "file": None if place is None else shown_path(place[0], said.root),
+        "line": None if place is None else place[1],
+        "code": error.code,
+    }
 
 
 def _finding(finding: Finding, root: Path) -> dict[str, Any]:
@@ -134,6 +163,8 @@ def as_junit(said: Reported) -> str:
     report = said.report
     root = repository_of(said.root)
     cases = [_case(result, said, root) for result in report.results]
+    cases += [_ignored_case(rule, report.task.env_id) for rule in report.ignored]
+    cases += [] if said.error is None else [_error_case(said, said.error, root)]
     counts = {
         "tests": len(cases),
         "failures": sum(case.find("failure") is not None for case in cases),
@@ -146,20 +177,19 @@ def as_junit(said: Reported) -> str:
     named = {"name": _xml(report.task.env_id), "timestamp": now}
     suite = ElementTree.SubElement(suites, "testsuite", {**named, **totals})
     suite.extend(cases)
+    if report.comments:
+        told = [f"{shown_path(one.file, root)}:{one.line}: {one.message}" for one in report.comments]
+        ElementTree.SubElement(suite, "system-out").text = _xml("\n".join(told))
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
 
 
 def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element:
+    """A rule that was looked at."""
     task = said.report.task
     place = next((f for f in result.findings if f.file is not None), None)
     file = task.file if place is None else place.file
-    case = ElementTree.Element(
-        "testcase",
-        classname=_xml(f"workbench.check.{task.env_id}"),
-        name=result.rule,
-        time=f"{result.seconds:.3f}",
-    )
+    case = _test_case(task.env_id, result.rule, result.seconds)
     if file is not None:
         case.set("file", _xml(shown_path(file, root)))
         case.set("line", str(1 if place is None else place.line or 1))
@@ -167,6 +197,10 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
     if failing:
         failure = ElementTree.SubElement(case, "failure", type=result.rule, message=_xml(failing[0].message))
         failure.text = _xml("\n\n".join(_text(finding, root) for finding in failing))
+    elif result.state == "failed" and said.fail_on == "never":
+        ElementTree.SubElement(
+            case, "skipped", type="workbench.undecided", message=_xml(f"not decided: {result.why}")
+        )
     elif result.state == "failed":
         error = ElementTree.SubElement(case, "error", type="TaskError", message=_xml(result.why))
         error.text = _xml(result.why)
@@ -178,6 +212,31 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
     if lines:
         ElementTree.SubElement(case, "system-out").text = _xml("\n\n".join(lines))
     return case
+
+
+def _ignored_case(rule: str, env_id: str) -> ElementTree.Element:
+    case = _test_case(env_id, rule, 0)
+    ElementTree.SubElement(case, "skipped", type="workbench.ignore", message="left out by --ignore")
+    return case
+
+
+def _error_case(said: Reported, error: Problem, root: Path) -> ElementTree.Element:
+    case = _test_case(said.report.task.env_id, CANNOT_CHECK, said.report.seconds)
+    where = ""
+    if (place := said.place_of_error) is not None:
+        file, line = shown_path(place[0], root), place[1]
+        case.set("file", _xml(file))
+        case.set("line", str(line))
+        where = f"{file}:{line}: "
+    found = ElementTree.SubElement(case, "error", type=_xml(error.stage), message=_xml(error.message))
+    code = f"\n    {error.code}" if error.code else ""
+    found.text = _xml(f"{where}{error.stage} failed\n{error.message}{code}\n{error.traceback}".rstrip())
+    return case
+
+
+def _test_case(env_id: str, name: str, seconds: float) -> ElementTree.Element:
+    classname = _xml(f"workbench.check.{env_id}")
+    return ElementTree.Element("testcase", classname=classname, name=name, time=f"{seconds:.3f}")
 
 
 def _text(finding: Finding, root: Path) -> str:
@@ -199,7 +258,8 @@ def as_sarif(said: Reported) -> str:
     """SARIF 2.1.0 with what GitHub's code scanning asks for. Paths are relative to the repository."""
     report = said.report
     root = repository_of(said.root)
-    ids = [result.rule for result in report.results]
+    ids = [*(result.rule for result in report.results), *report.ignored]
+    rules = [_sarif_rule(rule) for rule in ids]
     silenced = [(one.finding, one.reason) for result in report.results for one in result.silenced]
     results = [_result(finding, ids, said, root) for finding in report.findings]
     results += [
@@ -219,26 +279,57 @@ def as_sarif(said: Reported) -> str:
             "message": {"text": comment.message},
             "locations": [_location(comment.file, comment.line, root)],
         }
-        for comment in report.task.comments
+        for comment in report.comments
+    ]
+    if said.error is not None:
+        results.append(_error_result(said, said.error, root))
+        rules.append(_ERROR_RULE)
+    off = [
+        {"descriptor": {"id": rule, "index": ids.index(rule)}, "configuration": {"enabled": False}}
+        for rule in report.ignored
     ]
     driver = {
         "name": "workbench check",
         "semanticVersion": version(DISTRIBUTION),
-        "rules": [_sarif_rule(rule) for rule in ids],
+        "rules": rules,
     }
+    decided = said.error is None and not report.of_state("failed") and not report.stopped
     run = {
         "tool": {"driver": driver},
         "originalUriBaseIds": {"%SRCROOT%": {"uri": f"{root.as_uri()}/"}},
         "invocations": [
             {
-                "executionSuccessful": not report.of_state("failed") and not report.stopped,
+                "executionSuccessful": decided,
                 "toolExecutionNotifications": notes,
+                **({"ruleConfigurationOverrides": off} if off else {}),
             }
         ],
         "columnKind": "unicodeCodePoints",
         "results": results,
     }
     return _json({"$schema": SCHEMA, "version": "2.1.0", "runs": [run]})
+
+
+_ERROR_RULE = {
+    "id": CANNOT_CHECK,
+    "shortDescription": {"text": "Task and policy can be imported, and what they need is downloaded."},
+    "fullDescription": {"text": "Otherwise none of its rules can be checked."},
+    "help": {"text": "Mend what is at this line, or fetch what is missing, and check again."},
+    "defaultConfiguration": {"level": "error"},
+}
+
+
+def _error_result(said: Reported, error: Problem, root: Path) -> dict[str, Any]:
+    place = said.place_of_error
+    key = [CANNOT_CHECK, shown_path(place[0] if place else "", root), error.code or ""]
+    return {
+        "ruleId": CANNOT_CHECK,
+        "ruleIndex": 0,
+        "level": "error",
+        "message": {"text": f"{error.stage} failed: {error.message}"},
+        "locations": [] if place is None else [_location(*place, root)],
+        "partialFingerprints": {"primaryLocationLineHash": _fingerprint(key)},
+    }
 
 
 def _sarif_rule(rule_id: str) -> dict[str, Any]:
@@ -262,15 +353,18 @@ def _result(finding: Finding, ids: list[str], said: Reported, root: Path) -> dic
     # A result without a place is shown nowhere: the first line of the task's file.
     file = finding.file or said.report.task.file
     key = [finding.rule, shown_path(file or "", root), finding.function, finding.code]
-    found = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     return {
         "ruleId": finding.rule,
         "ruleIndex": ids.index(finding.rule),
         "level": LEVELS[finding.degree],
         "message": {"text": finding.message},
         "locations": [] if file is None else [_location(file, finding.line or 1, root)],
-        "partialFingerprints": {"primaryLocationLineHash": f"{found}:1"},
+        "partialFingerprints": {"primaryLocationLineHash": _fingerprint(key)},
     }
+
+
+def _fingerprint(key: list[str]) -> str:
+    return f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]}:1"
 
 
 def _location(file: str, line: int, root: Path) -> dict[str, Any]:

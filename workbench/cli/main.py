@@ -6,6 +6,7 @@ from __future__ import annotations
 import workbench.machine.processes.own_path  # noqa: F401
 
 # isort: split
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -216,7 +217,8 @@ def check(
     workers: int | None = None,
     select: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     ignore: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    fail_on: Literal["stop", "warn"] = "stop",
+    actions: str = "random",
+    fail_on: Literal["stop", "warn", "never"] = "stop",
     json: bool = False,
     json_file: Path | None = None,
     junit: Path | None = None,
@@ -230,7 +232,9 @@ def check(
         workers: processes, which share the groups of rules; as many as cores and groups allow.
         select: check only this rule; repeatable, or several with commas. workbench help rules lists them.
         ignore: do not check this rule; repeatable, or several with commas.
-        fail_on: lowest degree of a finding that makes the exit code 1.
+        actions: who acts in further episodes, beside random actions, for the rules of evaluate() and of rewards: as
+            of workbench record, so zero, hold, a policy as module:function or file.py:function, or a file of actions.
+        fail_on: lowest degree of a finding that makes the exit code 1; never is for a job that only reports.
         json: print the result as JSON in place of text.
         json_file: also write the result to this file, as JSON.
         junit: also write it to this file as JUnit's XML, with a test case for each rule.
@@ -241,7 +245,9 @@ def check(
         return Exit.REFUSED
     from workbench.authoring.loading.reference import why_missing
 
-    if (why := why_missing(task) or _no_folder(json_file, junit, sarif)) is not None:
+    # A report is to say it too.
+    reports = json or any(file is not None for file in (json_file, junit, sarif))
+    if (why := why_missing(task)) is not None and not reports:
         return refuse(why)
     from workbench.checks.rules import degree_of_each
 
@@ -251,12 +257,16 @@ def check(
         degree_of_each(separated(select), separated(ignore))
     except ValueError as error:
         return refuse(str(error))
-    use_private_driver()
+    if (why := _without_folder(json_file, junit, sarif)) is not None:
+        return refuse(why)
+    if options.env_kwargs.get("render_backend") != "none":
+        use_private_driver()
     with quick_imports():
         from workbench.cli.check import CheckOutput, check_in_terminal
         from workbench.jobs.check import CheckOptions
 
-    what = CheckOptions(task, options, envs.seeds, separated(select), separated(ignore), workers)
+    rules = separated(select), separated(ignore)
+    what = CheckOptions(task, options, envs.seeds, *rules, actions, workers)
     return check_in_terminal(what, CheckOutput(json, json_file, junit, sarif, fail_on), began)
 
 
@@ -353,7 +363,7 @@ def rescore(
         return refuse(
             "--csv and --json both print the table: give one of them, and --csv-file or --json-file"
         )
-    if (why := _no_folder(csv_file, json_file)) is not None:
+    if (why := _without_folder(csv_file, json_file)) is not None:
         return refuse(why)
     try:
         base = batch.options()
@@ -482,11 +492,20 @@ def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
     return help.show_help(topic)
 
 
-def _no_folder(*files: Path | None) -> str | None:
-    """Why one of these files cannot be written; None if each has its folder."""
+def _without_folder(*files: Path | None) -> str | None:
+    """Make the folders of these files. Returns why one of the files cannot be written; None if each can."""
     for file in files:
-        if file is not None and not file.resolve().parent.is_dir():
-            return f"there is no folder {file.resolve().parent} to write {file.name} into"
+        if file is None:
+            continue
+        folder = file.resolve().parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            return f"{file} cannot be written: the folder {folder} cannot be made ({error.strerror})"
+        if file.is_dir():
+            return f"{file} is a folder: name a file in it"
+        if not os.access(folder, os.W_OK):
+            return f"{file} cannot be written: you may not write into {folder}"
     return None
 
 

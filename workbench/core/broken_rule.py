@@ -20,7 +20,7 @@ from typing import Any, Literal
 import mani_skill
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.rules import Degree, Finding, reason_of_silence
+from workbench.core.rules import Degree, Finding, Silence, silence_of
 
 MOST_ROWS = 64
 """Places that are kept; breaches at further places are only counted."""
@@ -95,7 +95,7 @@ class BrokenRules:
         """
         self._degrees, self._on_finding = degrees, on_finding
         self._rows: dict[_Key, _KeptFinding] = {}
-        self._silenced: dict[_Key, tuple[Finding, str]] = {}
+        self._silenced: dict[_Key, tuple[Finding, Silence]] = {}
         self._now: Occasion = "reset"
         self.more = 0
         """Breaches at places beyond `MOST_ROWS`."""
@@ -109,8 +109,8 @@ class BrokenRules:
         return tuple(row.finding for row in self._rows.values())
 
     @property
-    def silenced(self) -> tuple[tuple[Finding, str], ...]:
-        """What a comment at its line silences, with the reason; its breaches are not counted."""
+    def silenced(self) -> tuple[tuple[Finding, Silence], ...]:
+        """What a comment silences, with the comment; its breaches are not counted."""
         return tuple(self._silenced.values())
 
     def degree(self, rule: str) -> Degree:
@@ -160,11 +160,11 @@ class BrokenRules:
         self._note(rule, message, place, hook, exact=False)
 
     def _is_silenced(self, rule: str, message: str, place: Place | None) -> bool:
-        reason = None if place is None else reason_of_silence(place[0], place[1], rule)
-        if place is None or reason is None:
+        silence = None if place is None else silence_of(place[0], place[1], rule)
+        if place is None or silence is None:
             return False
         found = Finding(rule, self._degrees[rule], message, None, None, "", "", 1, self.step)
-        self._silenced.setdefault((rule, place), (_at(found, place), reason))
+        self._silenced.setdefault((rule, place), (_at(found, place), silence))
         return True
 
     def _note(self, rule: str, message: str, place: Place | None, subject: Hashable, exact: bool) -> None:

@@ -176,7 +176,7 @@ class Finding:
 
 # --- silenced in the source ------------------------------------------------------------------------------
 # ``# workbench: off[reward-rows] one env only, see the paper`` stands in the line of the finding, alone in the line above, or
-# in the ``def`` or ``class`` line around it. Without a reason it silences nothing, and `reasonless` finds it.
+# in the ``def`` or ``class`` line around it. Without a reason it silences nothing.
 
 _COMMENT = re.compile(r"#\s*workbench:\s*off\[([\w\s,-]*)\]\s*(.*)")
 
@@ -198,8 +198,8 @@ def silences(text: str) -> tuple[Silence, ...]:
     return _read(text)[0]
 
 
-def reason_of_silence(file: str | None, line: int | None, rule: str) -> str | None:
-    """Why a finding at this line is silenced; None if it is not."""
+def silence_of(file: str | None, line: int | None, rule: str) -> Silence | None:
+    """The comment that silences a finding at this line; None if there is none."""
     if file is None or line is None or file.startswith("<"):
         return None
     found, scopes = _read("".join(linecache.getlines(file)))
@@ -210,14 +210,8 @@ def reason_of_silence(file: str | None, line: int | None, rule: str) -> str | No
     for one in found:
         here = one.line == line or one.line in heads or (one.alone and one.line == line - 1)
         if here and rule in one.rules and one.reason:
-            return one.reason
+            return one
     return None
-
-
-def reasonless(file: str) -> list[tuple[int, str]]:
-    """Line and rules of the comments of a file that lack a reason."""
-    found, _ = _read("".join(linecache.getlines(file)))
-    return [(one.line, ", ".join(sorted(one.rules))) for one in found if not one.reason]
 
 
 @lru_cache(maxsize=64)

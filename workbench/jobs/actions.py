@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +14,13 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env import actions
 from workbench.core.env.task_env import TaskEnv
 from workbench.jobs.from_recording import run_of
-from workbench.jobs.policy import Policy, load_policy, policy_problem
+from workbench.jobs.policy import Policy, find_policy, load_policy, policy_problem
 from workbench.jobs.task import ActionSource
 from workbench.machine.files import open_regular_file
 from workbench.machine.folders import CurrentFolder
@@ -172,6 +173,53 @@ class RecordActionChooser:
                 )
             action[env] = given.action[step]
         return action
+
+
+# --- what ``--actions`` names ----------------------------------------------------------------------------
+
+
+KINDS = ("random", "zero", "hold")
+STEPS_WITHOUT_LIMIT = 200
+"""Of an episode whose task has no time limit."""
+
+
+def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
+    """The runs of a file, and the env's keywords that it needs; both empty for a policy, or one of `KINDS`.
+
+    Args:
+        name: as `RecordArguments.actions`.
+        task: as `RecordArguments.task`; a policy may be in its folder.
+
+    Raises:
+        FileNotFoundError, ValueError: as `read_actions`; or it names no policy (`NoPolicy`).
+    """
+    if Path(name).suffix in SUFFIXES:
+        return read_actions(Path(name))
+    if name not in KINDS:
+        find_policy(name, _folder_of(task))
+    return (), {}
+
+
+def plain_chooser(name: str, task: str, seed: int, here: CurrentFolder) -> ActionChooser:
+    """Chooses what ``--actions`` names where that is neither random nor a file.
+
+    Raises:
+        TaskError: the policy cannot be imported.
+    """
+    chooser = ActionChooser(here)
+    chooser.seed(seed)
+    if name in ("hold", "zero"):
+        chooser.use(name, None)
+    else:
+        with here.again():
+            folder = _folder_of(task)
+        chooser.use("policy", name, folder)
+    return chooser
+
+
+def _folder_of(task: str) -> Path | None:
+    file = named_file(task)
+    return None if file is None else file.parent
 
 
 # --- actions from a file: NumPy arrays, or demonstrations in ManiSkill's ``.h5`` -----------------------

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
+import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, undo_load
+from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.by_hook.run import (
     CORE_GROUP,
     GROUPS,
@@ -22,17 +27,26 @@ from workbench.checks.by_hook.run import (
     run_core,
     run_group,
 )
+from workbench.checks.comments import Comment, comments_without_effect
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.results import Silenced
 from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
+from workbench.core.backends import find_renderer, keep_render_device
+from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.keywords import constructor_arguments
-from workbench.core.rules import DEGREES, Degree, Finding, silences
+from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.rules import DEGREES, Degree, Finding
+from workbench.jobs.actions import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
 from workbench.jobs.open_task import Opening, import_task
 from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work
+from workbench.jobs.replay import begin_run
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import CurrentFolder
 
+FailOn = Literal["stop", "warn", "never"]
+"""The lowest degree of a finding that fails a check."""
 _ORDER: tuple[State, ...] = ("broken", "silenced", "failed", "kept", "skipped")
 """Of the states that one rule has in several processes, the first counts."""
 
@@ -48,17 +62,10 @@ class CheckOptions:
     select: tuple[str, ...] = ()
     """Only these rules; empty for all."""
     ignore: tuple[str, ...] = ()
+    actions: str = "random"
+    """As `RecordArguments.actions`. In further episodes, beside random ones, what it names acts."""
     workers: int | None = None
     """Processes; None for as many as cores and groups of rules allow."""
-
-
-@dataclass(frozen=True)
-class Comment:
-    """A comment in the source that was to silence a rule and silences none."""
-
-    file: str
-    line: int
-    message: str
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,8 @@ class CheckedTask:
     others: tuple[str, ...] = ()
     """Further tasks of the file, which were not checked."""
     notices: tuple[str, ...] = ()
-    comments: tuple[Comment, ...] = ()
+    source: Mapping[str, str] = field(default_factory=dict)
+    """Path to text of the author's files."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +112,10 @@ class CheckReport:
     picture_seconds: float = 0.0
     """Of those, for the first pictures."""
     stopped: bool = False
+    ignored: tuple[str, ...] = ()
+    """Rules that would have been checked without `CheckOptions.ignore`."""
+    comments: tuple[Comment, ...] = ()
+    """Silencing comments that silence nothing."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -114,8 +126,11 @@ class CheckReport:
     def of_state(self, state: State) -> tuple[RuleResult, ...]:
         return tuple(result for result in self.results if result.state == state)
 
-    def fails(self, fail_on: Degree) -> bool:
-        """Whether a finding has this degree or a higher one, or a rule is undecided because the task raised."""
+    def fails(self, fail_on: FailOn) -> bool:
+        """Whether a finding has this degree or a higher one, or a rule is undecided because the task raised. Never for
+        ``never``."""
+        if fail_on == "never":
+            return False
         highest = DEGREES.index(fail_on)
         if any(DEGREES.index(finding.degree) <= highest for finding in self.findings):
             return True
@@ -167,12 +182,15 @@ def check(
         began: when the work began, by ``time.monotonic()``; None for now.
 
     Raises:
-        TaskError: the task cannot be imported, or lacks assets.
+        TaskError: the task or the policy cannot be imported, or the task lacks assets.
         PoolError: a process that checks died.
-        ValueError: the request is invalid.
+        FileNotFoundError, ValueError: the request is invalid.
     """
     began = time.monotonic() if began is None else began
     degrees = degrees_of_request(what)
+    _, env_kwargs = find_actions(what.actions, what.task)
+    made = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
+    what = replace(what, options=made)
     groups = groups_of(degrees)
     cores = len(os.sched_getaffinity(0))
     workers = min(cores if what.workers is None else what.workers, len(groups))
@@ -180,7 +198,11 @@ def check(
     deal: Deal[None, CheckUpdate] = Deal(range(len(groups)), lambda number, none: None, found.take, stop)
     work = Work(_check_groups, [what] * workers, result=None, update=CheckUpdate, name="that checks")
     (executor or (ThisProcess() if workers == 1 else Processes())).run(work, deal)
-    return found.report(began, stop())
+    return found.report(began, stop(), _ignored(what))
+
+
+def _ignored(what: CheckOptions) -> tuple[str, ...]:
+    return tuple(rule for rule in RULES if rule in what.ignore and (not what.select or rule in what.select))
 
 
 class _Results:
@@ -214,7 +236,7 @@ class _Results:
         if update.silenced is not None:
             self._silenced.append(update.silenced)
 
-    def report(self, began: float, stopped: bool) -> CheckReport:
+    def report(self, began: float, stopped: bool, ignored: tuple[str, ...]) -> CheckReport:
         # Stopped before the task was imported: nothing is known of it.
         task = self._task or CheckedTask("", "", None)
         results = [*self._results, *core_results(self._findings, self._silenced, self._degrees)]
@@ -224,7 +246,10 @@ class _Results:
         ordered = tuple(merged(by_rule[rule]) for rule in RULES if rule in by_rule)
         now = time.monotonic()
         started = (self._started or now) - began
-        return CheckReport(task, ordered, now - began, started, self._picture_seconds, stopped)
+        comments = comments_without_effect(task.source, ordered, task.class_name, task.others)
+        return CheckReport(
+            task, ordered, now - began, started, self._picture_seconds, stopped, ignored, tuple(comments)
+        )
 
 
 def merged(results: Iterable[RuleResult]) -> RuleResult:
@@ -236,7 +261,7 @@ def merged(results: Iterable[RuleResult]) -> RuleResult:
         known = findings.setdefault(finding.key, finding)
         if finding.count > known.count:
             findings[finding.key] = finding
-    silenced = {one.finding.key: one for result in results for one in result.silenced}
+    silenced = {(one.finding.key, one.line): one for result in results for one in result.silenced}
     return replace(
         first,
         findings=tuple(findings.values()),
@@ -264,31 +289,35 @@ def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
         if queue.limit() <= number:
             raise _Stopped
 
-    with CurrentFolder().again():  # the task may change it
+    here = CurrentFolder()  # the task may change it
+    with here.again(), ExitStack() as stack:
+        given = what.options.env_kwargs.get("render_backend", "found") or "none"
+        if given != "none" and (renderer := find_renderer()) is not None:
+            # SAPIEN refuses it while a material of a build that failed is alive.
+            keep_render_device(renderer.render_backend)
+        runs, _ = find_actions(what.actions, what.task)
         opening = Opening(lambda activity: queue.send_update(CheckUpdate(activity=activity)))
         loaded = import_task(what.task, what.options, None, opening)
+        stack.callback(undo_load, loaded)
         checkup = Checkup(
             loaded,
             what.options.env_kwargs,
             num_envs=what.options.num_envs,
             seeds=what.seeds,
             first_seed=what.options.seed,
+            actors=[] if what.actions == "random" else [_Given(what, loaded, runs, here)],
             keep_going=keep_going,
         )
-        try:
-            _require_assets(loaded, what)
-            queue.send_update(CheckUpdate(task=_described(loaded)))
+        stack.callback(checkup.close)
+        _require_assets(loaded, what)
+        queue.send_update(CheckUpdate(task=_described(loaded)))
+        with suppress(_Stopped):
             while (taken := queue.next()) is not None:
                 number = taken
                 queue.send_update(CheckUpdate(activity=groups[number].name))
                 _check_group(groups[number], checkup, degrees, queue)
                 queue.send_update(CheckUpdate(picture_seconds=checkup.picture_seconds))
                 queue.send_result(number, None)
-        except _Stopped:
-            pass
-        finally:
-            checkup.close()
-            undo_load(loaded)
 
 
 def _check_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree], queue: ItemQueue) -> None:
@@ -313,21 +342,59 @@ def _described(loaded: LoadedTask) -> CheckedTask:
     file = None if loaded.file is None else str(loaded.file)
     others = loaded.others if loaded.followed else ()
     notices = loaded.notices if loaded.followed else ()
-    comments = [
-        comment for path, text in loaded.source.items() for comment in comments_without_effect(path, text)
-    ]
-    return CheckedTask(loaded.env_id, loaded.chosen, file, others, notices, tuple(comments))
+    return CheckedTask(loaded.env_id, loaded.chosen, file, others, notices, loaded.source)
 
 
-def comments_without_effect(file: str, text: str) -> Iterable[Comment]:
-    """The silencing comments of a file that lack a reason, or name no rule that there is."""
-    for comment in silences(text):
-        named = ", ".join(sorted(comment.rules))
-        if unknown := sorted(comment.rules - RULES.keys()):
-            yield Comment(file, comment.line, f"no rule is called {', '.join(unknown)}")
-        elif not comment.rules:
-            yield Comment(file, comment.line, "the comment names no rule, as in off[reward-rows]")
-        if comment.rules and not comment.reason:
-            yield Comment(
-                file, comment.line, f"off[{named}] silences nothing until a reason stands behind it"
-            )
+class _Given:
+    """Acts as ``--actions`` says: a policy in an episode of each seed, or the episodes of a file."""
+
+    kind = "given"
+
+    def __init__(
+        self, what: CheckOptions, loaded: LoadedTask, runs: Sequence[RecordedRun], here: CurrentFolder
+    ) -> None:
+        """
+        Args:
+            runs: of the file, as `find_actions` gives them.
+            here: where a policy is found.
+
+        Raises:
+            TaskError: the policy cannot be imported.
+        """
+        self._loaded = loaded
+        first = what.options.seed
+        if runs:
+            # Actions that belong to no start are tried from each seed.
+            from_seeds = len(runs) == 1 and runs[0].seed < 0 and not runs[0].env_states
+            count = what.seeds if from_seeds else min(len(runs), what.seeds)
+            chosen = [runs[k % len(runs)] for k in range(count)]
+            self._runs = [
+                run if run.seed >= 0 else replace(run, seed=first + k) for k, run in enumerate(chosen)
+            ]
+            self.seeds, self.lengths = [run.seed for run in self._runs], [run.length for run in self._runs]
+            self._chooser = RecordActionChooser(None)
+        else:
+            self._runs: list[RecordedRun] = []
+            self.seeds = list(range(first, first + what.seeds))
+            self.lengths = [loaded.max_episode_steps or STEPS_WITHOUT_LIMIT] * what.seeds
+            self._chooser = RecordActionChooser(plain_chooser(what.actions, what.task, first, here))
+        self._begun: list[int] = []
+
+    def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
+        self._begun = list(episodes)
+        runs = {env: self._runs[k] for env, k in enumerate(episodes) if self._runs}
+        for env, k in enumerate(episodes):
+            self._chooser.begin(env, self.seeds[k], runs.get(env))
+        if not runs:
+            with blamed("reset", self._loaded, task):
+                return task.reset([self.seeds[k] for k in episodes])
+        begin_run(self._loaded, task, runs)
+        with blamed("restore", self._loaded, task):
+            return task.rescore()
+
+    def next_action(self, task: TaskEnv, step: int) -> NDArray[np.float32]:
+        running = {env: step for env, k in enumerate(self._begun) if step < self.lengths[k]}
+        try:
+            return self._chooser.next_action(task, running)
+        except ValueError as error:
+            raise TaskError(Problem("policy", str(error), None, None, None, "")) from error

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.authoring.loading.reference import named_file
 from workbench.core.broken_rule import warn_of
 from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.recorded_run import RecordedRun, states_of
@@ -20,10 +19,9 @@ from workbench.core.capture.recorded_state import state_distance
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
-from workbench.jobs.actions import SUFFIXES, ActionChooser, RecordActionChooser, read_actions
+from workbench.jobs.actions import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.open_task import OpenedTask, open_task
-from workbench.jobs.policy import find_policy
 from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work, envs_per_process
 from workbench.jobs.replay import restore_recorded
 from workbench.jobs.task import RecordArguments, Stepped, TaskOptions
@@ -31,10 +29,8 @@ from workbench.machine.folders import CurrentFolder
 from workbench.recording.writing.episode_writer import EpisodeFiles
 from workbench.recording.writing.publish import RecordingError
 
-_STEPS_WITHOUT_LIMIT = 200
 _TRIES = 100
 """For each requested success."""
-_KINDS = ("random", "zero", "hold")
 _SAME_START = 1e-4
 """Metres or radians: a start further from the demonstration's is a different one."""
 
@@ -93,15 +89,11 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
     each episode or one for all; empty without a file.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_actions`; or the requested numbers are invalid.
+        FileNotFoundError, ValueError: as `find_actions`; or the requested numbers are invalid.
     """
-    given: Sequence[RecordedRun] = ()
-    if Path(what.actions).suffix in SUFFIXES:
-        given, env_kwargs = read_actions(Path(what.actions))
-        options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
-        what = replace(what, options=options)
-    elif what.actions not in _KINDS:
-        find_policy(what.actions, _task_folder(what))
+    given, env_kwargs = find_actions(what.actions, what.task)
+    options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
+    what = replace(what, options=options)
     if what.use_env_states and not (given and all(run.env_states for run in given)):
         raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")
     if what.episodes is not None and what.successes is not None:
@@ -259,7 +251,9 @@ class _Episodes:
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
         plain = not given and what.actions != "random"
-        self._chooser = RecordActionChooser(_chooser(what, here) if plain else None)
+        self._chooser = RecordActionChooser(
+            plain_chooser(what.actions, what.task, what.options.seed, here) if plain else None
+        )
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
         self._running: dict[int, int] = {}
         """Number of the episode in each env that has one."""
@@ -375,7 +369,7 @@ class _Episodes:
         given = self._given_of(self._running[env])
         if given is not None:
             return self._steps[env] >= min(given.length, self._what.max_steps or 10**9)
-        limit = self._what.max_steps or self._opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
+        limit = self._what.max_steps or self._opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
         return bool(step.terminated[env] or step.truncated[env] or self._steps[env] >= limit)
 
     def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
@@ -392,21 +386,3 @@ class _Episodes:
             self._queue.send_result(index, None)
         else:
             self._made[index] = episode, self._finisher.finish(episode)
-
-
-def _chooser(what: RecordOptions, here: CurrentFolder) -> ActionChooser:
-    chooser = ActionChooser(here)
-    chooser.seed(what.options.seed)
-    if what.actions in ("hold", "zero"):
-        chooser.use(what.actions, None)
-    else:
-        with here.again():
-            task_folder = _task_folder(what)
-        chooser.use("policy", what.actions, task_folder)
-    return chooser
-
-
-def _task_folder(what: RecordOptions) -> Path | None:
-    """The task's folder, where a policy may be too."""
-    file = named_file(what.task)
-    return None if file is None else file.parent

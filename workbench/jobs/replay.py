@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.load import LoadedTask
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import (
     new_physics,
@@ -22,6 +23,7 @@ from workbench.core.capture.recorded_state import (
 )
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
 from workbench.core.snapshots.snapshot import Snapshot, step_only
 from workbench.jobs.open_task import OpenedTask
 from workbench.machine.text import length
@@ -60,7 +62,7 @@ class Beginning:
     """What could not be restored, with the reason."""
 
 
-def begin_run(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
+def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
     """Put these envs into the first state of their runs: reset with the seed, then restore the state where it differs.
 
     It may differ: envs that were reset together shared torch's generator, so their numbers depend on more than the seed.
@@ -68,9 +70,9 @@ def begin_run(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, 
     Raises:
         TaskError: a reset raised.
     """
-    task, env = opened.env, opened.env.env
+    env = task.env
     missed: dict[int, dict[str, str]] = {i: {} for i in runs}
-    with blamed("restore", opened.loaded, task):
+    with blamed("restore", loaded, task):
         new_physics(env, list(runs))
     for i, run in runs.items():
         options = {name: value for name, value in run.reset_options.items() if name != "env_idx"}
@@ -80,12 +82,12 @@ def begin_run(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, 
             missed[i]["the seed"] = "the recording does not know it: what the task drew at the reset is new"
         seed = [run.seed] if run.seed >= 0 else None
         # One by one: envs that are reset together draw other numbers than each alone.
-        with blamed("reset", opened.loaded, task):
+        with blamed("reset", loaded, task):
             task.reset(seed, [i], options)
     now = read_states(env)
     other = {i: not same_state(_of(now, i), run.state(0)) for i, run in runs.items()}
     wrong = {i: run.state(0) for i, run in runs.items() if other[i]}
-    with blamed("restore", opened.loaded, task):
+    with blamed("restore", loaded, task):
         for i, run in runs.items():
             if run.env_states:
                 missed[i] |= state_mismatches(env, i, run.state(0))
@@ -144,7 +146,7 @@ def replay_to(
     why_not = why_not or reason
     corrected = 0
     with step_only(env, chosen, kept):
-        beginnings = begin_run(opened, dict.fromkeys(chosen, run))
+        beginnings = begin_run(opened.loaded, task, dict.fromkeys(chosen, run))
         missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:
             for t in range(state):

@@ -172,7 +172,8 @@ def _open_episode(
 
 def _begin(opened: OpenedTask, rescorings: dict[int, _Rescoring]) -> None:
     task = opened.env
-    beginnings = begin_run(opened, {env: rescoring.run for env, rescoring in rescorings.items()})
+    runs = {env: rescoring.run for env, rescoring in rescorings.items()}
+    beginnings = begin_run(opened.loaded, task, runs)
     with blamed("restore", opened.loaded, task):
         first = task.rescore()
     now = read_states(task.env)

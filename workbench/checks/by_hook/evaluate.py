@@ -34,36 +34,52 @@ def success_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def success_and_fail(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts."""
-    both = _flag(checkup.random, "success") & _flag(checkup.random, "fail")
-    if both.any():
-        step, env = (int(i) for i in np.argwhere(both)[0])
-        yield Found(
-            f"success and fail are both true in {of(int(both.any(axis=0).sum()), both.shape[1], 'episode')}, first at "
-            f"step {step} of seed {checkup.random.seeds[env]}. Write `success & ~fail`.",
-            checkup.places.entry("success"),
-            int(both.sum()),
-        )
+    """Over all rollouts."""
+    for episodes in checkup.rollouts:
+        both = _flag(episodes, "success") & _flag(episodes, "fail")
+        if both.any():
+            step, env = (int(i) for i in np.argwhere(both)[0])
+            count = of(int(both.any(axis=0).sum()), both.shape[1], f"{episodes.kind} episode")
+            yield Found(
+                f"success and fail are both true in {count}, first at step {step} of seed {episodes.seeds[env]}. Write "
+                "`success & ~fail`.",
+                checkup.places.entry("success"),
+                int(both.sum()),
+            )
+            return
 
 
 def success_flickers(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts that succeed."""
-    success = _flag(checkup.random, "success")
-    begun = success[1:-1] & ~success[:-2]
-    if not begun.any():
-        raise CannotCheck("no random episode succeeds")
-    gone = begun & ~success[2:]
-    if gone.sum() > max(1, FLICKER_SHARE * begun.sum()):
+    """Over all rollouts that succeed."""
+    times = gone = 0
+    at_reset = succeeds = False
+    kinds: list[str] = []
+    for episodes in checkup.rollouts:
+        success = _flag(episodes, "success")
+        begun = success[1:-1] & ~success[:-2]
+        times, gone = times + int(begun.sum()), gone + int((begun & ~success[2:]).sum())
+        at_reset, succeeds = at_reset or bool(success[0].any()), succeeds or bool(success.any())
+        kinds.append(episodes.kind)
+    which = " or ".join(kinds)
+    if not succeeds:
+        raise CannotCheck(f"no {which} episode succeeds")
+    if not times:
+        raise CannotCheck(
+            "where success is true, it is so from the reset on"
+            if at_reset
+            else "success comes at the last step only"
+        )
+    if gone > max(1, FLICKER_SHARE * times):
         yield Found(
-            f"success is true for a single step {int(gone.sum())} of {int(begun.sum())} times. Ask for a state that "
-            "lasts, such as `is_robot_static` or a count of steps, or an easier threshold.",
+            f"success is true for a single step {gone} of {times} times in {which} episodes. Ask for a state that lasts, "
+            "such as `is_robot_static` or a count of steps, or an easier threshold.",
             checkup.places.entry("success"),
-            int(gone.sum()),
+            gone,
         )
 
 
 def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
-    """Whether there is an entry at all, and whether random actions reach it."""
+    """Whether there is an entry at all, and in how many rollouts it is reached."""
     entries = checkup.starts.evaluate
     if any(known != "elapsed_steps" for _, known in _misspelt(entries)):
         raise CannotCheck("an entry has nearly the name that ManiSkill reads, see entry-name")
@@ -79,8 +95,9 @@ def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
             checkup.places.hook("evaluate"),
         )
     elif "success" in entries:
-        reached = int(checkup.random.evaluate["success"].any(axis=0).sum())
-        yield Note(f"success in {of(reached, len(checkup.random.seeds), 'random episode')}")
+        for episodes in checkup.rollouts:
+            reached = int(_flag(episodes, "success").any(axis=0).sum())
+            yield Note(f"success in {of(reached, len(episodes.seeds), f'{episodes.kind} episode')}")
 
 
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
@@ -116,18 +133,21 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def entries_finite(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts."""
-    episodes = checkup.random
-    for name, rows in episodes.evaluate.items():
-        if rows.dtype.kind != "f":
-            continue
-        bad = np.logical_or.reduce(~np.isfinite(rows.reshape(*rows.shape[:2], -1)), axis=2)
-        if bad.any():
+    """Over all rollouts."""
+    told: set[str] = set()
+    for episodes in checkup.rollouts:
+        for name, rows in episodes.evaluate.items():
+            if rows.dtype.kind != "f" or name in told:
+                continue
+            bad = np.logical_or.reduce(~np.isfinite(rows.reshape(*rows.shape[:2], -1)), axis=2)
+            if not bad.any():
+                continue
+            told.add(name)
             step, env = (int(i) for i in np.argwhere(bad)[0])
+            count = of(int(bad.any(axis=0).sum()), bad.shape[1], f"{episodes.kind} episode")
             yield Found(
-                f"{name!r} is not finite in {of(int(bad.any(axis=0).sum()), bad.shape[1], 'random episode')}, first at step "
-                f"{step} of seed {episodes.seeds[env]}. Look for a division or a square root of what can be 0, and clamp "
-                "it; for what is not known, return 0 and a bool beside it.",
+                f"{name!r} is not finite in {count}, first at step {step} of seed {episodes.seeds[env]}. Look for a division "
+                "or a square root of what can be 0, and clamp it; for what is not known, return 0 and a bool beside it.",
                 checkup.places.entry(name.rpartition("/")[2]),
                 int(bad.sum()),
             )

@@ -29,22 +29,24 @@ CLEARLY_LOWER = 0.05
 
 
 def reward_finite(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts and odd states."""
-    reward = _rewards(checkup)
-    bad = ~np.isfinite(reward)
+    """Over all rollouts and odd states."""
     what = (
         "Look for a division, a square root or a logarithm of what can be 0; clamp it, or use "
         "torch.linalg.norm(..., dim=1)."
     )
-    if bad.any():
-        step, env = (int(i) for i in np.argwhere(bad)[0])
-        yield Found(
-            f"the reward is {reward[step, env]} in {of(int(bad.any(axis=0).sum()), bad.shape[1], 'random episode')}, "
-            f"first at step {step + 1} of seed {checkup.random.seeds[env]}. {what}",
-            checkup.places.hook(*_hooks(checkup)),
-            int(bad.sum()),
-        )
-        return
+    for episodes in checkup.rollouts:
+        reward = _rewards(checkup, episodes)
+        bad = ~np.isfinite(reward)
+        if bad.any():
+            step, env = (int(i) for i in np.argwhere(bad)[0])
+            count = of(int(bad.any(axis=0).sum()), bad.shape[1], f"{episodes.kind} episode")
+            yield Found(
+                f"the reward is {reward[step, env]} in {count}, first at step {step + 1} of seed {episodes.seeds[env]}. "
+                f"{what}",
+                checkup.places.hook(*_hooks(checkup)),
+                int(bad.sum()),
+            )
+            return
     seen = checkup.look(odd_states)
     rewards = np.stack(seen.reward[checkup.task.env.reward_mode])
     bad = ~np.isfinite(rewards)
@@ -61,7 +63,7 @@ def reward_finite(checkup: Checkup) -> Iterator[Found | Note]:
 def reward_changes(checkup: Checkup) -> Iterator[Found | Note]:
     """Over random rollouts."""
     _require_dense(checkup)
-    reward = _rewards(checkup)
+    reward = _rewards(checkup, checkup.random)
     spread = float(np.nan_to_num(reward).max() - np.nan_to_num(reward).min())
     if spread < 1e-7:
         yield Found(
@@ -72,19 +74,22 @@ def reward_changes(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def reward_normalized(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts, where the reward is the normalized or the sparse one."""
+    """Over all rollouts, where the reward is the normalized or the sparse one."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
         raise CannotCheck("its reward is neither normalized nor sparse")
-    reward = _rewards(checkup)
     least, most = REWARD_RANGES[mode]
-    known = np.nan_to_num(reward)
-    outside = (known < least - ROUNDING) | (known > most + ROUNDING)
-    if outside.any():
+    for episodes in checkup.rollouts:
+        reward = _rewards(checkup, episodes)
+        known = np.nan_to_num(reward)
+        outside = (known < least - ROUNDING) | (known > most + ROUNDING)
+        if not outside.any():
+            continue
         low, high = float(np.nanmin(reward)), float(np.nanmax(reward))
         sparse = mode == "sparse"
         yield Found(
-            f"the {'sparse' if sparse else 'normalized'} reward goes from {low:.3g} to {high:.3g} in random episodes. "
+            f"the {'sparse' if sparse else 'normalized'} reward goes from {low:.3g} to {high:.3g} in {episodes.kind} "
+            "episodes. "
             + (
                 "Return 1 at success, -1 at fail and 0 elsewhere."
                 if sparse
@@ -99,6 +104,7 @@ def reward_normalized(checkup: Checkup) -> Iterator[Found | Note]:
             ),
             int(outside.sum()),
         )
+        return
 
 
 def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
@@ -138,7 +144,7 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
 
 
 def reward_order(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts and odd states, in episodes that have success."""
+    """Over all rollouts and odd states, in episodes that have success."""
     _require_dense(checkup)
     lower: list[tuple[float, float, float, str]] = []
     compared = 0
@@ -166,7 +172,7 @@ def reward_order(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def reward_needs_success(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts and odd states, where the reward is the normalized one."""
+    """Over all rollouts and odd states, where the reward is the normalized one."""
     if checkup.task.env.reward_mode != "normalized_dense":
         raise CannotCheck("it has no normalized dense reward")
     given, places = 0, []
@@ -210,12 +216,15 @@ class _Scored:
 
 
 def _scored(checkup: Checkup) -> list[_Scored]:
-    """Of random rollouts, then of the odd states of each batch."""
-    episodes, rewards = checkup.random, np.nan_to_num(_rewards(checkup))
-    if "success" not in episodes.evaluate:
-        raise CannotCheck("evaluate() has no entry success")
-    success = flags(episodes.evaluate["success"][1:])
-    found = [_Scored(rewards, success, [[f"seed {seed}" for seed in episodes.seeds]])]
+    """Of all rollouts, then of the odd states of each batch."""
+    found: list[_Scored] = []
+    for episodes in checkup.rollouts:
+        rewards = np.nan_to_num(_rewards(checkup, episodes))
+        if "success" not in episodes.evaluate:
+            raise CannotCheck("evaluate() has no entry success")
+        success = flags(episodes.evaluate["success"][1:])
+        actions = "" if episodes.kind == "random" else f" with {episodes.kind} actions"
+        found.append(_Scored(rewards, success, [[f"seed {seed}{actions}" for seed in episodes.seeds]]))
     seen = checkup.look(odd_states)
     mode = checkup.task.env.reward_mode
     for seeds in dict.fromkeys(map(tuple, seen.seeds)):
@@ -230,9 +239,8 @@ def _scored(checkup: Checkup) -> list[_Scored]:
     return found
 
 
-def _rewards(checkup: Checkup) -> NDArray:
-    """(T, K) of random rollouts."""
-    episodes: Episodes = checkup.random
+def _rewards(checkup: Checkup, episodes: Episodes) -> NDArray:
+    """(T, K)"""
     if checkup.task.env.reward_mode == "none":
         raise CannotCheck("it has no reward")
     if not episodes.reward.size:

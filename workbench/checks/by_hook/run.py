@@ -25,7 +25,7 @@ from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found
 from workbench.checks.results import RuleResult, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.env import actions
-from workbench.core.rules import Degree, Finding, reason_of_silence
+from workbench.core.rules import Degree, Finding, silence_of
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,9 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
             yield replace(
                 result_of(rule, degrees[rule], seen), state="failed", why=str(error), seconds=seconds
             )
-            if degrees["runs"] != "off" and rule != "runs" and (cause := raised(error)) not in told:
+            # What a policy raised is no fault of the task.
+            of_task = error.problem.stage != "policy" and rule != "runs"
+            if of_task and degrees["runs"] != "off" and (cause := raised(error)) not in told:
                 told.add(cause)
                 yield result_of("runs", degrees["runs"], [cause])
             continue
@@ -108,7 +110,7 @@ def core_results(
         of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
         once = {each.key: each for each in of_rule}
         off = {
-            each.finding.key: replace(each, finding=replace(each.finding, degree=degrees[rule]))
+            (each.finding.key, each.line): replace(each, finding=replace(each.finding, degree=degrees[rule]))
             for each in silenced
             if each.finding.rule == rule
         }
@@ -131,10 +133,10 @@ def result_of(rule: str, degree: Degree, seen: list[Found | Note]) -> RuleResult
         if isinstance(found, Note):
             continue
         finding = finding_of(rule, degree, found)
-        reason = reason_of_silence(finding.file, finding.line, rule)
-        if reason is None:
+        silence = silence_of(finding.file, finding.line, rule)
+        if silence is None:
             findings.append(finding)
         else:
-            silenced.append(Silenced(finding, reason))
+            silenced.append(Silenced(finding, silence.reason, silence.line))
     notes = tuple(each.message for each in seen if isinstance(each, Note))
     return RuleResult(rule, _state(findings, silenced), tuple(findings), tuple(silenced), notes)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import linecache
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
-from workbench.checks.evidence.episodes import Episodes, SeenOutliers, joined, stacked
+from workbench.checks.evidence.episodes import Actor, Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.places import Places
 from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.checks.results import Silenced
@@ -132,16 +132,19 @@ class Checkup:
         num_envs: int = 8,
         seeds: int = 32,
         first_seed: int = 0,
+        actors: Sequence[Actor] = (),
         keep_going: Callable[[], None] = lambda: None,
     ) -> None:
         """
         Args:
+            actors: act in further episodes, beside random actions.
             keep_going: called between steps; raises to end the checks.
         """
         self.loaded = loaded
         self.env_kwargs = dict(env_kwargs or {})
         self.num_envs = num_envs
         self.seeds = list(range(first_seed, first_seed + seeds))
+        self.actors = tuple(actors)
         self.places = Places(loaded)
         self.findings: list[Finding] = []
         """Breaches of the rules of GPU simulation, seen in all that ran so far."""
@@ -163,7 +166,7 @@ class Checkup:
         while self._open:
             self._open.pop().close()
         self._looked.clear()
-        for name in ("task", "pictured", "starts", "overlaps", "still", "random"):
+        for name in ("task", "pictured", "starts", "overlaps", "still", "random", "acted"):
             self.__dict__.pop(name, None)
 
     # --- envs ---------------------------------------------------------------------------------------------
@@ -193,8 +196,11 @@ class Checkup:
                 made = self._made(self.num_envs, False, "warn", {})
             except TaskError as error:
                 # What a task wants of a renderer can fail in many ways: only trying says whether that was it.
-                if isinstance(error.__cause__, (MissingAssets, ImportError)) or not self._may_render:
+                if isinstance(error.__cause__, (MissingAssets, ImportError)):
                     raise
+                if not self._may_render:
+                    why = f"{error.problem.message} ({self._why_no_renderer})"
+                    raise TaskError(replace(error.problem, message=why)) from error
                 for noted in (self.findings, self.builds, self.merges):
                     noted.clear()
                 made = self._made(self.num_envs, True, "warn", {})
@@ -207,7 +213,7 @@ class Checkup:
     def silenced(self) -> list[Silenced]:
         """Breaches of the rules of GPU simulation that a comment silences, seen so far."""
         known = () if self._rules is None else self._rules.silenced
-        return [Silenced(finding, reason) for finding, reason in known]
+        return [Silenced(finding, silence.reason, silence.line) for finding, silence in known]
 
     @property
     def _needs_renderer(self) -> bool:
@@ -217,8 +223,20 @@ class Checkup:
     @property
     def _may_render(self) -> bool:
         """Whether a build without a renderer can be made with one: an argument may name one, or none."""
+        return self._render_backend == "found" and find_renderer() is not None
+
+    @property
+    def _why_no_renderer(self) -> str:
+        if self._render_backend == "none":
+            return "built with render_backend=none: leave that out if the task needs a renderer"
+        return "built without a renderer: there is nothing to render with here, see `workbench doctor`"
+
+    @property
+    def _render_backend(self) -> Any:
+        """As it was given: ``none``, or a name; ``found`` if it was not."""
         given = {**self.loaded.default_kwargs, **self.env_kwargs}
-        return "render_backend" not in given and find_renderer() is not None
+        # ManiSkill also takes None for "none".
+        return given.get("render_backend", "found") or "none"
 
     @evidence
     def pictured(self) -> TaskEnv:
@@ -231,6 +249,8 @@ class Checkup:
         wanted = [m for m in ("rgb", "rgbd", "depth") if m in modes or "any_textures" in modes]
         if not wanted:
             raise CannotCheck("it has no observations with pictures")
+        if self._render_backend == "none":
+            raise CannotCheck("it is made without a renderer (render_backend=none)")
         if find_renderer() is None:
             raise CannotCheck("there is nothing to render with")
         began = time.monotonic()
@@ -287,7 +307,7 @@ class Checkup:
     # --- what was seen ------------------------------------------------------------------------------------
 
     def batches(self) -> Iterator[list[int]]:
-        """The seeds, `num_envs` at a time; the last ones go on counting so that every batch is full."""
+        """The seeds, `num_envs` at a time; beyond the last one they go on counting so that every batch is full."""
         count, n = len(self.seeds), self.num_envs
         for first in range(0, count, n):
             yield [self.seeds[0] + first + i for i in range(n)]
@@ -295,7 +315,8 @@ class Checkup:
     @evidence
     def starts(self) -> Episodes:
         """All seeds, right after their reset (T = 0)."""
-        return self._episodes(lambda task, step: None, 0)
+        hold = _FromSeeds(self, "still", 0, lambda task, step: actions.hold_action(task.parts, task.num_envs))
+        return self._episodes(hold)
 
     @evidence
     def still(self) -> Episodes:
@@ -308,17 +329,29 @@ class Checkup:
                 held[0] = actions.hold_action(task.parts, task.num_envs)
             return held[0]
 
-        return self._episodes(hold, max(1, round(STILL_SECONDS / self.task.control_dt)))
+        steps = max(1, round(STILL_SECONDS / self.task.control_dt))
+        return self._episodes(_FromSeeds(self, "still", steps, hold))
 
     @evidence
     def random(self) -> Episodes:
         """All seeds, under random actions, to the end of the episode or `ROLLOUT_STEPS`."""
         rng = np.random.default_rng(0)
-        return self._episodes(
-            lambda task, step: actions.random_action(task.parts, task.num_envs, rng),
-            min(self.loaded.max_episode_steps or ROLLOUT_STEPS, ROLLOUT_STEPS),
-            watched=True,
+        steps = min(self.loaded.max_episode_steps or ROLLOUT_STEPS, ROLLOUT_STEPS)
+        actor = _FromSeeds(
+            self, "random", steps, lambda task, step: actions.random_action(task.parts, task.num_envs, rng)
         )
+        return self._episodes(actor, watched=True)
+
+    @evidence
+    def acted(self) -> tuple[Episodes, ...]:
+        """The episodes of each of the actors."""
+        return tuple(self._episodes(actor) for actor in self.actors)
+
+    @property
+    def rollouts(self) -> Iterator[Episodes]:
+        """The random episodes, then those of each actor."""
+        yield self.random
+        yield from self.acted
 
     @evidence
     def overlaps(self) -> dict[int, tuple[Overlap, ...]]:
@@ -327,7 +360,9 @@ class Checkup:
         for seeds in self.batches():
             self.reset(self.task, seeds)
             self.first_substep(self.task)
-            found |= {seed: overlaps_of(self.task, env) for env, seed in enumerate(seeds)}
+            found |= {
+                seed: overlaps_of(self.task, env) for env, seed in enumerate(seeds) if seed in self.seeds
+            }
         return found
 
     @evidence
@@ -378,35 +413,62 @@ class Checkup:
             task.env.scene.step()
             fetch(task.env)
 
-    def _episodes(self, choose: Callable[[TaskEnv, int], Any], steps: int, watched: bool = False) -> Episodes:
+    def _episodes(self, actor: Actor, watched: bool = False) -> Episodes:
         together: list[Episodes] = []
         geometry: SceneGeometry | None = None
-        for seeds in self.batches():
-            states = [self.reset(self.task, seeds)]
+        task, n, steps = self.task, self.num_envs, max(actor.lengths)
+        for first in range(0, len(actor.seeds), n):
+            chosen = range(first, min(first + n, len(actor.seeds)))
+            seeds, lengths = ([of[k] for k in chosen] for of in (actor.seeds, actor.lengths))
+            self._keep_going()
+            # Every env needs an episode: the last one again, which is not looked at.
+            states = [actor.begin(task, [min(first + i, chosen[-1]) for i in range(n)])]
             seen = None
             if watched:
-                env = self.task.env
-                if geometry is None or env.reconfiguration_freq:
-                    geometry = read_geometry(env)
-                watch = OutlierWatch(geometry, states[0], self.task.control_dt, env.reward_mode)
+                if geometry is None or task.env.reconfiguration_freq:
+                    geometry = read_geometry(task.env)
+                watch = OutlierWatch(geometry, states[0], task.control_dt, task.env.reward_mode)
                 seen = SeenOutliers(watch, seeds)
-            obs = [read_obs(self.task)]
+            obs = [read_obs(task)]
             rewards: list[NDArray[np.float32]] = []
-            length = np.full(len(seeds), steps)
-            over = np.zeros(len(seeds), bool)
-            for step in range(steps):
-                now = self.step(self.task, choose(self.task, step))
+            ends, over = np.full(n, steps), np.arange(n) >= len(chosen)
+            for step in range(max(lengths)):
+                now = self.step(task, actor.next_action(task, step))
                 rewards.append(now.reward)
                 states.append(now)
-                obs.append(read_obs(self.task))
+                obs.append(read_obs(task))
                 ended = (now.terminated | now.truncated) & ~over
-                length[ended] = step + 1
+                ends[ended] = step + 1
                 over |= ended
                 if seen is not None:
                     seen.take(step + 1, now, over)
             outliers = () if seen is None else seen.all()
-            together.append(stacked(seeds, states, rewards, obs, length, outliers))
+            together.append(stacked(actor.kind, seeds, lengths, steps, states, rewards, obs, ends, outliers))
         return joined(together)
+
+
+@dataclass(frozen=True)
+class _FromSeeds:
+    """Acts in an episode of each seed, alike in all envs."""
+
+    checkup: Checkup
+    kind: str
+    steps: int
+    choose: Callable[[TaskEnv, int], NDArray[np.float32]]
+
+    @property
+    def seeds(self) -> list[int]:
+        return self.checkup.seeds
+
+    @property
+    def lengths(self) -> list[int]:
+        return [self.steps] * len(self.seeds)
+
+    def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
+        return self.checkup.reset(task, [self.seeds[k] for k in episodes])
+
+    def next_action(self, task: TaskEnv, step: int) -> NDArray[np.float32]:
+        return self.choose(task, step)
 
 
 def put_where_built(task: TaskEnv) -> None:

@@ -1,15 +1,52 @@
-"""What was seen of many episodes of a task, rolled out in batches."""
+"""What was seen of many episodes of a task, rolled out in batches, and who acts in them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.capture.outliers import OutlierKind, OutlierWatch
 from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
+
+
+class Actor(Protocol):
+    """Acts in K episodes of a task."""
+
+    @property
+    def kind(self) -> str:
+        """For a sentence: ``random``, ``given``."""
+        ...
+
+    @property
+    def seeds(self) -> Sequence[int]:
+        """(K,) with which each episode begins."""
+        ...
+
+    @property
+    def lengths(self) -> Sequence[int]:
+        """(K,) the most control steps of each episode."""
+        ...
+
+    def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
+        """Reset all envs to the start of these episodes, one for each env. The last may be there several times.
+
+        Raises:
+            TaskError: the task raised.
+        """
+        ...
+
+    def next_action(self, task: TaskEnv, step: int) -> NDArray[np.float32]:
+        """(N, A) in the episodes that were begun last; any for one that is over.
+
+        Raises:
+            TaskError: the actor raised; the problem's stage is ``policy``.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -29,8 +66,11 @@ class SeenOutlier:
 @dataclass
 class Episodes:
     """What was seen of K episodes over T control steps; episode k began with seed ``seeds[k]``. Leading dimension T + 1 for
-    states, T for rewards. An episode that has ended goes on, as in stock ManiSkill: `length` says where it ended."""
+    states, T for rewards. An episode that has ended goes on, as in stock ManiSkill: `length` says where it ended. Of one
+    whose actions are over, the last state and reward are repeated."""
 
+    kind: str = "random"
+    """As `Actor.kind`."""
     seeds: list[int] = field(default_factory=list)
     poses: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0, 0, 7), np.float32))
     """(T + 1, K, B, 7) position in metres, quaternion wxyz; bodies as `Checkup.bodies`."""
@@ -73,33 +113,50 @@ class SeenOutliers:
 
 
 def stacked(
+    kind: str,
     seeds: list[int],
+    lengths: Sequence[int],
+    steps: int,
     states: list[StepResult],
     rewards: list[NDArray[np.float32]],
     obs: list[dict[str, NDArray[np.float64]]],
-    length: NDArray[np.int64],
+    ended: NDArray[np.int64],
     outliers: Iterable[SeenOutlier],
 ) -> Episodes:
-    """The episodes of one batch."""
+    """The episodes of one batch: of the first ``len(seeds)`` envs.
+
+    Args:
+        lengths: control steps for which each episode had actions; at most as many were made.
+        steps: T.
+        ended: (N,) as `Episodes.length`.
+    """
+    count = len(seeds)
     names = [name for name in states[0].evaluate if all(name in state.evaluate for state in states)]
     # The reward's terms exist from the first step on.
     late = [name for name in states[-1].evaluate if name not in names]
     leaves = [name for name in obs[0] if all(name in one for one in obs)]
+    envs = np.arange(count)
+    row = np.minimum(np.arange(steps + 1)[:, None], np.array(lengths)[None])
+
+    def of_states(rows: list[NDArray]) -> NDArray:
+        return np.stack(rows)[row, envs]
+
     return Episodes(
+        kind=kind,
         seeds=list(seeds),
-        poses=np.stack([state.poses for state in states]),
-        qpos=None if states[0].qpos is None else np.stack([s.qpos for s in states if s.qpos is not None]),
+        poses=of_states([state.poses for state in states]),
+        qpos=None if states[0].qpos is None else of_states([s.qpos for s in states if s.qpos is not None]),
         evaluate={
-            **{name: np.stack([state.evaluate[name] for state in states]) for name in names},
+            **{name: of_states([state.evaluate[name] for state in states]) for name in names},
             **{
-                name: np.stack([state.evaluate[name] for state in [states[1], *states[1:]]])
+                name: of_states([state.evaluate[name] for state in [states[1], *states[1:]]])
                 for name in late
                 if all(name in state.evaluate for state in states[1:])
             },
         },
-        reward=np.stack(rewards) if rewards else np.zeros((0, len(seeds)), np.float32),
-        obs={name: np.stack([one[name] for one in obs]) for name in leaves},
-        length=length,
+        reward=np.stack(rewards)[row[1:] - 1, envs] if rewards else np.zeros((0, count), np.float32),
+        obs={name: of_states([one[name] for one in obs]) for name in leaves},
+        length=np.minimum(ended[:count], np.array(lengths)),
         outliers=tuple(outliers),
     )
 
@@ -109,7 +166,8 @@ def joined(parts: list[Episodes]) -> Episodes:
     names = [name for name in parts[0].evaluate if all(name in part.evaluate for part in parts)]
     leaves = [name for name in parts[0].obs if all(name in part.obs for part in parts)]
     qpos = [part.qpos for part in parts if part.qpos is not None]
-    return Episodes(
+    return replace(
+        parts[0],
         seeds=[seed for part in parts for seed in part.seeds],
         poses=np.concatenate([part.poses for part in parts], axis=1),
         qpos=np.concatenate(qpos, axis=1) if len(qpos) == len(parts) else None,

@@ -13,7 +13,7 @@ from workbench.authoring.problem import hook_definition
 from workbench.checks.rules import RULES, degree_of_each
 from workbench.core.broken_rule import Place
 from workbench.core.capture.outliers import OUTLIER_RULES
-from workbench.core.rules import Degree, Finding, reason_of_silence
+from workbench.core.rules import Degree, Finding, silence_of
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def rules_of_outliers(loaded: LoadedTask, choice: Degree | None) -> dict[str, Fi
         hooks = (RULES[rule].hook, *_OTHER_HOOKS.get(rule, ()))
         hook = hook_definition(loaded.cls, hooks, loaded.source_files)
         name, (file, line) = ("", (None, None)) if hook is None else hook
-        if degrees[rule] == "off" or reason_of_silence(file, line, rule) is not None:
+        if degrees[rule] == "off" or silence_of(file, line, rule) is not None:
             continue
         code = "" if file is None or line is None else linecache.getline(file, line).strip()
         found[rule] = Finding(rule, degrees[rule], "", file, line, code, name, 0, 0)
