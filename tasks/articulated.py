@@ -7,7 +7,12 @@ a larger `qpos` is a drawer that is further out, towards the robot.
 - the root link's joint is "fixed": the cabinet does not move;
 - the joint has damping, or the drawer would glide on for ever after a push;
 - `qpos` is a batch: (N, 1), since there is one joint. At a reset it is set with b rows;
-- a place on a link, as the handle, is the link's pose times the place in the link's frame.
+- a place on a link, as the handle, is the link's pose times the place in the link's frame;
+- reward and success read `qpos`: an open drawer counts, however it was opened.
+
+To change: `HALF`, `TRAVEL` and `OPEN`; a door has a "revolute" joint, which turns about the x axis of its
+frame, has its limits in radians, and its two poses put that axis at the hinge. Another drawer is another
+link on `body` with a joint of its own, and `qpos` gets one more column.
 """
 
 from __future__ import annotations
@@ -60,9 +65,10 @@ class ArticulatedEnv(BaseEnv):
         build_ground(self.scene)
         builder = self.scene.create_articulation_builder()
         x, y, z = HALF
-        body = builder.create_link_builder()
+        body = builder.create_link_builder()  # without a parent: the root
         body.set_name("body")
         body.set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
+        # A link may have any number of shapes: here walls, bottom, top and back. The front is open.
         for side in (-1, 1):
             add_box(body, [x, 0.005, z], [0, side * (y - 0.005), 0], WOOD)
             add_box(body, [x, y - 0.01, 0.005], [0, 0, side * (z - 0.005)], WOOD)
@@ -71,8 +77,11 @@ class ArticulatedEnv(BaseEnv):
         drawer = builder.create_link_builder(body)
         drawer.set_name("drawer")
         drawer.set_joint_name("slide")
+        # The joint's frame in the parent and in the child. They are equal, so at `qpos` 0 the frames of both
+        # links coincide, and the drawer's boxes are placed in the frame of the body.
         outwards = sapien.Pose(q=euler2quat(0, 0, np.pi))
         drawer.set_joint_properties("prismatic", [[0, TRAVEL]], outwards, outwards, damping=20)
+        # A little smaller than the space for it: PhysX pushes apart what overlaps.
         add_box(drawer, [x - 0.02, y - 0.02, 0.005], [-0.01, 0, -z + 0.02], FRONT)
         for side in (-1, 1):
             add_box(drawer, [x - 0.02, 0.005, 0.04], [-0.01, side * (y - 0.02), -z + 0.065], FRONT)
@@ -81,6 +90,7 @@ class ArticulatedEnv(BaseEnv):
         for side in (-1, 1):
             add_box(drawer, [0.02, 0.006, 0.006], [HANDLE[0] + 0.02, side * 0.05, 0], METAL)
 
+        # The body stands on the ground: an articulation's pose is that of its root's frame.
         builder.initial_pose = sapien.Pose(p=[0.35, 0, z])
         self.cabinet = builder.build(name="cabinet", fix_root_link=True)
         self.drawer = self.cabinet.links_map["drawer"]
@@ -100,6 +110,7 @@ class ArticulatedEnv(BaseEnv):
             place[:, 1] = 0.2 * torch.rand(b) - 0.1
             place[:, 2] = HALF[2]
             self.cabinet.set_pose(Pose.create_from_pq(place))
+            # Joints are set, never the pose of a link: physics would not see it.
             self.cabinet.set_qpos(0.02 * torch.rand((b, 1)))
             self.cabinet.set_qvel(torch.zeros((b, 1)))
 
@@ -121,6 +132,7 @@ class ArticulatedEnv(BaseEnv):
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         distance = torch.linalg.norm(self.handle - self.agent.tcp.pose.p, dim=1)
+        # Reaching is worth 1 and pulling is worth 1, and both grow all the way: each step can be better.
         reward = 1 - torch.tanh(4 * distance) + (info["opened"] / OPEN).clamp(0, 1)
         return torch.where(info["success"], 3.0, reward)
 
