@@ -31,13 +31,15 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 from transforms3d.euler import euler2quat
 
+NEAREST = 0.26
+"""Least x of the cabinet. From 0.35 on a hand that points down does not reach behind the handle."""
 HALF = [0.12, 0.14, 0.1]
 """Half sizes of the cabinet, metres; its walls are 1 cm thick."""
 TRAVEL = 0.18
 OPEN = 0.12
 """The drawer counts as open from here."""
-HANDLE = [-HALF[0] - 0.045, 0, 0]
-"""In the frame of the drawer."""
+HANDLE = [-HALF[0] - 0.06, 0, 0]
+"""In the frame of the drawer: far enough from the front that a hand fits between them."""
 WOOD, FRONT, METAL = [0.5, 0.35, 0.2, 1], [0.75, 0.6, 0.4, 1], [0.25, 0.25, 0.28, 1]
 
 
@@ -88,16 +90,16 @@ class ArticulatedEnv(BaseEnv):
         add_box(drawer, [0.005, y - 0.015, z - 0.015], [-x + 0.005, 0, 0], FRONT)
         add_box(drawer, [0.008, 0.06, 0.008], HANDLE, METAL)
         for side in (-1, 1):
-            add_box(drawer, [0.02, 0.006, 0.006], [HANDLE[0] + 0.02, side * 0.05, 0], METAL)
+            add_box(drawer, [0.028, 0.006, 0.006], [HANDLE[0] + 0.028, side * 0.05, 0], METAL)
 
         # The body stands on the ground: an articulation's pose is that of its root's frame.
-        builder.initial_pose = sapien.Pose(p=[0.35, 0, z])
+        builder.initial_pose = sapien.Pose(p=[NEAREST, 0, z])
         self.cabinet = builder.build(name="cabinet", fix_root_link=True)
         self.drawer = self.cabinet.links_map["drawer"]
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=[-0.2, 0.6, 0.6], target=[0.2, 0, 0.1])
+        pose = sapien_utils.look_at(eye=[-0.3, 0.6, 0.6], target=[0.1, 0, 0.1])
         return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
@@ -106,7 +108,7 @@ class ArticulatedEnv(BaseEnv):
             rest = torch.tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(b, 1))
             place = torch.zeros((b, 3))
-            place[:, 0] = 0.35 + 0.05 * torch.rand(b)
+            place[:, 0] = NEAREST + 0.04 * torch.rand(b)
             place[:, 1] = 0.2 * torch.rand(b) - 0.1
             place[:, 2] = HALF[2]
             self.cabinet.set_pose(Pose.create_from_pq(place))
