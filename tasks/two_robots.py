@@ -5,7 +5,12 @@
 - `self.agent` is then a `MultiAgent`: the robots are `self.agent.agents`, in the order of the tuple, and
   each has its own joints, tcp and reset. There is no `self.agent.tcp`;
 - an action is a dict with an entry for each robot ("panda-0", "panda-1"), and so is the robots' own part
-  of an observation.
+  of an observation;
+- numbers of each robot have an axis for the robots: `to_grips` is (N, 2, 3) and `held` is (N, 2). "Both" is
+  then `all(dim=1)`.
+
+To change: other robots are another tuple, in `SUPPORTED_ROBOTS` and as the default of `robot_uids`. A third
+robot needs a third pose in `_load_agent`, and a third place in `to_grips`.
 """
 
 from __future__ import annotations
@@ -43,13 +48,14 @@ class TwoRobotsEnv(BaseEnv):
         super().__init__(*args, robot_uids=robot_uids, **kwargs)
 
     def _load_agent(self, options: dict) -> None:
+        # Apart enough that the hands do not meet, near enough that each reaches its end of the bar.
         facing_back = sapien.Pose(p=[0.78, 0, 0], q=euler2quat(0, 0, torch.pi))
         super()._load_agent(options, [sapien.Pose(p=[-0.78, 0, 0]), facing_back])
 
     def _load_scene(self, options: dict) -> None:
         build_ground(self.scene)
         builder = self.scene.create_actor_builder()
-        builder.add_box_collision(half_size=BAR, density=300)
+        builder.add_box_collision(half_size=BAR, density=300)  # like wood; the default is 1000, water
         builder.add_box_visual(
             half_size=BAR, material=sapien.render.RenderMaterial(base_color=[0.2, 0.45, 0.7, 1])
         )
@@ -99,6 +105,7 @@ class TwoRobotsEnv(BaseEnv):
         return obs
 
     def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> torch.Tensor:
+        # A mean over the robots of what each does alone. `lift` needs both, or one would drag the bar alone.
         reach = (1 - torch.tanh(4 * torch.linalg.norm(self.to_grips, dim=2))).mean(dim=1)
         held = info["held"].float().mean(dim=1)
         lift = info["held"].all(dim=1) * (info["height"] / LIFTED).clamp(0, 1)

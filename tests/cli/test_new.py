@@ -117,9 +117,10 @@ def test_in_a_terminal_it_asks_for_template_and_name_until_they_will_do(
     (place / "taken.py").write_text("mine")
     terminal = Terminal(place)
     said = terminal.says("Enter: minimal): ")
-    assert "1  minimal" in said and "2  tabletop" in said
-    terminal.type("7\n")
-    assert "Type a number from 1 to " in terminal.says("): ")
+    listed = [line.split(maxsplit=2) for line in said.splitlines() if line[:2] == "  "]
+    assert listed == [[str(n), one.name, one.about] for n, one in enumerate(TEMPLATES, 1)]
+    terminal.type(f"{len(TEMPLATES) + 1}\n")
+    assert f"Type a number from 1 to {len(TEMPLATES)}" in terminal.says("): ")
     terminal.type("2\n")
     terminal.says("Name of the task, such as stack_two: ")
     terminal.type("taken\n")

@@ -22,6 +22,7 @@ IDS = {
     "custom_scene": "WorkbenchCustomScene-v1",
     "different_objects": "WorkbenchDifferentObjects-v1",
     "fail_conditions": "WorkbenchFailConditions-v1",
+    "locomotion": "WorkbenchLocomotion-v1",
     "obs_history": "WorkbenchObsHistory-v1",
     "own_robot": "WorkbenchOwnRobot-v1",
     "reward_terms": "WorkbenchRewardTerms-v1",
@@ -31,6 +32,8 @@ IDS = {
 }
 ROBOTS = ("workbench_pen_arm", "workbench_pendulum")
 """Those that the examples register."""
+LOGGED = {"locomotion": {"Currently ManiSkill does not support loading plane geometries from MJCFs"}}
+"""What ManiSkill logs of an example that cannot help it: the robot's file has a floor."""
 
 
 def import_file(name: str) -> None:

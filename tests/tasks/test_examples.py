@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import workbench
-from tests.tasks.conftest import FOLDER, IDS
+from tests.tasks.conftest import FOLDER, IDS, LOGGED
 
 Make = Callable[..., Any]
 EXAMPLES = ("push_cube", "minimal")
@@ -136,7 +136,7 @@ def test_stock_maniskill_makes_and_steps_it_without_a_warning(
         obs, reward, terminated, _, _ = env.step(env.action_space.sample())
         assert all(leaf.shape[0] == 1 and torch.isfinite(leaf).all() for leaf in numbers(obs))
         assert reward.shape == terminated.shape == (1,) and torch.isfinite(reward).all()
-    assert mani_skill_log == []
+    assert set(mani_skill_log) <= LOGGED.get(name, set())
 
 
 @pytest.mark.filterwarnings("ignore:.*which belonged to another task")  # the class that the fixture imported

@@ -166,7 +166,7 @@ def new(
 
     Args:
         name: of the file, such as stack_two, whose class is StackTwoEnv and whose id is StackTwo-v1.
-        origin: minimal (also if not given), tabletop, or the id of a task of ManiSkill, such as PickCube-v1, which is copied.
+        origin: minimal (also if not given), tabletop, articulated, multi-robot, locomotion, or the id of a task of ManiSkill, such as PickCube-v1, which is copied.
     """
     from workbench.cli.new import new_in_terminal
 

@@ -40,6 +40,9 @@ class Template:
 TEMPLATES = (
     Template("minimal", "minimal.py", "the least that a task can be: a robot, a cube, and when it is done"),
     Template("tabletop", "push_cube.py", "a whole task on a table: reward, cameras, observations, fail"),
+    Template("articulated", "articulated.py", "a drawer that is built in code, and pulled open"),
+    Template("multi-robot", "two_robots.py", "two arms that lift one bar together"),
+    Template("locomotion", "locomotion.py", "a four-legged robot that walks, rewarded at each step"),
 )
 
 

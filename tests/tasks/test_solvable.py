@@ -1,0 +1,67 @@
+"""Examples that a hand has to work for: a scripted policy succeeds from every seed, and earns most when it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+
+import workbench
+from tests.tasks import solvers
+from tests.tasks.conftest import FOLDER
+
+SEEDS = 6
+Policy = Callable[[torch.Tensor], torch.Tensor]
+
+
+@pytest.fixture
+def make_batch() -> Iterator[Callable[[str], Any]]:
+    envs: list[Any] = []
+
+    def make(name: str) -> Any:
+        keywords = {"backend": "cpu", "render_backend": "none", "obs_mode": "state", "rules": "stop"}
+        env = workbench.make(
+            FOLDER / f"{name}.py", num_envs=SEEDS, control_mode="pd_ee_delta_pos", **keywords
+        )
+        envs.append(env)
+        return env
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+def one_robot(actions: torch.Tensor) -> Any:
+    return actions
+
+
+def two_robots(actions: torch.Tensor) -> Any:
+    left, right = actions.chunk(2, dim=1)
+    return {"panda-0": left, "panda-1": right}
+
+
+@pytest.mark.filterwarnings("ignore:.*which belonged to another task")  # the class that the fixture imported
+@pytest.mark.parametrize(
+    ("name", "policy", "as_action"),
+    [
+        ("articulated", solvers.open_drawer, one_robot),
+        ("reward_terms", solvers.lift_cube, one_robot),
+        ("two_robots", solvers.lift_bar, two_robots),
+    ],
+)
+def test_a_script_succeeds_from_every_seed_and_earns_most_then(
+    make_batch: Callable[[str], Any], name: str, policy: Policy, as_action: Callable[[torch.Tensor], Any]
+) -> None:
+    env = make_batch(name)
+    obs, info = env.reset(seed=0)
+    assert not info["success"].any()
+    best, done = torch.zeros(SEEDS), torch.zeros(SEEDS, dtype=torch.bool)
+    for _ in range(40):
+        obs, reward, *_, info = env.step(as_action(policy(obs)))
+        assert (reward[info["success"]] == 1).all() and (reward[~info["success"]] < 0.9).all()
+        best, done = torch.maximum(best, reward), done | info["success"]
+        if done.all():
+            break
+    assert done.all() and (best == 1).all()
