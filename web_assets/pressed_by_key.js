@@ -13,6 +13,7 @@
   const STEPS = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 };
   const GONE = 1500; // milliseconds without it, after which a part is not waited for
   let walkedTo = "";
+  let byPointer = false; // what is clicked gives the focus back (keys.js), and must not get it again
   let missedSince = 0;
 
   function press(part, event) {
@@ -29,6 +30,8 @@
   window.addEventListener(
     "keydown",
     (event) => {
+      byPointer = false;
+      remember(event);
       const part = event.target instanceof Element && event.target.matches(PARTS) ? event.target : null;
       if (!part || event.altKey) return;
       const list = part.closest("[data-roving]");
@@ -41,13 +44,24 @@
     true,
   );
 
-  window.addEventListener("focusin", ({ target }) => {
-    walkedTo = (target instanceof Element && target.matches("[data-press]") && target.dataset.press) || "";
-  });
+  function remember({ target }) {
+    const walked = !byPointer && target instanceof Element && target.matches("[data-press]");
+    walkedTo = (walked && target.dataset.press) || "";
+  }
+
+  window.addEventListener("focusin", remember);
   // Between the part that Tab leaves and the next one nothing has the focus. A change of the page in that moment would
   // bring the focus back to the first.
   window.addEventListener("focusout", ({ relatedTarget }) => relatedTarget && (walkedTo = ""));
-  window.addEventListener("pointerdown", (event) => event.isTrusted && (walkedTo = ""), true);
+  window.addEventListener(
+    "pointerdown",
+    (event) => {
+      if (!event.isTrusted) return;
+      walkedTo = "";
+      byPointer = true;
+    },
+    true,
+  );
 
   new MutationObserver(() => {
     if (!walkedTo || document.activeElement !== document.body) return;

@@ -77,7 +77,7 @@ FAULTS = r"""() => {
         const range = document.createRange();
         range.selectNodeContents(a.element);
         const text = range.getBoundingClientRect();
-        if (text.width && (text.left < a.box.left + 1 || text.right > a.box.right - 1)) faults.add(`text over a button's edge: ${name(a.element)}`);
+        if (text.width && (text.left < a.box.left + 3 || text.right > a.box.right - 3)) faults.add(`text over a button's edge: ${name(a.element)}`);
     });
 
     // Scroll bars and slider thumbs over text.

@@ -116,6 +116,12 @@ def test_what_is_wrong_is_found(desk: Desk) -> None:
 
 
 def test_the_view_keeps_half_of_the_page_beside_the_envs(desk: Desk) -> None:
+    table = desk.page.locator(".wb-env-table")
+
+    def heads() -> list[str]:
+        """Of the columns that are seen."""
+        return [head.inner_text().split()[0] for head in table.locator("th").all() if head.is_visible()]
+
     desk.press("b")
     expect(desk.page.locator(".wb-env-table")).to_be_visible()
     until(
@@ -123,9 +129,18 @@ def test_the_view_keeps_half_of_the_page_beside_the_envs(desk: Desk) -> None:
         "a view of half the page",
         seen=lambda: width_of(desk.page, VIEW),
     )
+    # Beside it columns give way, and none is cut.
+    cut = "() => { const t = document.querySelector('.wb-env-table'); return t.getBoundingClientRect().right > t.closest('[data-dock-region]').getBoundingClientRect().right }"
+    until(lambda: not desk.page.evaluate(cut), "a table that is not cut")
+    assert heads() == ["env", "state", "steps", "return", "success"]
+    hidden = desk.page.locator(".wb-envs-hidden")
+    expect(hidden).to_have_text("4 hidden")
+    expect(hidden).to_have_attribute("title", re.compile("flags, last, fail, reward"))
     desk.page.set_viewport_size({"width": 1920, "height": 1080})
     fits = "() => { const t = document.querySelector('.wb-env-table'); return t.scrollWidth <= t.closest('.mantine-ScrollArea-viewport').clientWidth && t.closest('[data-dock-region]').offsetWidth - t.offsetWidth < 40 }"
     until(lambda: desk.page.evaluate(fits), "a table as wide as its columns")
+    assert len(heads()) == 9
+    expect(hidden).to_be_empty()
     pills = desk.page.locator(".wb-envs")
     pills.get_by_text("columns ▾").click()
     pills.get_by_text("✓ fail").click()

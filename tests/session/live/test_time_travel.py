@@ -138,7 +138,7 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     session.past.seek(start + 2)
     after(session, lambda: session.past.continue_from_shown("all"))
     step(session, 2)
-    assert session.view().timeline.undo == "going back of all"
+    assert session.view().timeline.undo == "jump of all"
     view = after(session, session.past.undo)
     assert is_close(view.step.poses, left.poses)
     assert view.step.elapsed_steps.tolist() == [6] * N

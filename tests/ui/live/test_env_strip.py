@@ -16,6 +16,7 @@ from workbench.ui.live.env_panel import (
     MOST_ENTRIES,
     columns,
     entry_names,
+    gives_way,
     make_rows,
     mask,
     moment_of,
@@ -73,11 +74,12 @@ def test_cells_say_how_an_env_stands() -> None:
     rows = rows_of()
     assert entry_names(rows) == ("success", "near")
     running, solved, _, cut, after, odd = cells_of(rows, np.arange(6))
-    assert (running.state, running.steps, running.total, running.last) == ("running", "3", "1", "success 41")
+    assert (running.state, running.steps, running.total) == ("running", "3", "1")
+    assert (running.last, running.last_steps) == ("success", "41")
     assert running.tally == "3 of 5 episodes ended in success"
     assert (solved.state, solved.first_true, solved.last) == ("success", ("33", "20"), "")
     assert (cut.state, cut.total) == ("truncated", "")
-    assert after.last == "fail 9" and after.first_true == ("", "")
+    assert (after.last, after.last_steps) == ("fail", "9") and after.first_true == ("", "")
     assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
 
 
@@ -87,7 +89,7 @@ def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
     row = cells_of(rows, np.array([2]))[0]
     assert (
         row.flags == ("bodies-stay: cube dropped 0.90 m (previous episode, step 12)",)
-        and row.last == "cut short 13"
+        and (row.last, row.last_steps) == ("cut short", "13")
     )
     assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
 
@@ -138,3 +140,18 @@ def test_a_return_that_is_nan_is_said_and_its_curve_has_a_gap() -> None:
     odd, other = cells_of(rows, np.array([0, 1]))
     assert odd.total == "NaN" and len(odd.curve) == 2 and len(other.curve) == 1
     assert cells_of(rows, np.array([3]))[0].total == ""
+
+
+def test_a_narrow_table_leaves_out_chosen_columns_late_and_the_sorted_one_never() -> None:
+    ranks = gives_way(("success", "fail", "a", "b"), {"a": True, "success": True, "b": False}, "last")
+    assert sorted(ranks, key=lambda column: ranks[column]) == [
+        "flags",
+        "first b",
+        "first fail",
+        "reward curve",
+        "steps",
+        "first a",
+        "first success",
+        "return",
+    ]
+    assert list(gives_way(("success",), {}, "env"))[-2:] == ["first success", "return"]

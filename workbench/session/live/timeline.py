@@ -265,7 +265,7 @@ class Timeline:
 
 
 def _jump_text(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
-    what = "reset" if jump.restored is None else "going back"
+    what = "reset" if jump.restored is None else "jump"
     if jump.restored is not None and jump.restored.recording:
         what = "going live"
     if num_envs == 1:

@@ -44,6 +44,8 @@ MOST_ENTRIES = 6
 """Columns of bool entries at first; with more a row is wider than the view. The others can be chosen."""
 POINTS = 40
 """Points of a row's small curve."""
+REWARD_CURVE = "reward curve"
+"""The column that nothing is sorted by."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
 _GRAVITY = np.array([2, 3, 0, 1])
 """Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
@@ -72,6 +74,24 @@ def columns(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[st
         "flags",
         *(f"first {name}" for name in entry_names(rows, chosen)),
     )
+
+
+def gives_way(entries: tuple[str, ...], chosen: Mapping[str, bool], sorted_by: str) -> dict[str, int]:
+    """Rank of the columns that are left out where the panel is narrow, 0 first; those without a rank always stay.
+
+    Args:
+        entries: The bool entries of `evaluate` that have a column.
+        chosen: Those that a person switched on stay longer than the others.
+        sorted_by: This column stays.
+    """
+    added = [name for name in reversed(entries) if chosen.get(name)]
+    others = [name for name in reversed(entries) if name not in added]
+    more = [f"first {name}" for name in others if name not in ("success", "fail")]
+    fail, success = ([f"first {name}"] if name in others else [] for name in ("fail", "success"))
+    # What is flagged has a row of its own, too.
+    in_turn = ["flags", *more, "last", *fail, REWARD_CURVE, "steps", *(f"first {name}" for name in added)]
+    ranked = [column for column in (*in_turn, *success, "return") if column != sorted_by]
+    return {column: rank for rank, column in enumerate(ranked)}
 
 
 def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
@@ -139,9 +159,8 @@ def make_rows(
                 "steps": str(int(rows.steps[env])),
                 "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
                 "curve": curve,
-                "last": f"{'cut short' if last == 'running' else last} {rows.last.steps[env]}"
-                if had_one
-                else "",
+                "last": ("cut short" if last == "running" else last) if had_one else "",
+                "last_steps": str(int(rows.last.steps[env])),
                 "last_state": last,
                 "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
                 "flags": tuple(now + before),
@@ -277,24 +296,40 @@ class EnvPanel(PagePart[SessionView]):
             ],
         )
 
-    def _head(self, rows: EnvRows) -> list[dict[str, str]]:
-        def sortable(name: str, column: str, hint: str) -> dict[str, str]:
-            arrow = "" if column != self._column else " ↓" if self._descending else " ↑"
+    def _head(self, rows: EnvRows) -> list[dict[str, object]]:
+        names = entry_names(rows, self._chosen)
+        ranks = gives_way(names, self._chosen, self._column)
+
+        def sortable(name: str, column: str, hint: str) -> dict[str, object]:
+            arrow = (
+                ""
+                if column != self._column
+                else "\N{NO-BREAK SPACE}↓"
+                if self._descending
+                else "\N{NO-BREAK SPACE}↑"
+            )
             press = self._press(("sort", column), lambda: self._choose_column(column))
-            return {"name": name, "arrow": arrow, "press": press, "hint": hint}
+            return {
+                "name": name,
+                "arrow": arrow,
+                "press": press,
+                "hint": hint,
+                "gives_way": ranks.get(column),
+            }
 
         entries = [
-            sortable(name, f"first {name}", f"The first step at which {name} was true")
-            for name in entry_names(rows, self._chosen)
+            sortable(name, f"first {name}", f"{name}: the first step at which it was true") for name in names
         ]
-        plain = {
+        plain: dict[str, object] = {
             "name": "reward",
             "arrow": "",
             "press": "",
             "hint": "Over the episode; all rows on one scale",
+            "gives_way": ranks[REWARD_CURVE],
         }
         start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
-        return [*start, plain, *entries, *(sortable(name, name, HINTS[name]) for name in ("last", "flags"))]
+        end = [sortable(name, name, HINTS[name]) for name in ("last", "flags")]
+        return [*start, plain, *entries, *end]
 
     def _entries(self, rows: EnvRows) -> list[dict[str, object]]:
         shown = entry_names(rows, self._chosen)
