@@ -126,7 +126,7 @@ def body_names(checkup: Checkup) -> Iterator[Found | Note]:
             )
         elif taken[merge.name] > 1 or merge.name in built - merge.parts:
             yield Found(
-                f"{merge.name} is the name of {taken[merge.name] + (merge.name in built)} bodies. Name each its own.",
+                f"{merge.name} is the name of {taken[merge.name] + (merge.name in built)} bodies. Give each a name of its own.",
                 merge.place or checkup.places.hook("_load_scene"),
             )
 
