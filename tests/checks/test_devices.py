@@ -67,12 +67,23 @@ def test_other_loops_are_none_over_envs(checked: Checked) -> None:
 )
 def test_a_copy_to_the_host(line: str, written: str, checked: Checked) -> None:
     finding = the_finding(in_evaluate(checked, "device-copies", line))
-    assert written in finding.message and finding.code == line and " once in a step" in finding.message
+    assert written in finding.message and finding.code == line and " once in each step" in finding.message
+    assert finding.count == 1, "the message says how often"
 
 
 def test_a_copy_for_each_env(checked: Checked) -> None:
     line = "torch.tensor([d.item() for d in distance])"
-    assert "for each env in a step" in the_finding(in_evaluate(checked, "device-copies", line)).message
+    assert (
+        "once for each env in each step" in the_finding(in_evaluate(checked, "device-copies", line)).message
+    )
+
+
+def test_copies_that_only_some_steps_make(checked: Checked) -> None:
+    line = "[distance.cpu() for _ in range(self.seen // 3)]"
+    seen = GOAL, f"{GOAL}            self.seen = 0\n"
+    edits = seen, (AT, f"{AT}        self.seen += 1\n        {line}\n")
+    message = the_finding(checked("device-copies", *edits)).message
+    assert "2 times in 3 steps" in message
 
 
 def test_copies_of_host_tensors_and_at_resets_are_none(checked: Checked) -> None:

@@ -79,6 +79,17 @@ def test_success_that_is_true_for_a_single_step_at_a_time(checked: Checked) -> N
     assert checked("success-flickers", ('"success": (distance < GOAL_RADIUS)', lasts)).state == "kept"
 
 
+def test_why_nothing_is_said_of_success_that_comes_and_goes(checked: Checked) -> None:
+    edit = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005)'
+    for success, why in (
+        ("distance < 0", "no random episode succeeds"),
+        ("distance < 9", "where success is true, it is so from the reset on"),
+        ("(distance < 9) & (self.elapsed_steps == 50)", "success comes at the last step only"),
+    ):
+        result = checked("success-flickers", (edit, f'"success": {success}'))
+        assert (result.state, result.why) == ("skipped", why)
+
+
 def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:
     easy = '"success": (distance < 1) & (height.abs() < 0.005),'
     edit = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'

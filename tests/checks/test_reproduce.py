@@ -27,8 +27,25 @@ def test_unseeded_numbers(checked: Checked) -> None:
     finding = the_finding(
         checked("same-seed", (DRAWN, "torch.tensor(np.random.rand(b, 2)).float()"), seeds=4)
     )
-    assert finding.degree == "stop" and "np.random.rand is not seeded" in finding.message
+    assert finding.degree == "stop" and "np.random.rand() is not seeded" in finding.message
     assert "actors/cube" in finding.message and "np.random.rand" in finding.code
+
+
+def test_unseeded_numbers_that_a_helper_draws_are_told_at_their_call(checked: Checked) -> None:
+    helper = (
+        "def drawn(b):\n    low = 0\n    return torch.tensor(np.random.uniform(low, 1, (b, 2))).float()\n\n\n"
+    )
+    edits = (DRAWN, "drawn(b)"), ("@register_env(", f"{helper}@register_env(")
+    finding = the_finding(checked("same-seed", *edits, seeds=4))
+    assert finding.code.startswith("return torch.tensor(np.random.uniform") and finding.function == "drawn"
+    assert "np.random.uniform() is not seeded" in finding.message
+
+
+def test_numbers_that_another_hook_draws_are_told_there(checked: Checked) -> None:
+    noisy = '"cube_height": height,', '"cube_height": height + torch.rand(self.num_envs),'
+    finding = the_finding(checked("same-seed", noisy, seeds=4))
+    assert finding.function == "evaluate" and finding.code.startswith('"cube_height": height + torch.rand')
+    assert "torch.rand() is not seeded" in finding.message
 
 
 def test_a_value_that_only_the_first_reset_draws(checked: Checked) -> None:
@@ -70,6 +87,7 @@ def test_random_pushes_in_a_step(checked: Checked) -> None:
     noisy = '"cube_height": height,', '"cube_height": height + self.push,'
     finding = the_finding(checked("actions-replay", pushed, begun, noisy, seeds=4))
     assert "cube_height" in finding.message and finding.function == "_before_control_step"
+    assert finding.code == "self.push = torch.rand(self.num_envs)"
 
 
 def test_sizes_that_depend_on_the_number_of_envs(checked: Checked) -> None:

@@ -53,6 +53,27 @@ def test_a_body_at_the_origin(checked: Checked) -> None:
     assert finding.code == CUBE.strip() and finding.function == "_load_scene"
 
 
+FIXED = """fixed = self.scene.create_actor_builder()
+        fixed.add_box_collision(half_size=[0.01] * 3, pose=sapien.Pose(p=[{x}, 0, 0.02]))
+        fixed.{build}(name="fixed")"""
+
+
+def test_a_body_that_stays_at_the_origin_needs_no_pose(checked: Checked) -> None:
+    for build in ("build_static", "build_kinematic"):
+        away = added(FIXED.format(x=0.4, build=build))
+        for rule in ("initial-pose", "overlap-at-load"):
+            assert checked(rule, away, seeds=4).state == "kept"
+
+
+def test_a_body_at_the_origin_that_is_inside_another_is_told(checked: Checked) -> None:
+    kinematic = added(FIXED.format(x=0, build="build_kinematic"))
+    finding = the_finding(checked("initial-pose", kinematic, seeds=4))
+    assert finding.code.startswith("fixed.build_kinematic")
+    static = added(FIXED.format(x=0, build="build_static"))
+    assert checked("initial-pose", static, seeds=4).state == "kept"
+    assert "cube and fixed are built" in the_finding(checked("overlap-at-load", static, seeds=4)).message
+
+
 def test_a_mark_without_collision_may_be_built_anywhere(checked: Checked) -> None:
     goal_at = "builder.initial_pose = sapien.Pose(p=[0.2, 0, GOAL_HEIGHT])"
     assert checked("initial-pose", (goal_at, ""), seeds=4).state == "kept"

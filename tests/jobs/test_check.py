@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mani_skill.utils import assets
 
@@ -15,6 +16,7 @@ from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
 from workbench.jobs.check import CheckOptions, CheckReport, check, merged
 from workbench.jobs.pool import Processes
+from workbench.jobs.record import RecordOptions, record
 from workbench.jobs.task import TaskOptions
 
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
@@ -22,6 +24,11 @@ AT_ONCE = '"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)'
 LOSES_ROWS = "b = len(env_idx)\n", "b = len(env_idx)\n            self.drawn = torch.rand((b, 2))\n"
 RAISES = '"cube_height": height,', '"cube_height": height / self.gone,'
 PLAIN = {"render_backend": "none"}
+TURNED = (
+    '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),',
+    '"success": self.agent.robot.qpos[:, 0] > 0.6,',
+)
+"""No random action turns the first joint so far; the largest do it in some twenty steps."""
 
 
 def task_of(folder: Path, *edits: tuple[str, str]) -> str:
@@ -167,3 +174,80 @@ def test_what_several_processes_say_of_one_rule_becomes_one_result() -> None:
     assert one == RuleResult("runs", "broken", (again, other), notes=("a", "b"), seconds=1.5)
     undecided = [RuleResult("runs", "kept"), RuleResult("runs", "failed", why="it raised")]
     assert merged(undecided).state == "failed" and merged(undecided).why == "it raised"
+
+
+# --- who acts beside random actions ----------------------------------------------------------------------
+
+
+def turns(steps: int) -> np.ndarray:
+    """(steps, 8) that turn the first joint as fast as it goes."""
+    actions = np.zeros((steps, 8), np.float32)
+    actions[:, 0] = 1
+    return actions
+
+
+def notes(report: CheckReport) -> dict[str, tuple[str, ...]]:
+    return {result.rule: result.notes for result in report.results}
+
+
+def test_the_actions_of_a_file_reach_what_random_ones_do_not(tmp_path: Path) -> None:
+    """One array is tried from each seed; of several each from its own, and no more than there are seeds."""
+    task = task_of(tmp_path, TURNED)
+    np.save(tmp_path / "one.npy", turns(20))
+    np.savez(tmp_path / "two.npz", turns(20), turns(3))
+    for name, reached in (("one.npy", "4 of 4"), ("two.npz", "1 of 2")):
+        what = replace(options(task, "success-stays-possible"), actions=str(tmp_path / name))
+        assert notes(check(what))["success-stays-possible"] == (
+            "success in 0 of 4 random episodes",
+            f"success in {reached} given episodes",
+        )
+    np.savez(tmp_path / "many.npz", *[turns(20)] * 6)
+    what = replace(options(task, "success-stays-possible"), actions=str(tmp_path / "many.npz"))
+    assert "4 of 4 given" in notes(check(what))["success-stays-possible"][1]
+
+
+def test_a_recording_begins_where_it_was_recorded(tmp_path: Path, child_process: None) -> None:
+    """Its seed is not among those of the check, and its success is at its last step."""
+    task = task_of(tmp_path, TURNED)
+    np.save(tmp_path / "one.npy", turns(20))
+    made = RecordOptions(
+        task,
+        tmp_path / "made",
+        episodes=1,
+        actions=str(tmp_path / "one.npy"),
+        pictures=False,
+        options=TaskOptions(num_envs=1, seed=70, env_kwargs=PLAIN),
+    )
+    (written,) = record(made).written
+    assert written.success
+    what = replace(options(task, "success-stays-possible"), actions=str(written.path.with_suffix(".h5")))
+    assert notes(check(what))["success-stays-possible"][1] == "success in 1 of 1 given episode"
+
+
+def test_what_is_wrong_in_given_episodes_alone_is_found(tmp_path: Path) -> None:
+    fails = '"fail": height < -0.1,', '"fail": self.agent.robot.qpos[:, 0] > 0.5,'
+    task = task_of(tmp_path, TURNED, fails)
+    np.save(tmp_path / "one.npy", turns(20))
+    assert states(check(options(task, "success-and-fail")))["success-and-fail"] == "kept"
+    what = replace(options(task, "success-and-fail"), actions=str(tmp_path / "one.npy"))
+    (finding,) = check(what).findings
+    assert "in 4 of 4 given episodes" in finding.message
+
+
+def test_actions_of_another_robot_leave_the_rules_of_success_undecided_and_blame_no_line(
+    tmp_path: Path,
+) -> None:
+    np.save(tmp_path / "wide.npy", np.zeros((5, 9), np.float32))
+    task = task_of(tmp_path)
+    what = replace(options(task, "success-stays-possible", "runs"), actions=str(tmp_path / "wide.npy"))
+    report = check(what)
+    assert states(report) == {"runs": "kept", "success-stays-possible": "failed"}
+    assert "9 dimensions" in report.of_state("failed")[0].why and report.fails("stop")
+
+
+def test_a_policy_that_cannot_be_imported_ends_the_check_at_its_line(tmp_path: Path) -> None:
+    (tmp_path / "policies.py").write_text("import nothing_of_this_name\n")
+    what = replace(options(task_of(tmp_path), "runs"), actions=f"{tmp_path / 'policies.py'}:act")
+    with pytest.raises(TaskError, match="policies.py:1: ModuleNotFoundError") as raised:
+        check(what)
+    assert raised.value.problem.stage == "policy"

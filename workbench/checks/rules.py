@@ -21,7 +21,7 @@ _TABLE = (
         "versioned-id",
         "warn",
         "The registered id ends in a version (-v1).",
-        "A later change of the task cannot be told from the earlier one in results.",
+        "Results from before and after a change of the task cannot be told apart.",
         "class",
     ),
     Rule(
@@ -84,7 +84,7 @@ _TABLE = (
         "undeclared-assets",
         "warn",
         "Assets that need a download are named in asset_download_ids.",
-        "ManiSkill asks for the download at a prompt, where a cluster has none, or fails to find the files.",
+        "ManiSkill asks for the download at a prompt, which a cluster does not have, or does not find the files.",
         "class",
     ),
     # --- _load_agent, _load_scene --------------------------------------------------------------------------
@@ -119,7 +119,7 @@ _TABLE = (
     Rule(
         "body-names",
         "warn",
-        "Bodies have names, each its own.",
+        "Each body has a name of its own.",
         "The second that is merged under a name takes the place of the first, in the scene and in the state.",
         "_load_scene",
     ),
@@ -162,7 +162,7 @@ _TABLE = (
         "reconfigures",
         "warn",
         "A scene that is built at random is rebuilt now and then (reconfiguration_freq), at one env at each reset.",
-        "One env trains on the same objects for ever.",
+        "A single env trains on the same objects forever.",
         "_load_scene",
     ),
     Rule(
@@ -207,7 +207,7 @@ _TABLE = (
         "outside-reach",
         "warn",
         "What the robot is to touch lies within its reach.",
-        "Part of the episodes cannot be solved by anybody.",
+        "Some episodes cannot be solved.",
     ),
     Rule(
         "unit-quaternion",
@@ -361,7 +361,7 @@ _TABLE = (
         "observation-constant",
         "warn",
         "Numbers of an observation differ between episodes or steps.",
-        "They carry nothing, and normalisers divide by their zero variance.",
+        "They carry no information, and normalisers divide by their zero variance.",
         "_get_obs_extra",
     ),
     Rule(
@@ -433,14 +433,14 @@ _TABLE = (
         "device-copies",
         "warn",
         "Hooks that run at every step leave tensors on their device (.cpu(), .item(), float(tensor), if tensor:).",
-        "Each is a stop of the GPU, every step.",
+        "The GPU has to stop for each of them, in every step.",
         "evaluate",
     ),
     Rule(
         "foreign-device",
         "warn",
         "Tensors are made on self.device (with torch.device(self.device), or device=self.device).",
-        "On the GPU: 'Expected all tensors to be on the same device'.",
+        "A GPU raises 'Expected all tensors to be on the same device'.",
         "_initialize_episode",
     ),
 )

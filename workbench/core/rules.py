@@ -106,14 +106,14 @@ _TABLE = (
         "behind-the-tensors",
         "warn",
         "State is set through ManiSkill's objects, not through SAPIEN's.",
-        "Nothing: the GPU's simulation does not look there.",
+        "Nothing happens: the GPU's simulation does not look there.",
         "step",
     ),
     Rule(
         "evaluate-rows",
         "stop",
         "evaluate() returns a row for each env.",
-        "It is broadcast over the envs, or fails far away.",
+        "It is broadcast over the envs, or an error comes up somewhere else.",
         "evaluate",
     ),
     Rule(
@@ -127,7 +127,7 @@ _TABLE = (
         "observation-rows",
         "warn",
         "Observations have a row for each env.",
-        "They are broadcast over the envs, or fail far away.",
+        "They are broadcast over the envs, or an error comes up somewhere else.",
         "_get_obs_extra",
     ),
 )

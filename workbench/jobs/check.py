@@ -291,8 +291,7 @@ def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
 
     here = CurrentFolder()  # the task may change it
     with here.again(), ExitStack() as stack:
-        given = what.options.env_kwargs.get("render_backend", "found") or "none"
-        if given != "none" and (renderer := find_renderer()) is not None:
+        if "render_backend" not in what.options.env_kwargs and (renderer := find_renderer()) is not None:
             # SAPIEN refuses it while a material of a build that failed is alive.
             keep_render_device(renderer.render_backend)
         runs, _ = find_actions(what.actions, what.task)

@@ -46,6 +46,17 @@ def test_what_was_seen_while_playing_says_how_often_and_since_when_and_is_no_sec
     assert len(both.rows) == 1 and both.rows[0].played
 
 
+def test_an_outlier_that_both_saw_is_one_finding_at_its_line() -> None:
+    exact, at_hook = finding("entries-finite", line=30), finding("entries-finite", line=24)
+    of_check = ChecksView("done", results=(RuleResult("entries-finite", "broken", (exact,)),))
+    (card,) = cards(of_check, [at_hook])
+    (row,) = card.rows
+    assert row.finding == exact and row.played.endswith("first at step 3: a message")
+    before = ChecksView("checking", before=(exact,))
+    (card,) = cards(before, [at_hook])
+    assert [row.finding for row in card.rows] == [at_hook] and not card.old
+
+
 def test_a_rule_that_is_broken_while_playing_is_not_counted_as_kept() -> None:
     kept = ChecksView("done", results=(RuleResult("not-applied", "kept"), RuleResult("entry-name", "kept")))
     assert summary(kept, cards(kept, [PLAYED])) == "1 warn, 1 kept"

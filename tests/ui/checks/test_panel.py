@@ -99,6 +99,22 @@ def test_it_says_what_a_check_is_before_the_first(shown: Shown) -> None:
     assert "Checks" in shown.panels.folders()
 
 
+def test_a_comment_that_silences_nothing_is_listed_with_its_line(shown: Shown) -> None:
+    text = (
+        "x = 1  # workbench: off[reward-changes] <b>long</b> ago\ny = 2  # workbench: off[reward-change] so\n"
+    )
+    task = running(4).task
+    assert task is not None
+    task = replace(task, source={"/home/me/push.py": text})
+    shown.draw(replace(DONE, state="checking"), task=task)
+    html = shown.panels.html("wb-check-comment")
+    assert "no rule is called reward-change (did you mean reward-changes?)" in html and "push.py:2" in html
+    assert "silenced nothing" not in html, "its rule may not be checked yet"
+    shown.draw(DONE, task=task)
+    html = shown.panels.html("wb-check-comment")
+    assert "off[reward-changes] silenced nothing in this check" in html and "push.py:1" in html
+
+
 def test_a_finding_has_rule_degree_line_code_and_message_escaped_and_the_tab_counts_it(shown: Shown) -> None:
     shown.draw(DONE)
     text = shown.panels.html("wb-checks")

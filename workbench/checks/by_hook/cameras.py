@@ -52,7 +52,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
             uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
     if not in_view:
-        raise CannotCheck("it has no objects beside the robot and the scenery")
+        raise CannotCheck("it has no objects besides the robot and the scenery")
     covered: list[str] = []
     for name, of_cameras in in_view.items():
         missed = ~np.any(of_cameras, axis=0)

@@ -42,15 +42,26 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     """Over a few steps."""
     uses = checkup.tensor_uses
     for place, count in uses.copies.items():
-        a_step = count / uses.steps
-        written = uses.written[place]
-        times = "for each env" if a_step >= NUM_ENVS else "once" if a_step <= 1 else f"{a_step:.3g} times"
         yield Found(
-            f"{place[2]}() copies a tensor to the host {times} in a step ({written}): a GPU stops there each time. "
-            "Stay in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for rows.",
+            f"{place[2]}() copies a tensor to the host {_how_often(count, uses.steps)} ({uses.written[place]}): a GPU has to "
+            "wait each time. Stay in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for "
+            "rows.",
             place,
-            count,
         )
+
+
+def _how_often(count: int, steps: int) -> str:
+    """``once in each step``, ``2 times for each env in each step``; ``4 times in 3 steps`` where they differ."""
+    if count % steps:
+        return f"{_times(count)} in {steps} steps"
+    a_step = count // steps
+    if a_step % NUM_ENVS == 0:
+        return f"{_times(a_step // NUM_ENVS)} for each env in each step"
+    return f"{_times(a_step)} in each step"
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:

@@ -169,7 +169,7 @@ def robot_holds(checkup: Checkup) -> Iterator[Found | Note]:
     driven = {joint.name for part in checkup.task.parts for joint in part.controller.joints}
     qpos, robots = checkup.still.qpos, _robots(checkup)
     if qpos is None:
-        raise CannotCheck("its robots have other joints in each env")
+        raise CannotCheck("its robots have different joints in each env")
     column = 0
     for owner, articulation in joints_of_scene(env):
         for joint in articulation.active_joints:
@@ -305,7 +305,7 @@ def bodies_stay(checkup: Checkup) -> Iterator[Found | Note]:
     for every in of_owner.values():
         first, seeds = every[0], sorted({seen.seed for seen in every})
         yield Found(
-            f"{first.reason} at step {first.step} of seed {first.seed}; so or otherwise it leaves the scene in "
+            f"{first.reason} at step {first.step} of seed {first.seed}; in this way or another it leaves the scene in "
             f"{of(len(seeds), len(rollouts.seeds), 'random episode')} (seed {listed(seeds)}). Let nothing overlap and "
             "nothing be thrown, or end an episode without it: return `fail` from evaluate().",
             _where_placed(checkup, first.body),

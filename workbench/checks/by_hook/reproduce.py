@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +14,8 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.builds import shapes_of_env
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, raised, read_obs
-from workbench.core.broken_rule import Place
+from workbench.checks.evidence.random_calls import first_draw, global_draw, torch_draw
+from workbench.checks.evidence.step_profile import EVERY_STEP
 from workbench.core.capture.state_columns import env_states, flat_names, split_flat
 from workbench.core.env.actions import random_action
 from workbench.core.env.cpu_scene import BatchedCpuMixin
@@ -31,6 +31,9 @@ SAME = 1e-4
 """Largest difference of two numbers that are equal: poses come back rounded."""
 RESTORED = 1e-3
 """The same after a state dict, whose link poses are computed from joints again; of larger numbers, relative."""
+_RESET_HOOKS = ("_initialize_episode", "reset")
+_RESULT_HOOKS = ("evaluate", "_get_obs_extra", "_get_obs_agent", "get_info", "get_obs")
+"""They give what a reset returns."""
 Numbers = dict[str, NDArray[np.float64]]
 """(N, ...) by name."""
 
@@ -68,7 +71,10 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
         again = _seen(task, checkup.reset(task, seeds))
     differing = _differing(first, again, SAME)
     if differing:
-        place, called = _random_call(checkup)
+        drawn = first_draw(checkup.places, global_draw, *_RESET_HOOKS, *_RESULT_HOOKS)
+        # Within the reset torch is seeded, and what comes of its result is asked for after it.
+        drawn = drawn or first_draw(checkup.places, torch_draw, *_RESULT_HOOKS)
+        place, called = drawn or (checkup.places.hook("_initialize_episode"), "")
         yield Found(
             f"{_named(differing)} after two resets with the same seeds. "
             + (
@@ -77,7 +83,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
                 else "Set everything in a reset, and draw"
             )
             + " with torch.rand in _initialize_episode, or from self._batched_episode_rng.",
-            place or checkup.places.hook("_initialize_episode"),
+            place,
             len(differing),
         )
 
@@ -147,10 +153,21 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
             continue
         if step == 0:
             raise CannotCheck("the same seed gives another start")
+        drawn = next(
+            (
+                found
+                for draws in (global_draw, torch_draw)
+                if (found := first_draw(checkup.places, draws, *EVERY_STEP)) is not None
+            ),
+            (
+                checkup.places.hook("_before_control_step", "_after_control_step", "evaluate"),
+                "what is drawn in a step",
+            ),
+        )
         yield Found(
             f"{_named(differing)} after {step} {'step' if step == 1 else 'steps'} of the same actions from the same seeds. "
-            "What is drawn in a step must come from self._batched_episode_rng, or be drawn in the reset.",
-            checkup.places.hook("_before_control_step", "_after_control_step", "evaluate"),
+            f"No reset seeds {drawn[1]}: draw from self._batched_episode_rng, or in the reset.",
+            drawn[0],
         )
         return
 
@@ -245,17 +262,6 @@ def _copied(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _copied(item) for key, item in value.items()}
     return value.clone() if isinstance(value, torch.Tensor) else value
-
-
-def _random_call(checkup: Checkup) -> tuple[Place | None, str]:
-    """The first call of numpy's or Python's global generator, or of a new one, in the author's hooks of a reset."""
-    for module, function in checkup.places.functions("_initialize_episode", "reset"):
-        for node in ast.walk(function):
-            if isinstance(node, ast.Call):
-                called = ast.unparse(node.func)
-                if called.startswith(("np.random.", "numpy.random.", "random.")):
-                    return module.place(node, function.name), called
-    return None, ""
 
 
 CHECKS: Mapping[str, Check] = {

@@ -111,7 +111,7 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     """Both hooks, called on the same odd states."""
     rewards = checkup.look(odd_states).reward
     if not DENSE_HOOKS.keys() <= rewards.keys():
-        raise CannotCheck("it has not both a dense and a normalized dense reward")
+        raise CannotCheck("it lacks a dense or a normalized dense reward")
     dense, normalized = (np.concatenate(rewards[mode]) for mode in DENSE_HOOKS)
     finite = np.isfinite(dense) & np.isfinite(normalized)
     size = float(np.abs(dense[finite]).max(initial=0))

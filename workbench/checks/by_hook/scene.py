@@ -40,10 +40,10 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of what was built: bodies that collide. Others cannot hurt."""
+    """Of what was built: bodies that collide and are somewhere else later, or inside something. Others cannot hurt."""
     unposed: dict[Place | None, list[str]] = {}
     for each in _own(checkup):
-        if each.quaternion is None and each.collision:
+        if _is_unposed(checkup, each) and each.collision:
             unposed.setdefault(each.place, []).append(each.name)
     for place, names in unposed.items():
         yield Found(
@@ -54,11 +54,25 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+def _is_unposed(checkup: Checkup, each: Built) -> bool:
+    """Whether it should have an initial pose and has none: a static body stays at the origin, and a kinematic one harms only
+    what it is inside of."""
+    if each.quaternion is not None or each.kind == "static":
+        return False
+    return each.kind != "kinematic" or each.name in _inside_others(checkup)
+
+
+def _inside_others(checkup: Checkup) -> set[str]:
+    """Names of the bodies that are built inside others, and of the parts of what they were merged to."""
+    names = {body.split("/", 1)[0] for overlap in checkup.alone.overlaps for body in overlap.bodies}
+    return names.union(*(merge.parts for merge in _merges(checkup) if merge.name in names))
+
+
 def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     """With one env, all bodies where they are built and all joints at zero."""
     builds = _builds(checkup)
     # Those have a rule of their own.
-    unposed = {each.name for each in builds if each.quaternion is None}
+    unposed = {each.name for each in builds if _is_unposed(checkup, each)}
     unposed |= {str(merge.name) for merge in _merges(checkup) if not unposed.isdisjoint(merge.parts)}
     places = {each.name: each.place for each in builds}
     for overlap in checkup.alone.overlaps:
@@ -112,7 +126,7 @@ def body_names(checkup: Checkup) -> Iterator[Found | Note]:
             )
         elif taken[merge.name] > 1 or merge.name in built - merge.parts:
             yield Found(
-                f"{merge.name} is the name of {taken[merge.name] + (merge.name in built)} bodies. Name each its own.",
+                f"{merge.name} is the name of {taken[merge.name] + (merge.name in built)} bodies. Give each a name of its own.",
                 merge.place or checkup.places.hook("_load_scene"),
             )
 

@@ -19,6 +19,7 @@ from workbench.checks.by_hook.devices import EVERY_STEP
 from workbench.checks.by_hook.reward import REWARD_HOOKS
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.places import Module
+from workbench.checks.evidence.random_calls import global_draw
 from workbench.core.broken_rule import Place
 from workbench.core.env.assets import robots_of
 
@@ -28,9 +29,6 @@ HOOKS = tuple(
 AT_RESETS = ("_initialize_episode", "reset", *EVERY_STEP)
 """Hooks that run after the GPU's simulation has begun."""
 _BUILDERS = {"create_actor_builder": ActorBuilder, "create_articulation_builder": ArticulationBuilder}
-_SEEDED = {"RandomState", "default_rng", "Generator", "SeedSequence", "PCG64", "Philox", "MT19937", "Random"}
-"""They are random of their own accord only without an argument."""
-_NO_DRAW = {"seed", "get_state", "set_state", "getstate", "setstate"}
 _GPU_CALLS = {"_gpu_apply_all", "_gpu_fetch_all"}
 _STATE = re.compile(r"(get_|set_)?(\w+_)?(pose|qpos|qvel|velocity|global_pose)$")
 _GUARDS = {
@@ -177,7 +175,7 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
     at_resets = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
     for module, function in checkup.places.reached_from(*HOOKS):
         for node in ast.walk(function):
-            drawn = _drawn(node, module)
+            drawn = global_draw(node, module)
             if drawn is None:
                 continue
             write = (
@@ -186,7 +184,7 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
                 else "self._batched_episode_rng, which has a generator for each env's seed"
             )
             yield Found(
-                f"{drawn} is seeded by nobody: the same seed gives another episode. Draw from {write}.",
+                f"no reset seeds {drawn}: the same seed gives another episode each time. Draw from {write}.",
                 module.place(node, function.name),
             )
 
@@ -331,41 +329,6 @@ def _names_of(checkup: Checkup, cls: type) -> set[str]:
             if isinstance(code, CodeType) and code.co_filename not in own:
                 names.update(code.co_names)
     return names
-
-
-def _drawn(node: ast.AST, module: Module) -> str | None:
-    """``np.random.rand()`` if the node is such a call."""
-    if not isinstance(node, ast.Call):
-        return None
-    written = ast.unparse(node.func)
-    first, *rest = written.split(".")
-    full = ".".join([_imports(module).get(first, first), *rest])
-    for owner in ("numpy.random.", "random."):
-        name = full.removeprefix(owner)
-        if name == full or first not in _imports(module):
-            continue
-        top = name.split(".")[0]
-        if top in _NO_DRAW or "(" in top or (top in _SEEDED and (node.args or node.keywords)):
-            return None
-        return f"{written}()"
-    if full == "scipy.spatial.transform.Rotation.random" and len(node.args) < 2 and not node.keywords:
-        return f"{written}()"
-    return None
-
-
-def _imports(module: Module) -> dict[str, str]:
-    """``np`` to ``numpy``, ``uniform`` to ``random.uniform``."""
-    found: dict[str, str] = {}
-    for node in ast.walk(module.tree):
-        if isinstance(node, ast.Import):
-            for each in node.names:
-                found[each.asname or each.name.split(".")[0]] = (
-                    each.name if each.asname else each.name.split(".")[0]
-                )
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            for each in node.names:
-                found[each.asname or each.name] = f"{node.module}.{each.name}"
-    return found
 
 
 def _guarded(body: list[ast.stmt]) -> Iterator[ast.AST]:

@@ -27,6 +27,21 @@ class Module:
     def functions(self) -> tuple[ast.FunctionDef, ...]:
         return tuple(node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef))
 
+    @cached_property
+    def imports(self) -> dict[str, str]:
+        """``np`` to ``numpy``, ``uniform`` to ``random.uniform``."""
+        found: dict[str, str] = {}
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.Import):
+                for each in node.names:
+                    found[each.asname or each.name.split(".")[0]] = (
+                        each.name if each.asname else each.name.split(".")[0]
+                    )
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                for each in node.names:
+                    found[each.asname or each.name] = f"{node.module}.{each.name}"
+        return found
+
     def place(self, node: ast.AST, function: str = "") -> Place:
         line: int = getattr(node, "lineno", 1)
         inside = [f for f in self.functions if f.lineno <= line <= (f.end_lineno or f.lineno)]

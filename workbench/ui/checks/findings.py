@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from workbench.checks.results import RuleResult, counts
 from workbench.checks.rules import RULES
+from workbench.core.capture.outliers import OUTLIER_RULES
 from workbench.core.rules import DEGREES, Degree, Finding, Rule
 from workbench.session.checks.checks import ChecksView
 from workbench.ui.checks.rule_pages import RulePage, rule_page
 
+_Key = tuple[str, str | None, str, str]
+"""As `Finding.key`."""
 MOST_SHOWN = 5
 """Findings of one rule."""
 
@@ -57,17 +60,27 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
     """
     rows = {finding.key: Row(finding) for finding in checks.findings}
     for finding in played:
-        known = rows.get(finding.key)
-        rows[finding.key] = Row(finding if known is None else known.finding, _played(finding))
+        key = _same(finding, rows)
+        known = rows.get(key)
+        told = _played(finding) if key == finding.key else f"{_played(finding)}: {finding.message}"
+        rows[key] = Row(finding if known is None else known.finding, told)
     for finding in checks.before:
         # Rules of GPU simulation are checked last, and seen while playing at once.
-        rows.setdefault(finding.key, Row(finding, old=True))
+        rows.setdefault(_same(finding, rows), Row(finding, old=True))
     together: dict[str, list[Row]] = {}
     for row in rows.values():
         if row.finding.rule in RULES:
             together.setdefault(row.finding.rule, []).append(row)
     found = [Card(RULES[rule], _worst(row.finding for row in of), tuple(of)) for rule, of in together.items()]
     return sorted(found, key=lambda card: (card.old, DEGREES.index(card.degree)))
+
+
+def _same(finding: Finding, rows: Mapping[_Key, Row]) -> _Key:
+    """The key of the row that tells the same: an outlier is seen at its hook while playing, and at its line by the checks."""
+    if finding.key in rows or finding.rule not in OUTLIER_RULES:
+        return finding.key
+    told = (key for key, row in rows.items() if row.finding.rule == finding.rule and not row.old)
+    return next(told, finding.key)
 
 
 def count(shown: Iterable[Card]) -> int:

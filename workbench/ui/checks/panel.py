@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import viser
 
+from workbench.checks.comments import Comment, comments_without_effect
 from workbench.checks.rules import RULES
 from workbench.machine.kept_choices import keep_check_after_save
 from workbench.session.checks.checks import RUNNING, ChecksView
@@ -76,8 +77,9 @@ class ChecksPanel(PagePart[SessionView]):
         self._now.visible = checks.state not in RUNNING and view.task is not None
         self._after_save.show(checks.after_each_save)
         more = 0 if view.rules is None else view.rules.more
-        self._list.visible = bool(found or checks.results)
-        self._list.content = list_html(checks, found, more, self._open, self._press, self._link)
+        comments = _comments(view)
+        self._list.visible = bool(found or checks.results or comments)
+        self._list.content = list_html(checks, found, more, self._open, self._press, self._link, comments)
 
     def _press(self, key: str) -> str:
         """The id of the button that folds a part out and in."""
@@ -142,6 +144,15 @@ def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) 
     return render("checks_status", checks=checks, told=summary(checks, found), link=link)
 
 
+def _comments(view: SessionView) -> list[Comment]:
+    """The comments that silence nothing; whether one is needed is known when all rules are checked."""
+    task, checks = view.task, view.checks
+    if task is None:
+        return []
+    results = checks.results if checks.state == "done" else ()
+    return comments_without_effect(task.source, results, task.class_name, task.others)
+
+
 def list_html(
     checks: ChecksView,
     found: list[Card],
@@ -149,6 +160,7 @@ def list_html(
     opened: set[str],
     press: Callable[[str], str],
     link: LinkTo = no_links,
+    comments: Sequence[Comment] = (),
 ) -> str:
     """The findings, and the rules without one if that is folded out.
 
@@ -156,9 +168,12 @@ def list_html(
         more: breaches seen while playing at lines that are not listed.
         opened: what is folded out.
         press: the id of the button that folds a part.
+        comments: those that were to silence a rule and silence none.
     """
     known = {"found": found, "more": more, "opened": opened, "id_of": press, "link": link, "most": MOST_SHOWN}
     rest = without_finding(checks, found)
     kept = [result.rule for result in rest if result.state == "kept" and not result.notes]
     told = [result for result in rest if result.rule not in kept]
-    return render("checks", **known, rest=len(rest), told=told, kept=kept, REST=REST, RULES=RULES)
+    return render(
+        "checks", **known, rest=len(rest), told=told, kept=kept, comments=comments, REST=REST, RULES=RULES
+    )

@@ -1,0 +1,87 @@
+"""What playing loses while the Checks tab checks: python tests/benchmarks/play_beside_checks.py [--num-envs 16]
+
+A session with a worker on the example task plays at unlimited speed, without a page. Windows without checks and windows in
+which the background process checks all rules come in turns, in one run. Prints the control steps a second of both (median
+of the windows), their ratio, how long a whole check took beside the play, and how long alone.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.drive.session import TASKS, live_session, wait_until
+from workbench.session.checks.checks import RUNNING
+from workbench.session.live.session import Session
+
+
+@dataclass(frozen=True)
+class Options:
+    num_envs: int = 16
+    seconds: float = 4.0
+    """Of one window."""
+    windows: int = 5
+    """Of each kind."""
+    task: str = str(TASKS / "push_cube.py")
+
+
+def steps_a_second(session: Session, seconds: float, checking: bool) -> float:
+    """Of all envs together as one step; while rules are checked, until the last is."""
+    first, begun = session.view().timeline.last, time.perf_counter()
+    while time.perf_counter() - begun < seconds:
+        if checking and session.checks.view.state != "checking":
+            break
+        time.sleep(0.02)
+    return (session.view().timeline.last - first) / (time.perf_counter() - begun)
+
+
+def begin_check(session: Session) -> None:
+    session.check_now()
+    wait_until(session, lambda view: view.checks.state != "loading", "the begin of the checks")
+
+
+def whole_check(session: Session) -> float:
+    """Seconds of all rules, once the version is loaded there."""
+    begin_check(session)
+    wait_until(session, lambda view: view.checks.state not in RUNNING, "the end of the checks")
+    return session.checks.view.seconds
+
+
+def main(options: Options) -> None:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        live_session(options.task, Path(folder), options.num_envs, draw=True) as session,
+    ):
+        session.checks.check_after_each_save(False)
+        session.change(speed=math.inf)
+        whole_check(session)  # shaders are compiled
+        alone = whole_check(session)
+        session.play()
+        without, beside = [], []
+        for _ in range(options.windows):
+            session.checks.stop()
+            without.append(steps_a_second(session, options.seconds, checking=False))
+            begin_check(session)
+            beside.append(steps_a_second(session, options.seconds, checking=True))
+        took = whole_check(session)
+        rules = len(session.checks.view.results)
+    one, other = statistics.median(without), statistics.median(beside)
+    print(
+        f"{Path(options.task).name}, {options.num_envs} envs, unlimited speed, {options.windows} windows of each kind"
+    )
+    print(
+        f"control steps a second: {one:.1f} without checks, {other:.1f} beside them: {other / one:.2f} of it"
+    )
+    print(f"{rules} rules: {took:.1f} s beside the play, {alone:.1f} s while it is paused")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,80 @@
+"""Calls in the author's source that draw random numbers."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+
+from workbench.checks.evidence.places import Module, Places
+from workbench.core.broken_rule import Place
+
+_SEEDED = {"RandomState", "default_rng", "Generator", "SeedSequence", "PCG64", "Philox", "MT19937", "Random"}
+"""They are random of their own accord only without an argument."""
+_NO_DRAW = {"seed", "get_state", "set_state", "getstate", "setstate"}
+_TORCH = {
+    "bernoulli", "multinomial", "normal", "poisson", "rand", "rand_like", "randint", "randint_like", "randn", "randn_like",
+    "randperm",
+}  # fmt: skip
+_IN_PLACE = {
+    "bernoulli_",
+    "cauchy_",
+    "exponential_",
+    "geometric_",
+    "log_normal_",
+    "normal_",
+    "random_",
+    "uniform_",
+}
+"""Methods of a tensor that draw."""
+_MANISKILL = "mani_skill.envs.utils.randomization."
+"""Draws from torch."""
+
+
+def global_draw(node: ast.AST, module: Module) -> str | None:
+    """``np.random.rand()`` if the node is a call that draws from numpy's or Python's global generator, or from a new one
+    without a seed; no reset seeds it."""
+    if not isinstance(node, ast.Call):
+        return None
+    written, full = _names(node, module)
+    first = written.split(".")[0]
+    for owner in ("numpy.random.", "random."):
+        name = full.removeprefix(owner)
+        if name == full or first not in module.imports:
+            continue
+        top = name.split(".")[0]
+        if top in _NO_DRAW or "(" in top or (top in _SEEDED and (node.args or node.keywords)):
+            return None
+        return f"{written}()"
+    if full == "scipy.spatial.transform.Rotation.random" and len(node.args) < 2 and not node.keywords:
+        return f"{written}()"
+    return None
+
+
+def torch_draw(node: ast.AST, module: Module) -> str | None:
+    """``torch.rand()`` if the node is a call that draws from torch's global generator, which is seeded within a reset
+    alone."""
+    if not isinstance(node, ast.Call) or any(keyword.arg == "generator" for keyword in node.keywords):
+        return None
+    written, full = _names(node, module)
+    of_torch = full.startswith("torch.") and full.removeprefix("torch.") in _TORCH
+    in_place = isinstance(node.func, ast.Attribute) and node.func.attr in _IN_PLACE
+    return f"{written}()" if of_torch or in_place or full.startswith(_MANISKILL) else None
+
+
+Draws = Callable[[ast.AST, Module], str | None]
+
+
+def first_draw(places: Places, draws: Draws, *hooks: str) -> tuple[Place, str] | None:
+    """The first such call in these hooks and in the author's functions that they name, and how it is written."""
+    for module, function in places.reached_from(*hooks):
+        for node in ast.walk(function):
+            if (written := draws(node, module)) is not None:
+                return module.place(node, function.name), written
+    return None
+
+
+def _names(node: ast.Call, module: Module) -> tuple[str, str]:
+    """The called name as it is written, and with what its first part was imported as."""
+    written = ast.unparse(node.func)
+    first, *rest = written.split(".")
+    return written, ".".join([module.imports.get(first, first), *rest])
