@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 import urllib.request
 import warnings
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ KINDS = {
     *(("sh", mark) for mark in ("", "slow", "fragment", "wrong")),
     ("json", ""),
     ("yaml", ""),
+    *(("diff", mark) for mark in ("", "slow")),
     ("text", ""),
 }
 RUN = ("", "slow", "wrong")
@@ -79,7 +81,7 @@ def test_a_fragment_is_well_formed(page: Path) -> None:
         elif fence.language == "yaml":
             assert yaml.safe_load(fence.text), fence.place
         elif fence.language == "python":
-            ast.parse(fence.text, fence.place)
+            ast.parse(textwrap.dedent(fence.text), fence.place)
         elif fence.language == "sh":
             for words in commands(fence):
                 well_formed(words, fence)
