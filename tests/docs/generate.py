@@ -160,7 +160,7 @@ def help_of(command: str) -> str:
 
 def rules_table() -> str:
     rows = [
-        f"| {rule.id} | {rule.degree} | {code(rule.asks)} | {code(rule.otherwise)} |"
+        f"| {linked(rule.id, 'rules')} | {rule.degree} | {code(rule.asks)} | {code(rule.otherwise)} |"
         for rule in RULES.values()
     ]
     return "\n".join(
@@ -193,17 +193,17 @@ def all_rules_page() -> str:
     return "\n".join(lines)
 
 
-def linked(rule: str) -> str:
+def linked(rule: str, folder: str = "../rules") -> str:
     page = DOCS / "rules" / f"{rule}.md"
-    return f"[{rule}](../rules/{rule}.md)" if page.is_file() else rule
+    return f"[{rule}]({folder}/{rule}.md)" if page.is_file() else rule
 
 
 def code(sentence: str) -> str:
     """Names of functions and attributes set as code."""
+    name = r"@?(?:\w+\.)*\w*_\w+(?:\.\w+)*(?:\([\w, ]*\))?|\w+\.\w+\(\)|\w+\(\w*_\w+\)|evaluate\(\)"
+    # What is code already stays.
     return re.sub(
-        r"(?<![`\w])((?:\w+\.)*\w*_\w+(?:\.\w+)*(?:\([\w, ]*\))?|\w+\.\w+\(\)|evaluate\(\))",
-        r"`\1`",
-        sentence,
+        rf"`[^`]*`|(?<!\w)({name})", lambda found: f"`{found[1]}`" if found[1] else found[0], sentence
     )
 
 

@@ -76,6 +76,16 @@ def test_every_link_leads_somewhere(topic: Topic) -> None:
         assert not inside or inside in page_of(to).ids, link
 
 
+def test_a_path_or_a_long_name_in_a_table_may_go_on_in_another_line() -> None:
+    """Else its column takes the room of the one that says what is wrong."""
+    topic = find_topic("checked_tasks")
+    assert topic is not None
+    made = html_of(topic)
+    assert "<td>dexterity/<wbr>rotate_<wbr>valve.py:150" in made
+    assert "<td>Rotate<wbr>Single<wbr>Object<wbr>In<wbr>Hand<wbr>Level0, 1</td>" in made
+    assert '<td class="sentence">The reset replaces <code>self.rotate_direction</code>' in made
+
+
 @pytest.mark.parametrize("topic", topics(), ids=lambda topic: topic.name)
 def test_every_picture_is_there_dark_and_light(topic: Topic) -> None:
     pictures = page_of(topic).pictures - {"/workbench/logo.svg"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import posixpath
 import re
 from collections.abc import Iterator
@@ -151,6 +152,12 @@ def html_of(topic: Topic) -> str:
     for opened, inline in zip(tokens, tokens[1:]):
         if opened.type == "heading_open":
             opened.attrSet("id", _anchor(inline.content))
+        elif opened.type == "td_open":
+            if inline.content.endswith("."):
+                opened.attrJoin("class", "sentence")
+            for part in inline.children or ():
+                if part.type == "text":
+                    part.type, part.content = "html_inline", _breakable(part.content)
     made = markdown.renderer.render(tokens, markdown.options, {})
     # In a frame of its own, so that a wide table scrolls and not the page.
     made = made.replace("<table>", '<div class="wide"><table>').replace("</table>", "</table></div>")
@@ -162,6 +169,12 @@ _PICTURE = (
     r'<picture><source media="(prefers-color-scheme: light)" srcset="\1light/\2">'
     r'<img src="\1dark/\2" alt="\3"></picture>'
 )
+
+
+def _breakable(text: str) -> str:
+    """The text as HTML in which a path or a long name may go on in another line: a table is as wide as its longest word."""
+    path = re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", html.escape(text, quote=False))
+    return re.sub(r"[A-Za-z0-9]{20,}", lambda name: re.sub(r"(?<=[a-z])(?=[A-Z])", "<wbr>", name[0]), path)
 
 
 def _all(tokens: Sequence[Token]) -> Iterator[Token]:
