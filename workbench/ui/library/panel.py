@@ -387,4 +387,6 @@ class LibraryPanel(PagePart[object]):
         broken = [row for row in rows if row.problem]
         if len(broken) < len(rows) or not rows:
             return ""
-        return f"{broken[0].problem} Copy it again from where it was recorded, or open it to see what is left."
+        return (
+            f"{broken[0].problem} Copy it again from where it was recorded, or open it to see what is left."
+        )
