@@ -258,3 +258,30 @@ def test_record_keeps_an_episode(calm: Desk) -> None:
 
 def test_nothing_went_wrong_in_the_console(desk: Desk) -> None:
     assert desk.errors == []
+
+
+def test_what_is_typed_right_after_the_keys_that_open_a_window_goes_into_it(calm: Desk) -> None:
+    page = calm.page
+    dark = page.locator("html[data-mantine-color-scheme=dark]")
+    expect(dark).to_have_count(1)
+    page.keyboard.press("Control+k")
+    page.keyboard.type("dark")
+    search = page.get_by_placeholder("Search commands...")
+    expect(search).to_have_value("dark")
+    expect(dark).to_have_count(1)
+    page.keyboard.press("Escape")
+    expect(search).to_have_count(0)
+    page.keyboard.press("Control+k")
+    page.keyboard.type("dark")
+    page.keyboard.press("Enter")
+    expect(dark).to_have_count(0)
+    expect(search).to_have_count(0)
+    calm.press("d")
+    expect(dark).to_have_count(1)
+    page.keyboard.press("Control+o")
+    page.keyboard.type("swing")
+    expect(page.get_by_role("dialog").get_by_role("textbox").first).to_have_value("swing")
+    page.keyboard.press("Escape")
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    expect(dark).to_have_count(1)

@@ -123,9 +123,12 @@ def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_i
     studio = session.studio
     new = replace(there(session, ("human", "render_camera")), position=(0.5, 0.2, 0.6))
     studio.file.plan(EditRequest("add", ("human", "side"), new))
-    assert planned(session).message.startswith("This adds side to")
+    plan = planned(session)
+    assert plan.message.startswith("This adds side to")
+    assert "drawing what it sees" in edit_html(replace(plan, picture=None, drawing=True), False)
     view = wait_until(session, said(lambda s: s.edit_state.picture is not None), "its picture")
     picture = view.studio.edit_state.picture
+    assert "drawing what it sees" not in edit_html(view.studio.edit_state, False)
     assert picture.rgb.shape == (new.height, new.width, 3) and picture.rgb.std() > 5
     assert [c.key[1] for c in view.studio.cameras] == ["base_camera", "render_camera"], "it is there already"
     studio.place(BASE, replace(there(session, BASE), fov=0.9))
@@ -150,18 +153,23 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     studio.file.plan(EditRequest("remove", BASE))
     planned(session)
     studio.file.drop_plan()
-    for wanted in (texts[1], texts[0]):
-        wait_until(
-            session, said(lambda s: s.edit_state.stage == "checked"), "the change that can be taken back"
-        )
-        studio.file.undo_write()
-        wait_until(
-            session,
-            said(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
-            "the file of before",
-        )
-        assert task_file.read_text() == wanted
-        studio.file.drop_plan()
+    wait_until(session, said(lambda s: s.edit_state.stage == "checked"), "the change that can be taken back")
+    studio.file.undo_write()
+    view = wait_until(
+        session, said(lambda s: "Before it: base_camera" in s.edit_state.message), "the change before it"
+    )
+    # It can be reverted at once.
+    assert view.studio.edit_state.stage == "checked"
+    assert view.studio.edit_state.message.startswith(f"Edit reverted in {task_file.name}.")
+    assert task_file.read_text() == texts[1]
+    studio.file.undo_write()
+    wait_until(
+        session,
+        said(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
+        "the file of before",
+    )
+    assert task_file.read_text() == texts[0]
+    studio.file.drop_plan()
     wait_until(session, said(lambda s: s.edit_state.stage == "none"), "nothing left")
     studio.back_to_file(BASE)
 

@@ -109,6 +109,8 @@ def test_a_row_is_found_by_all_of_its_words(made: Callable[..., Catalogue], tmp_
     (tmp_path / "work/push.py").write_text(f"@register_env('Shove-v1')\n{TASK}")
     (entry,) = listed(made())[Section.FOLDER]
     assert entry.matches([]) and entry.matches(["push", "shove"]) and not entry.matches(["push", "pull"])
+    # Letters within a word are found in its name alone.
+    assert entry.matches(["us"]) and not entry.matches(["hove"])
 
 
 def jpeg() -> bytes:

@@ -87,10 +87,10 @@ def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
     last = LastEpisode(np.zeros(6, np.int8), np.full(6, 13, np.int32), np.zeros(6), {2: (FELL,)})
     rows = rows_of(outliers={}, last=last)
     row = cells_of(rows, np.array([2]))[0]
-    assert (
-        row.flags == ("bodies-stay: cube dropped 0.90 m (previous episode, step 12)",)
-        and (row.last, row.last_steps) == ("cut short", "13")
-    )
+    assert row.flags == ("bodies-stay: cube dropped 0.90 m (previous episode, step 12)",) and (
+        row.last,
+        row.last_steps,
+    ) == ("cut short", "13")
     assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
 
 

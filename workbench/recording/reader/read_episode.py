@@ -99,7 +99,8 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             broken_files.append(_broken_file(there[".h5"], error, "its env states are missing"))
     if table is None and states is None and broken_files:
-        raise UnreadableRecording(" ".join(broken.sentence for broken in broken_files))
+        told = " ".join(broken.sentence for broken in broken_files)
+        raise UnreadableRecording(f"{told} Copy it again from where it was recorded.")
     if not_json is not None and table is not None:
         broken_files.append(
             _broken_file(there[".json"], not_json, "its tags, its note and the place of its task are missing")

@@ -93,9 +93,11 @@ class FileEdits:
             first, self._just_copied = self._just_copied, ""
             if before is not None and (before.what, before.key) != (request.what, request.key):
                 first = change_text(before, LEFT)
-            self.view = replace(edit_state, message=f"{first} {edit_state.message}".strip())
+            drawing = edit_state.stage == "planned" and request.what == "add"
+            message = f"{first} {edit_state.message}".strip()
+            self.view = replace(edit_state, message=message, drawing=drawing)
         self._notify()
-        if edit_state.stage == "planned" and request.what == "add" and request.settings is not None:
+        if drawing and request.settings is not None:
             self._draw_new(request, request.settings)
 
     def _draw_new(self, request: EditRequest, settings: CameraSettings) -> None:
@@ -108,16 +110,16 @@ class FileEdits:
             if self._stopped.is_set() or not self._last.running():
                 raise Stopped
 
+        picture = None
         try:
             picture = self._asker.ask(check, question)
         except Stopped:
-            return
+            pass
         except JobFailed as failure:
             self._cameras.problem = f"There is no picture of the new camera: {failure}."
-        else:
-            with self._cameras.lock:
-                if self.view.request is request:
-                    self.view = replace(self.view, picture=picture)
+        with self._cameras.lock:
+            if self.view.request is request:
+                self.view = replace(self.view, picture=picture, drawing=False)
         self._notify()
 
     def _run(self, texts: Mapping[str, str]) -> HookCameras:
@@ -231,14 +233,20 @@ class FileEdits:
                 if went_back
                 else ""
             )
-            self._set_state(f"Edit reverted in {edit.names}.{back}", "undone")
-        elif wrong := mismatch(request, infos, edit.settings):
+            message = f"Edit reverted in {edit.names}.{back}"
+            if self._done:
+                # The edit before it, which can be reverted next.
+                earlier = self._done[-1]
+                self.view = replace(earlier, message=f"{message} Before it: {earlier.message}")
+            else:
+                self._set_state(message, "undone")
+            return frozenset({request.key, request.result})
+        if wrong := mismatch(request, infos, edit.settings):
             more = "Revert the change, or look for what else in the task places this camera."
             self._set_state(f"{wrong} {more}", "mismatch")
         else:
             self._set_state(change_text(request, DONE, edit.names), "checked")
-        if self.view.stage != "undone":
-            self._done[-1:] = [self.view]
+        self._done[-1:] = [self.view]
         return frozenset({request.key, request.result})
 
     def _is_in(self, task: TaskDescription, edit: SourceEdit) -> bool:

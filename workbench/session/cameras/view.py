@@ -76,6 +76,8 @@ class EditState:
     """Refused because the file must not be edited, while a copy could be: see `FileEdits.copy_task`."""
     picture: Picture | None = None
     """Preview of a camera that is to be added, once it is drawn."""
+    drawing: bool = False
+    """The preview is being drawn."""
     loading: bool = False
     """The file has changed, and that version is not loaded yet."""
 

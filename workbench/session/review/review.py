@@ -226,7 +226,7 @@ class Review:
                 files.update(stamps)
                 problems += [broken.sentence for broken in episode.broken_files]
             except (OSError, UnreadableRecording) as error:
-                problems.append(f"{row.name}: {error}")
+                problems.append(f"{row.name} was not opened. {error}")
             except Exception as error:
                 # The file may hold anything. Without this the page would stay on "opening" without a reason.
                 log.exception("%s could not be opened.", row.name)

@@ -55,9 +55,9 @@ class Entry:
     """Stands where the picture would."""
 
     def matches(self, words: list[str]) -> bool:
-        """Whether it has all of these words, in lower case."""
-        text = f"{self.name} {self.about} {self.section.value}".lower()
-        return all(word in text for word in words)
+        """Whether its name has all of these words, in lower case, or a word of its other texts begins with them."""
+        name, others = self.name.lower(), f" {self.about} {self.section.value}".lower()
+        return all(word in name or f" {word}" in others for word in words)
 
 
 @dataclass(frozen=True)
@@ -249,6 +249,6 @@ def _shown(text: str) -> str:
 def _first_line(file: Path) -> str:
     """The first line of the docstring of an example."""
     try:
-        return (ast.get_docstring(ast.parse(file.read_bytes())) or "").partition("\n")[0]
+        return (ast.get_docstring(ast.parse(file.read_bytes())) or "").partition("\n")[0].replace("`", "")
     except (OSError, SyntaxError, ValueError):
         return ""

@@ -337,6 +337,6 @@ class Page:
             Command(
                 "Restart the worker", session.versions.restart_worker, "L", "shift", (RESTART, NEW_WORKER)
             ),
-            Command("Switch between dark and light", self._view_panel.toggle_dark, "D"),
+            Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
             *self._studio.commands(),
         ]

@@ -346,7 +346,7 @@ class ReviewPage:
             Command("Overlaid or side by side", self._panel.toggle_arrangement, "O"),
             Command("Frame the scene", self._in_3d.frame, "F"),
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
-            Command("Switch between dark and light", self._view_panel.toggle_dark, "D"),
+            Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
             Command("Rescore the selected recordings, or the open ones", self._rescore_chosen, "J"),
             Command("Continue live from here", self._panel.enter_recording, "G", buttons=(GO_LIVE,)),
         ]

@@ -97,12 +97,14 @@ def edit_html(edit_state: EditState, stale: bool, scroll_to: str = "") -> str:
     edit, planned = edit_state.edit, edit_state.stage == "planned"
     seen = edit_state.picture.rgb if planned and edit_state.picture is not None else None
     files = [] if edit is None or edit_state.stage == "undone" else edit.changes
+    settings = None if edit_state.request is None else edit_state.request.settings
     return render(
         "camera_writing",
         message="The camera has moved since: show the change again." if stale else edit_state.message,
         mood="warn" if stale else MOODS.get(edit_state.stage, "plain"),
         about=edit_state.request.about if planned and edit_state.request is not None else "",
         picture="" if seen is None else data_address(seen, PREVIEW),
+        drawing=settings if planned and edit_state.drawing else None,
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=edit_state.stage in IN_FILE,
         notes=() if edit is None or edit_state.stage == "undone" else edit.notes,

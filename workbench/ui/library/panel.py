@@ -76,6 +76,8 @@ class LibraryPanel(PagePart[object]):
                 MOST_OPEN,
                 "Open the selected recordings",
                 "enter",
+                # Of a damaged one it shows what can be read.
+                reads=False,
             ),
             Action(
                 "Tag",
@@ -375,7 +377,7 @@ class LibraryPanel(PagePart[object]):
             body = f"{action.label} takes at most {action.most} at once."
             tell_all(self._server, f"{len(ids)} are selected", body, seconds=8.0)
         elif action.reads and (why := self._why_unreadable(ids)):
-            tell_all(self._server, f"{action.label} needs files that can be read", why, "red")
+            tell_all(self._server, f"{action.label} needs a recording that is not damaged", why, "red")
         else:
             action.run(ids)
 
@@ -383,4 +385,8 @@ class LibraryPanel(PagePart[object]):
         """Why none of these can be read; empty if one can."""
         rows = [row for row in self._library.view().rows if row.id in ids]
         broken = [row for row in rows if row.problem]
-        return "" if len(broken) < len(rows) or not rows else f"{broken[0].name} {broken[0].problem}"
+        if len(broken) < len(rows) or not rows:
+            return ""
+        return (
+            f"{broken[0].problem} Copy it again from where it was recorded, or open it to see what is left."
+        )

@@ -32,6 +32,7 @@ SCRIPTS = (
     "no_eval.js",
     "needs_webgl.js",
     "let_in.js",
+    "typed_ahead.js",
     "typed_first.js",
     "pressed.js",
     "curve_clicks.js",
