@@ -35,6 +35,7 @@ POLICY = Path(__file__).parent / "pusher.py"
 CONTROL = ("--env", "control_mode=pd_ee_delta_pos")
 """What the policy is written for."""
 THEMES = ("dark", "light")
+MOST_EFFORT = {"jpg": {"optimize": True}, "webp": {"method": 6}}
 FRAME = 4.0
 """Seconds that a browser that draws in software may need for a frame of the 3-D view."""
 
@@ -83,7 +84,13 @@ class Desk:
             self.theme = theme
             time.sleep(1.0)
 
-    def shoot(self, name: str, take: Callable[[Page], Image.Image] | None = None) -> None:
+    def shoot(
+        self,
+        name: str,
+        take: Callable[[Page], Image.Image] | None = None,
+        kind: Literal["jpg", "webp"] = "jpg",
+        quality: int = 82,
+    ) -> None:
         """Write the picture of this name, dark and light."""
         for theme in THEMES:
             self.wear(theme)
@@ -91,9 +98,9 @@ class Desk:
             self.page.mouse.move(400, 10)
             time.sleep(FRAME)
             image = picture_of(self.page) if take is None else take(self.page)
-            path = OUT / theme / f"{name}.jpg"
+            path = OUT / theme / f"{name}.{kind}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            image.convert("RGB").save(path, quality=82, optimize=True)
+            image.convert("RGB").save(path, quality=quality, **MOST_EFFORT[kind])
             print(path, flush=True)
         self.wear("dark")
 

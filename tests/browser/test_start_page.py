@@ -14,6 +14,7 @@ import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import TASK, Opened, open_workbench, page_at
+from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.session.tasks.registered import LIST_FILE
 from workbench.ui.app.trust_dialog import ONCE
 
@@ -171,6 +172,32 @@ def test_options_are_applied_on_the_page_and_bad_ones_leave_the_envs(
         page.get_by_role("button", name="Discard").click()
         expect(page.locator(".wb-banner")).to_be_hidden(timeout=PATIENT)
         runs(page, "WorkbenchPushCube-v1", "3 envs")
+        assert errors == []
+
+
+def test_a_new_task_is_created_with_the_mouse_and_opens(
+    started: Opened, folder: Path, browser: Browser
+) -> None:
+    with page_at(browser, started.url) as (page, errors):
+        open_list(page)
+        page.get_by_text("New task", exact=True).click()
+        name = page.get_by_role("textbox", name="Name", exact=True)
+        page.get_by_role("combobox", name="Template").click()
+        expect(page.get_by_role("option")).to_have_text([f"{one.name}: {one.about}" for one in TEMPLATES])
+        page.get_by_role("option", name="locomotion").click()
+        create = page.get_by_role("button", name="Create", exact=True)
+        name.click()
+        page.keyboard.type("push")
+        create.click()
+        expect(page.get_by_text("There is a file push.py already")).to_be_visible()
+        name.click()
+        page.keyboard.press("Control+a")
+        page.keyboard.type("walk_far")
+        create.click()
+        runs(page, "WalkFar-v1")
+        expect(page.locator(".wb-status")).to_contain_text("ant")
+        text = (folder / "work/walk_far.py").read_text()
+        assert "class WalkFarEnv(BaseEnv)" in text and '@register_env("WalkFar-v1"' in text
         assert errors == []
 
 

@@ -20,7 +20,9 @@ def test_a_step_at_the_speed_earns_most_and_an_upright_one_never_costs(make: Mak
     torch.testing.assert_close(stands, runs)
     assert 0.2 < stands < 0.25
     assert (base.compute_dense_reward(None, wild, info) > 0).all()
-    torch.testing.assert_close(sum(info["reward_terms"].values()), base.compute_dense_reward(None, wild, info))
+    torch.testing.assert_close(
+        sum(info["reward_terms"].values()), base.compute_dense_reward(None, wild, info)
+    )
 
 
 def test_a_robot_on_its_back_has_failed_and_one_that_stands_has_not(make: Make) -> None:

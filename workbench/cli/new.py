@@ -31,6 +31,7 @@ def new_in_terminal(name: str, origin: str) -> int:
             origin = origin or _ask_template()
             name = _ask("Name of the task, such as stack_two", lambda typed: why_not_name(typed, folder))
         except EOFError:
+            out.print()  # the question's line has no end
             return refuse("Nothing was written.")
     try:
         made = write_new_task(name, origin or TEMPLATES[0].name, folder)
@@ -42,8 +43,11 @@ def new_in_terminal(name: str, origin: str) -> int:
 
 
 def _ask_template() -> str:
+    longest = max(len(template.name) for template in TEMPLATES)
     for number, template in enumerate(TEMPLATES, 1):
-        out.print(f"  {number}  [cyan]{template.name}[/]  {escape(template.about)}", soft_wrap=True)
+        out.print(
+            f"  {number}  [cyan]{template.name:<{longest}}[/]  {escape(template.about)}", soft_wrap=True
+        )
     numbers = [str(number) for number in range(1, len(TEMPLATES) + 1)]
     names = [template.name for template in TEMPLATES]
 
