@@ -1,64 +1,26 @@
-"""Candidate action sequences around a plan, and the plan that their returns make better: predictive sampling, MPPI, CEM."""
+"""Candidate actions around a plan, and the plan that their returns make of them: predictive sampling, MPPI, CEM."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import Literal, get_args
-
 import torch
 
-Method = Literal["mppi", "predictive", "cem"]
+from workbench.planning.options import PlanOptions
 
-
-@dataclass(frozen=True)
-class PlanOptions:
-    """How a plan is searched. The defaults solve most tabletop tasks; see ``web_assets/docs/solve.md``."""
-
-    method: Method = "mppi"
-    """``mppi``: the mean of all candidates, weighted by return (Williams et al., 2017). ``predictive``: the best candidate
-    (Howell et al., 2022, predictive sampling). ``cem``: the mean and spread of the best ones (Pinneri et al., 2020, iCEM)."""
-    rollouts: int = 64
-    """K, candidates a round; each is an env."""
-    horizon: float = 0.0
-    """Seconds that a plan looks ahead; 0 for half a second, and from 8 to 20 control steps."""
-    knots: int = 4
-    """Actions that a candidate consists of; between them it is interpolated."""
-    noise: float = 0.5
-    """Standard deviation of a candidate's knots, of half the range of each action dimension."""
-    temperature: float = 0.1
-    """Of MPPI, in standard deviations of the returns: the lower, the more the best candidates count."""
-    elites: float = 0.1
-    """Of CEM: the part of the candidates that make the next plan."""
-    rounds: int = 1
-    """Times that candidates are drawn and rolled out for a plan."""
-    every: int = 1
-    """Control steps that are taken before the next plan."""
-
-    def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise ValueError(f"method must be one of {', '.join(get_args(Method))}, not {self.method!r}")
-        for name, least in (("rollouts", 2), ("knots", 2), ("rounds", 1), ("every", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
-        for name in ("noise", "temperature", "elites"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
-        if not 0 <= self.horizon < math.inf:
-            raise ValueError(f"horizon is a time in seconds, 0 for the usual one, not {self.horizon}")
-
-    def steps(self, control_dt: float) -> int:
-        """H, control steps of the horizon."""
-        if self.horizon:
-            return max(2, round(self.horizon / control_dt))
-        return min(20, max(8, round(0.5 / control_dt)))
+_SMALL = 0.3
+"""Of the noise, for a third of the candidates: what is nearly right is not improved by chance alone."""
+_FLIPS = 0.3
+"""Of the knots of a dimension that switches, those that are drawn anew."""
+_KEPT = 2
+"""Best candidates of a round that are tried again in the next."""
+_LEAST_SPREAD = 0.2
+"""Of CEM, of the noise: a spread that has vanished never finds anything again."""
 
 
 class Sampler:
     """The plan of one env: knots of actions from -1 to 1, and candidates around them.
 
-    A knot is an action at a time of the horizon; the first is now, the last at its end. Between knots a dimension goes
-    along a straight line; one that switches (a gripper) stays as at the knot before.
+    A knot is an action at a time of the horizon: the first is now, the last at its end. Between knots a dimension goes along
+    a straight line; one that switches (a gripper) stays as at the knot before, since what is half closed holds nothing.
     """
 
     def __init__(
@@ -73,95 +35,94 @@ class Sampler:
         """
         self._options, self._steps, self._switches = options, steps, switches
         self._generator = torch.Generator().manual_seed(seed)
-        self._noise = torch.where(switches, 1.0, options.noise * scale)
-        self._spread = self._noise.expand(options.knots, len(switches)).clone()
+        self._noise = torch.where(switches, 1.0, options.noise * scale).expand(options.knots, -1)
+        self._spread = self._noise
         self._mean: torch.Tensor | None = None
         self._kept: torch.Tensor | None = None
-        times = torch.linspace(0, steps - 1, options.knots)
-        self._times = times
-        self._lines = _line_weights(torch.arange(steps, dtype=torch.float32), times)
-        self._steps_of_switches = _line_weights(torch.arange(steps, dtype=torch.float32), times, hold=True)
+        self._times = torch.linspace(0, steps - 1, options.knots)
+        self._weights = _weights(torch.arange(steps, dtype=torch.float32), self._times)
+
+    @property
+    def plan(self) -> torch.Tensor:
+        """(P, A) knots of the plan; there is one from the first `candidates` on."""
+        assert self._mean is not None
+        return self._mean
+
+    def draw_seed(self) -> int:
+        """A seed of this plan's own random numbers."""
+        return int(torch.randint(2**31, (1,), generator=self._generator))
 
     def candidates(self, hold: torch.Tensor) -> torch.Tensor:
-        """(K, P, A) knots: the plan itself, holding still, and the others around the plan.
+        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, and others around the plan.
 
         Args:
-            hold: (A,) the action that changes nothing.
+            hold: (A,) the action that changes nothing; the plan that an episode begins with.
         """
         if self._mean is None:
             self._mean = hold.expand(self._options.knots, -1).clone()
-        count = self._options.rollouts
-        drawn = torch.randn((count, *self._mean.shape), generator=self._generator)
-        # A third of them small: what is nearly right is not only improved by chance.
-        drawn[2::3] *= 0.3
-        # And a third one action throughout: what only long motions show is found by them.
-        drawn[3::3] = drawn[3::3, :1]
+        shape = (self._options.rollouts, *self._mean.shape)
+        drawn = torch.randn(shape, generator=self._generator)
+        flips = torch.rand(shape, generator=self._generator) < _FLIPS
+        # What only a long motion shows is found by a third of one action throughout.
+        drawn[0::3] = drawn[0::3, :1].clone()
+        drawn[2::3] *= _SMALL
         knots = self._mean + drawn * self._spread
-        flips = torch.rand((count, *self._mean.shape), generator=self._generator) < 0.3
-        side = torch.sign(drawn)
-        knots = torch.where(self._switches, torch.where(flips, side, self._mean), knots)
-        knots[0] = self._mean
-        knots[1] = hold
+        switched = torch.where(flips, torch.sign(drawn), self._mean)
+        knots = torch.where(self._switches, switched, knots)
+        knots[0], knots[1] = self._mean, hold
         if self._kept is not None:
             knots[2 : 2 + len(self._kept)] = self._kept
         return knots.clamp_(-1, 1)
 
     def sequences(self, knots: torch.Tensor) -> torch.Tensor:
         """(K, H, A) actions of (K, P, A) knots."""
-        lines = torch.einsum("hp,kpa->kha", self._lines, knots)
-        held = torch.einsum("hp,kpa->kha", self._steps_of_switches, knots)
-        return torch.where(self._switches, held, lines)
+        return self._between(knots, self._weights)
 
     def improve(self, knots: torch.Tensor, returns: torch.Tensor) -> None:
-        """Make the plan anew from the returns (K,) of candidates (K, P, A); one that is not finite counts as the worst."""
-        returns = torch.where(torch.isfinite(returns), returns, -torch.inf)
-        best = returns.argsort(descending=True, stable=True)
-        if not torch.isfinite(returns[best[0]]):
+        """Make the plan of the returns (K,) of candidates (K, P, A). One that is NaN or infinite counts as the worst."""
+        finite = torch.isfinite(returns)
+        if not finite.any():
             return
-        finite = returns[torch.isfinite(returns)]
+        returns = torch.where(finite, returns, -torch.inf)
+        # Stable: equal returns would else be in an order that depends on the machine.
+        best = returns.argsort(descending=True, stable=True)
         if self._options.method == "predictive":
             self._mean = knots[best[0]].clone()
         elif self._options.method == "cem":
-            elites = knots[best[: max(2, round(self._options.elites * len(knots)))]]
+            count = max(2, round(self._options.elites * len(knots)))
+            elites = knots[best[: min(count, int(finite.sum()))]]
             self._mean = elites.mean(0)
-            self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0), 0.2 * self._noise)
+            least = _LEAST_SPREAD * self._noise
+            self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0, correction=0), least)
         else:
-            spread = finite.std() if len(finite) > 1 else torch.ones(())
-            weights = torch.softmax((returns - finite.max()) / (self._options.temperature * spread + 1e-12), 0)
-            self._mean = torch.einsum("k,kpa->pa", weights, knots)
-        self._kept = knots[best[:2]].clone()
-
-    @property
-    def plan(self) -> torch.Tensor:
-        """(P, A) the knots of the plan."""
-        assert self._mean is not None
-        return self._mean
+            width = self._options.temperature * returns[finite].std(correction=0)
+            weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
+            self._mean = (weights[:, None, None] * knots).sum(0)
+        self._kept = knots[best[:_KEPT]].clone()
 
     def shift(self, steps: int) -> None:
         """Move the plan on by control steps that were taken: what was planned for then is at its beginning now."""
-        if self._mean is None:
-            return
-        moved = (self._times + steps).clamp(max=self._steps - 1)
-        lines = _line_weights(moved, self._times)
-        held = _line_weights(moved, self._times, hold=True)
-
-        def later(knots: torch.Tensor) -> torch.Tensor:
-            return torch.where(self._switches, held @ knots, lines @ knots)
-
-        self._mean = later(self._mean)
+        weights = _weights((self._times + steps).clamp(max=self._steps - 1), self._times)
+        if self._mean is not None:
+            self._mean = self._between(self._mean, weights)
         if self._kept is not None:
-            self._kept = later(self._kept)
-        if self._options.method == "cem":
-            self._spread = self._noise.expand_as(self._spread).clone()
+            self._kept = self._between(self._kept, weights)
+        self._spread = self._noise
+
+    def _between(self, knots: torch.Tensor, weights: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        lines, held = (torch.matmul(each, knots) for each in weights)
+        return torch.where(self._switches, held, lines)
 
 
-def _line_weights(at: torch.Tensor, times: torch.Tensor, hold: bool = False) -> torch.Tensor:
-    """(T, P) parts of each knot in the value at times (T,); with `hold` that of the knot before."""
+def _weights(at: torch.Tensor, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(T, P) parts of each knot in the value at times (T,): along straight lines, and as at the knot before."""
     after = torch.searchsorted(times, at, right=True).clamp(1, len(times) - 1)
     part = ((at - times[after - 1]) / (times[after] - times[after - 1])).clamp(0, 1)
-    part = torch.where(part >= 1, 1.0, 0.0) if hold else part
-    weights = torch.zeros(len(at), len(times))
-    rows = torch.arange(len(at))
+    return _rows(after, part, len(times)), _rows(after, (part >= 1).float(), len(times))
+
+
+def _rows(after: torch.Tensor, part: torch.Tensor, knots: int) -> torch.Tensor:
+    weights, rows = torch.zeros(len(after), knots), torch.arange(len(after))
     weights[rows, after - 1] += 1 - part
     weights[rows, after] += part
     return weights
