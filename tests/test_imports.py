@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
 ARCHITECTURE = PACKAGE.parent / "web_assets" / "docs" / "developers" / "architecture.md"
-LAYERS = ("cli", "ui", "session", "jobs", "checks", "recording", "authoring", "core", "machine")
+LAYERS = ("cli", "ui", "session", "jobs", "checks", "planning", "recording", "authoring", "core", "machine")
 """From the top to the bottom: a layer imports those behind it. Recording and authoring do not import each other."""
 APART = {("recording", "authoring")}
 MOST_ENTRIES = 12

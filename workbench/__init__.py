@@ -11,11 +11,13 @@ if TYPE_CHECKING:
     from workbench.core.snapshots.snapshot import restore_snapshot as restore_snapshot
     from workbench.core.snapshots.snapshot import take_snapshot as take_snapshot
     from workbench.gym_env import make as make
+    from workbench.planning.planner import Planner as Planner
     from workbench.recorder import Recorder as Recorder
     from workbench.recording.reader.read_episode import read_episode as read_episode
 
 __version__ = "0.1.0"
 __all__ = [
+    "Planner",
     "Recorder",
     "begin_anew",
     "list_contacts",
@@ -26,6 +28,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Planner": "planning.planner",
     "Recorder": "recorder",
     "begin_anew": "core.snapshots.snapshot",
     "list_contacts": "core.capture.inspect_env",

@@ -101,6 +101,13 @@ def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.
     if not parts:
         return None
     action = torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32)).to(env.device)
+    return by_robot(parts, action)
+
+
+def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
+    """The argument of ``env.step`` of a flat action (N, A): itself, a dict of parts for several robots, None without a robot."""
+    if not parts:
+        return None
     if parts[0].robot is None:
         return action
     split = torch.split(action, [len(p.names) for p in parts], dim=1)

@@ -1,0 +1,143 @@
+"""What planning costs beside the steps that it is made of: python tests/benchmarks/solve.py
+
+For each task, in turns in one process: *quick* and *exact*, one plan of K rollouts of H steps for a live env in the middle
+of an episode, with each of the two ways to restore; *bare*, the same actions from the same state in K envs as
+`workbench.make` gives them, which are restored before the clock starts. Printed are the medians and their ratios.
+
+    python tests/benchmarks/solve.py --write    # also into web_assets/docs/reference/benchmarks.md
+"""
+
+# ManiSkill annotates an env's members as the widest thing they may be in any task.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import os
+import re
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import torch
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import workbench
+from workbench.core.maniskill_private import open_env
+from workbench.planning.options import PlanOptions
+from workbench.planning.rollouts import RolloutPlanner, make_rollout_env
+
+PAGE = Path(__file__).resolve().parents[2] / "web_assets" / "docs" / "reference" / "benchmarks.md"
+HEAD = "## Planning (`tests/benchmarks/solve.py`)"
+
+
+@dataclass(frozen=True)
+class Options:
+    env_ids: tuple[str, ...] = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
+    turns: int = 9
+    """Of each side; a turn is one plan, or as many bare steps."""
+    steps: int = 5
+    """Control steps of the live env before it is planned for, each by a plan."""
+    plan: PlanOptions = field(default_factory=PlanOptions)
+    processor: bool = False
+    """Take the processor's time of all threads in place of the wall's: on a machine that others use, only that says something."""
+    write: bool = False
+    """Put the table into the docs page too."""
+
+
+def seconds(action: Callable[[], Any], clock: Callable[[], float]) -> float:
+    began = clock()
+    action()
+    return clock() - began
+
+
+def measure(env_id: str, options: Options) -> dict[str, float]:
+    """Seconds of each side, and the control steps of a plan."""
+    made: dict[str, Any] = {"backend": "cpu", "render_backend": "none", "max_episode_steps": -1}
+    live = workbench.make(env_id, 1, **made)
+    many = workbench.make(env_id, options.plan.rollouts, rules="off", **made)
+    rolled = make_rollout_env(open_env(live), live.spec.kwargs, options.plan.rollouts)  # type: ignore[union-attr]
+    planners = {side: RolloutPlanner(rolled, options.plan, side == "exact") for side in ("quick", "exact")}
+    horizon = planners["quick"].horizon
+    live.reset(seed=0)
+    for planner in planners.values():
+        planner.begin(0, 0)
+    for _ in range(options.steps):
+        plan = planners["quick"].plan(workbench.take_snapshot(live), 0)
+        live.step(torch.from_numpy(plan.actions[:1]))
+    many.reset(seed=list(range(options.plan.rollouts)))
+    snapshot = workbench.take_snapshot(live)
+    tried: list[Any] = []
+
+    def restore() -> None:
+        workbench.restore_snapshot(many, snapshot, range(options.plan.rollouts), source=0)
+
+    def bare() -> None:
+        for action in tried:
+            many.step(action)
+
+    def plan_with(side: str) -> Callable[[], None]:
+        def plan() -> None:
+            # An episode's first plan each time, so that all sides make the same steps.
+            planners[side].begin(0, 0)
+            planners[side].plan(workbench.take_snapshot(live), 0)
+
+        return plan
+
+    sides: dict[str, Callable[[], None]] = {
+        "bare": bare,
+        **{side: plan_with(side) for side in planners},
+    }
+    step = rolled.step
+    rolled.step = lambda action: tried.append(action.clone()) or step(action)  # type: ignore[method-assign, assignment]
+    sides["exact"]()
+    del rolled.step
+    sides["quick"]()
+    clock = time.process_time if options.processor else time.perf_counter
+    took: dict[str, list[float]] = {name: [] for name in sides}
+    for number in range(options.turns):
+        for name in sorted(sides, reverse=bool(number % 2)):
+            restore()
+            took[name].append(seconds(sides[name], clock))
+    for env in (live, many, rolled):
+        env.close()
+    return {name: statistics.median(each) for name, each in took.items()} | {"horizon": horizon}
+
+
+def table(options: Options) -> Iterator[str]:
+    yield "| task | rollouts x steps | bare, ms | plan, quick restore, ms | plan, exact restore, ms | quick / bare | exact / bare |"
+    yield "|---|---|---|---|---|---|---|"
+    for env_id in options.env_ids:
+        took = measure(env_id, options)
+        bare, quick, exact = took["bare"], took["quick"], took["exact"]
+        yield (
+            f"| {env_id} | {options.plan.rollouts} x {took['horizon']:.0f} | {1e3 * bare:.0f} | {1e3 * quick:.0f} | "
+            f"{1e3 * exact:.0f} | {quick / bare:.2f} | {exact / bare:.2f} |"
+        )
+
+
+def main(options: Options) -> None:
+    torch.set_num_threads(1)
+    lines = []
+    for line in table(options):
+        print(line, flush=True)
+        lines.append(line)
+    if options.write:
+        cores = len(os.sched_getaffinity(0))
+        text = (
+            f"{HEAD}\n\nOn {cores} cores, without a GPU; both sides in one run: take the ratios.\n\n"
+            + "\n".join(lines)
+        )
+        page = PAGE.read_text()
+        there = re.search(rf"^{re.escape(HEAD)}$.*?(?=^## |\Z)", page, re.M | re.S)
+        page = page.replace(there[0], f"{text}\n\n") if there else f"{page.rstrip()}\n\n{text}\n"
+        PAGE.write_text(page.rstrip() + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

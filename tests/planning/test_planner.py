@@ -1,0 +1,251 @@
+"""`workbench.Planner`: the same plans always, from nothing but the state; and the env that is planned for is only read."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+import workbench
+from workbench.core.maniskill_private import open_env
+from workbench.core.snapshots.cpu_state import CpuState
+from workbench.planning.rollouts import NotAlike
+
+TASKS = Path(__file__).parents[2] / "tasks"
+SMALL: dict[str, Any] = {"rollouts": 8, "horizon": 0.2}
+MADE: dict[str, Any] = {"control_mode": "pd_ee_delta_pose", "render_backend": "none", "backend": "cpu"}
+REACHES = '''
+"""The hand is to rise, the author's way: NaN, an early end and a draw of random numbers where a test asks for them."""
+import torch
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+
+@register_env("Planned-v1", max_episode_steps=20)
+class PlannedEnv(PushCubeEnv):
+    trouble = ""
+
+    def __init__(self, *args, trouble="", **kwargs):
+        self.trouble = trouble
+        super().__init__(*args, **kwargs)
+
+    def evaluate(self):
+        height = self.agent.tcp.pose.p[:, 2]
+        fail = height > 0.2 if self.trouble == "fail" else torch.zeros_like(height, dtype=torch.bool)
+        return {"success": height > 5.0, "fail": fail, "height": height}
+
+    def compute_dense_reward(self, obs, action, info):
+        height = info["height"]
+        if self.trouble == "nan":
+            return torch.where(height > 0.2, torch.nan, height)
+        if self.trouble == "noise":
+            return height + torch.rand_like(height)
+        info["reward_terms"] = {"height": height, "still": torch.zeros_like(height)}
+        return height
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info)
+'''
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("planned") / "planned.py"
+    file.write_text(REACHES)
+    return file
+
+
+@pytest.fixture(scope="module")
+def push() -> Iterator[tuple[Any, workbench.Planner]]:
+    env = workbench.make("PushCube-v1", 4, **MADE)
+    planner = workbench.Planner(env, **SMALL)
+    yield env, planner
+    planner.close()
+    env.close()
+
+
+def walk(env: Any, planner: workbench.Planner, env_idx: list[int] | None, steps: int = 3) -> np.ndarray:
+    """(T, N, A) the actions that are planned and taken from a reset on."""
+    env.reset(seed=[5, 6, 7, 8][: open_env(env).num_envs])
+    planner.reset()
+    taken = []
+    for _ in range(steps):
+        action = planner.actions(env_idx)
+        env.step(action)
+        taken.append(action.numpy().copy())
+    return np.stack(taken)
+
+
+def test_the_same_state_and_seed_give_the_same_plan_whatever_was_planned_before(
+    push: tuple[Any, workbench.Planner],
+) -> None:
+    env, planner = push
+    first = walk(env, planner, None)
+    walk(env, planner, [1])
+    assert first.shape == (3, 4, 7)
+    np.testing.assert_array_equal(first, walk(env, planner, None))
+    assert not np.array_equal(first[:, 0], first[:, 1])
+
+
+def test_an_env_gets_the_plan_that_it_gets_alone(push: tuple[Any, workbench.Planner]) -> None:
+    env, planner = push
+    together = walk(env, planner, None)
+    alone = workbench.make("PushCube-v1", 1, **MADE)
+    np.testing.assert_array_equal(walk(alone, planner_of(alone), None)[:, 0], together[:, 0])
+    alone.close()
+
+
+def planner_of(env: Any) -> workbench.Planner:
+    return workbench.Planner(env, **SMALL)
+
+
+@pytest.mark.slow
+def test_another_process_gives_the_same_plan(push: tuple[Any, workbench.Planner]) -> None:
+    env, planner = push
+    here = walk(env, planner, None)
+    program = (
+        "import workbench; from tests.planning.test_planner import MADE, SMALL, walk\n"
+        "env = workbench.make('PushCube-v1', 4, **MADE); planner = workbench.Planner(env, threads=1, **SMALL)\n"
+        "print(walk(env, planner, None).tobytes().hex())"
+    )
+    top = Path(__file__).parents[2]
+    there = subprocess.run(
+        [sys.executable, "-c", program], cwd=top, check=True, capture_output=True, text=True
+    )
+    assert there.stdout.split()[-1] == here.tobytes().hex()
+
+
+def test_a_plan_changes_neither_the_env_nor_the_random_numbers_of_the_process(
+    push: tuple[Any, workbench.Planner],
+) -> None:
+    env, planner = push
+    walk(env, planner, [3], steps=1)
+    before, drawn = workbench.take_snapshot(env), torch.get_rng_state()
+    planner.actions([3])
+    after = workbench.take_snapshot(env)
+    assert torch.equal(torch.get_rng_state(), drawn)
+    one, other = (cast(CpuState, each.simulation) for each in (before, after))
+    assert [one.essence(k) for k in range(4)] == [other.essence(k) for k in range(4)]
+    np.testing.assert_array_equal(after.memory.elapsed_steps, before.memory.elapsed_steps)
+    assert after.memory.task.buffers.keys() == before.memory.task.buffers.keys()
+    for name, buffer in after.memory.task.buffers.items():
+        assert buffer.is_as(before.memory.task.buffers[name]), name
+
+
+def test_envs_that_are_not_planned_for_hold_still(push: tuple[Any, workbench.Planner]) -> None:
+    env, planner = push
+    taken = walk(env, planner, [2])
+    assert not taken[:, [0, 1, 3], :6].any()
+    assert taken[:, 2, :6].any()
+
+
+def test_actions_stay_within_the_space_and_the_gripper_is_open_or_closed(
+    push: tuple[Any, workbench.Planner],
+) -> None:
+    env, planner = push
+    taken = walk(env, planner, [0])
+    space = env.unwrapped.single_action_space
+    assert (taken >= space.low).all() and (taken <= space.high).all()
+    plan = planner.plans[0]
+    assert plan.actions.shape == (4, 7) and plan.rewards.shape == (8, 4)
+
+
+def test_every_says_how_many_actions_of_a_plan_are_taken(task: Path) -> None:
+    env = workbench.make(task, 1, **MADE)
+    planner = workbench.Planner(env, every=3, **SMALL)
+    env.reset(seed=0)
+    plans = []
+    for _ in range(4):
+        action = planner.actions()
+        plans.append(planner.plans[0])
+        np.testing.assert_array_equal(action[0].numpy(), planner.plans[0].actions[(len(plans) - 1) % 3])
+        env.step(action)
+    assert [plan is plans[0] for plan in plans] == [True, True, True, False]
+    planner.close()
+    env.close()
+
+
+@pytest.mark.parametrize("trouble", ["nan", "fail"])
+def test_a_rollout_earns_nothing_after_a_fail_and_counts_as_worst_with_nan(task: Path, trouble: str) -> None:
+    env = workbench.make(task, 1, trouble=trouble, **MADE)
+    planner = workbench.Planner(env, rollouts=32, horizon=0.5)
+    env.reset(seed=0)
+    for _ in range(8):
+        _, _, _, _, info = env.step(planner.actions())
+        plan = planner.plans[0]
+        assert np.isfinite(plan.returns[plan.best])
+        assert np.isfinite(plan.actions).all()
+        if trouble == "fail":
+            ended = (plan.rewards == 0).argmax(1)
+            for rewards, at in zip(plan.rewards, ended):
+                assert not rewards[at:].any() or at == 0
+    assert float(info["height"]) < 0.2
+    assert np.isnan(plan.rewards).any() if trouble == "nan" else (plan.rewards[:, -1] == 0).any()
+    planner.close()
+    env.close()
+
+
+def test_what_a_task_draws_in_a_step_is_drawn_in_the_same_way_again(task: Path) -> None:
+    env = workbench.make(task, 1, trouble="noise", **MADE)
+    planner = planner_of(env)
+    first = walk(env, planner, None, steps=2)
+    torch.manual_seed(99)
+    assert np.array_equal(first[0], walk(env, planner, None, steps=2)[0])
+    planner.close()
+    env.close()
+
+
+def test_the_terms_of_the_reward_are_summed_over_each_rollout(task: Path) -> None:
+    env = workbench.make(task, 1, **MADE)
+    planner = planner_of(env)
+    walk(env, planner, None, steps=1)
+    plan = planner.plans[0]
+    np.testing.assert_allclose(plan.terms["height"], plan.returns, rtol=1e-5)
+    assert not plan.terms["still"].any()
+    planner.close()
+    env.close()
+
+
+def test_an_env_that_observes_pictures_has_rollouts_that_draw_nothing() -> None:
+    env = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb")
+    planner = planner_of(env)
+    rolled = planner._rollouts.env
+    assert rolled.obs_mode == "state_dict" and not rolled.scene.can_render()
+    env.reset(seed=0)
+    env.step(planner.actions())
+    planner.close()
+    env.close()
+
+
+def test_a_task_with_other_bodies_in_each_env_is_refused_by_their_name() -> None:
+    env = workbench.make(TASKS / "different_objects.py", 4, backend="cpu", render_backend="none")
+    planner = planner_of(env)
+    env.reset(seed=0)
+    with pytest.raises(NotAlike, match="object"):
+        planner.actions()
+    planner.close()
+    env.close()
+
+
+def test_several_robots_get_a_dict_of_actions() -> None:
+    env = workbench.make(TASKS / "two_robots.py", 1, backend="cpu", render_backend="none")
+    planner = planner_of(env)
+    env.reset(seed=0)
+    action = planner.actions()
+    assert isinstance(action, dict) and len(action) == 2
+    env.step(action)
+    planner.close()
+    env.close()
+
+
+def test_an_unknown_option_and_an_env_of_another_kind_are_refused() -> None:
+    with pytest.raises(TypeError, match="ManiSkill"):
+        workbench.Planner(object())  # type: ignore[arg-type]

@@ -1,0 +1,156 @@
+"""Candidates around a plan: within bounds, smooth where they may be, and each method moves the plan to what earned more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from workbench.planning.options import Method, PlanOptions
+from workbench.planning.sampling import Sampler
+
+METHODS: tuple[Method, ...] = ("mppi", "predictive", "cem")
+USUAL = PlanOptions()
+GRIPPER = torch.tensor([False, False, True])
+
+
+def sampler_of(options: PlanOptions = USUAL, steps: int = 10, seed: int = 0) -> Sampler:
+    return Sampler(options, steps, GRIPPER, torch.ones(3), seed)
+
+
+def improved(sampler: Sampler, rounds: int, target: torch.Tensor) -> torch.Tensor:
+    """The knots of the plan after rounds in which a candidate earns more the nearer it is to a target (A,)."""
+    for _ in range(rounds):
+        knots = sampler.candidates(torch.zeros(3))
+        sampler.improve(knots, -(sampler.sequences(knots) - target).square().sum((1, 2)))
+    return sampler.plan
+
+
+@settings(deadline=None)
+@given(
+    knots=st.integers(2, 9),
+    steps=st.integers(2, 40),
+    shift=st.integers(0, 50),
+    noise=st.floats(0.01, 10.0),
+    method=st.sampled_from(METHODS),
+)
+def test_candidates_stay_within_their_bounds_at_any_time_of_an_episode(
+    knots: int, steps: int, shift: int, noise: float, method: Method
+) -> None:
+    sampler = sampler_of(PlanOptions(method, rollouts=8, knots=knots, noise=noise), steps)
+    for _ in range(3):
+        drawn = sampler.candidates(torch.tensor([0.5, -1.0, 1.0]))
+        sequences = sampler.sequences(drawn)
+        assert sequences.shape == (8, steps, 3)
+        assert sequences.abs().max() <= 1 + 1e-5
+        sampler.improve(drawn, sequences.sum((1, 2)))
+        sampler.shift(shift)
+
+
+@settings(deadline=None)
+@given(knots=st.integers(2, 9), steps=st.integers(2, 40), value=st.floats(-1, 1), shift=st.integers(0, 50))
+def test_knots_of_one_value_are_a_plan_of_that_value_before_and_after_a_shift(
+    knots: int, steps: int, value: float, shift: int
+) -> None:
+    """The weights of the interpolation add up to 1."""
+    sampler = sampler_of(PlanOptions(rollouts=4, knots=knots), steps)
+    sampler.candidates(torch.full((3,), value))
+    sampler.shift(shift)
+    torch.testing.assert_close(sampler.sequences(sampler.plan[None]), torch.full((1, steps, 3), value))
+
+
+@settings(deadline=None)
+@given(knots=st.integers(2, 9), steps=st.integers(2, 40), seed=st.integers(0, 100))
+def test_a_shift_by_no_step_changes_nothing(knots: int, steps: int, seed: int) -> None:
+    sampler = sampler_of(PlanOptions(rollouts=8, knots=knots), steps, seed)
+    before = improved(sampler, 1, torch.tensor([0.3, -0.8, 1.0])).clone()
+    sampler.shift(0)
+    assert torch.equal(sampler.plan, before)
+
+
+def test_a_shift_brings_forward_what_was_planned_for_later() -> None:
+    sampler = sampler_of(PlanOptions(rollouts=8, knots=4), steps=10)
+    improved(sampler, 2, torch.tensor([0.3, -0.8, 1.0]))
+    before = sampler.sequences(sampler.plan[None])[0]
+    sampler.shift(3)  # the distance of two knots
+    after = sampler.sequences(sampler.plan[None])[0]
+    torch.testing.assert_close(after[:7, :2], before[3:, :2])
+
+
+def test_a_gripper_switches_where_an_arm_goes_along_a_line() -> None:
+    sampler = sampler_of(PlanOptions(rollouts=4, knots=2), steps=5)
+    line = torch.tensor([[[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]])
+    sampler.candidates(torch.zeros(3))
+    sequence = sampler.sequences(line)[0]
+    torch.testing.assert_close(sequence[:, 0], torch.linspace(-1, 1, 5))
+    assert sequence[:, 2].tolist() == [-1, -1, -1, -1, 1]
+    drawn = sampler.candidates(torch.tensor([0.0, 0.0, 0.25]))
+    assert set(drawn[2:, :, 2].flatten().tolist()) <= {-1.0, 0.0, 1.0}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_method_moves_the_plan_to_what_earns_more(method: Method) -> None:
+    target = torch.tensor([0.6, -0.4, 1.0])
+    sampler = sampler_of(PlanOptions(method, rollouts=64))
+    plan = improved(sampler, 30, target)
+    assert (plan[:, :2] - target[:2]).abs().max() < 0.3
+    assert plan[:, 2].min() > 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_return_that_is_nan_or_infinite_is_the_worst(method: Method) -> None:
+    sampler = sampler_of(PlanOptions(method, rollouts=8))
+    knots = sampler.candidates(torch.zeros(3))
+    returns = torch.tensor(
+        [torch.nan, torch.inf, -torch.inf, torch.nan, 1.0, torch.nan, torch.nan, torch.nan]
+    )
+    sampler.improve(knots, returns)
+    torch.testing.assert_close(sampler.plan, knots[4])
+    before = sampler.plan.clone()
+    sampler.improve(sampler.candidates(torch.zeros(3)), torch.full((8,), torch.nan))
+    assert torch.equal(sampler.plan, before)
+
+
+def test_the_plan_and_holding_still_are_always_among_the_candidates() -> None:
+    sampler = sampler_of(PlanOptions(rollouts=8))
+    hold = torch.tensor([0.1, 0.2, -1.0])
+    plan = improved(sampler, 2, torch.tensor([0.3, -0.8, 1.0])).clone()
+    knots = sampler.candidates(hold)
+    assert torch.equal(knots[0], plan)
+    assert torch.equal(knots[1], hold.expand(4, 3))
+
+
+def test_the_seed_alone_decides_what_is_drawn() -> None:
+    one, same, other = sampler_of(seed=3), sampler_of(seed=3), sampler_of(seed=4)
+    torch.manual_seed(0)
+    drawn = one.candidates(torch.zeros(3))
+    torch.manual_seed(1)
+    assert torch.equal(drawn, same.candidates(torch.zeros(3)))
+    assert not torch.equal(drawn, other.candidates(torch.zeros(3)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"method": "guess"}, "mppi, predictive, cem"),
+        ({"rollouts": 3}, "rollouts must be at least 4"),
+        ({"knots": 1}, "knots must be at least 2"),
+        ({"noise": float("nan")}, "noise must be above 0"),
+        ({"temperature": 0.0}, "temperature must be above 0"),
+        ({"elites": 2.0}, "at most 1"),
+        ({"horizon": -1.0}, "time in seconds"),
+        ({"every": 0}, "every must be at least 1"),
+    ],
+)
+def test_options_out_of_range_are_refused_by_name(wrong: dict, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        PlanOptions(**wrong)
+
+
+def test_the_usual_horizon_is_half_a_second_within_bounds() -> None:
+    assert [USUAL.steps(dt) for dt in (0.05, 0.02, 0.01, 0.5)] == [10, 20, 20, 8]
+    assert replace(USUAL, horizon=1.0).steps(0.05) == 20
+    assert replace(USUAL, horizon=0.1, every=4).steps(0.05) == 4

@@ -1,0 +1,68 @@
+"""How a plan is searched, as plain data. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Method = Literal["mppi", "predictive", "cem"]
+_FEWEST_ROLLOUTS = 4
+"""The plan itself, holding still, and the two best of the round before."""
+_STEPS = 8, 20
+"""Fewest and most control steps of the usual horizon."""
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """How a plan is searched: candidate actions are rolled out from the present state, and the plan goes to what earned most.
+
+    Args:
+        method: mppi, the mean of all candidates weighted by what they earned (Williams et al., 2017); predictive, the best
+            candidate (predictive sampling; Howell et al., 2022); cem, mean and spread of the best ones (the
+            cross-entropy method, kept warm as in iCEM; Pinneri et al., 2020).
+        rollouts: candidates that are tried at once, each in an env of its own.
+        horizon: seconds that a plan looks ahead; 0 for half a second, but from 8 to 20 control steps.
+        knots: actions that a candidate is made of, in equal distances; between them it is interpolated.
+        noise: standard deviation of a candidate's knots around the plan, of half the range of each action dimension.
+        temperature: of mppi, in standard deviations of what the candidates earned; the lower, the more the best ones count.
+        elites: of cem, the part of the candidates that make the next plan.
+        rounds: times that candidates are drawn and rolled out for one plan.
+        every: control steps that are taken before the next plan.
+    """
+
+    method: Method = "mppi"
+    rollouts: int = 64
+    horizon: float = 0.0
+    knots: int = 4
+    noise: float = 0.5
+    temperature: float = 0.1
+    elites: float = 0.1
+    rounds: int = 1
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        """Raises ValueError with a sentence that names the option."""
+        if self.method not in get_args(Method):
+            raise ValueError(f"method must be one of {', '.join(get_args(Method))}, not {self.method!r}")
+        for name, least in (("rollouts", _FEWEST_ROLLOUTS), ("knots", 2), ("rounds", 1), ("every", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        for name in ("noise", "temperature", "elites"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+        if self.elites > 1:
+            raise ValueError(f"elites is a part of the candidates, at most 1, not {self.elites}")
+        if not 0 <= self.horizon < math.inf:
+            raise ValueError(f"horizon is a time in seconds, 0 for the usual one, not {self.horizon}")
+
+    def steps(self, control_dt: float) -> int:
+        """H, the control steps of a plan, at least two and as many as are taken before the next one.
+
+        Args:
+            control_dt: simulated seconds of a control step.
+        """
+        fewest, most = _STEPS
+        usual = min(most, max(fewest, round(0.5 / control_dt)))
+        steps = max(2, round(self.horizon / control_dt)) if self.horizon else usual
+        return max(steps, self.every)

@@ -1,0 +1,112 @@
+"""``workbench.Planner``: actions for an env of `workbench.make`, planned by rollouts of its own task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from workbench.core.env import actions
+from workbench.core.env_numbers import envs_of_batch
+from workbench.core.maniskill_private import episode_seeds, open_env
+from workbench.core.snapshots.snapshot import take_snapshot
+from workbench.planning.options import PlanOptions
+from workbench.planning.rollouts import Plan, RolloutPlanner, make_rollout_env
+
+
+class Planner:
+    """Plans the actions of an env that `workbench.make` gave, by rollouts of its task with its own reward::
+
+        env = workbench.make("PickCube-v1", control_mode="pd_ee_delta_pose")
+        planner = workbench.Planner(env, rollouts=64)
+        env.reset(seed=0)
+        planner.reset()
+        for _ in range(50):
+            obs, reward, terminated, truncated, info = env.step(planner.actions())
+        planner.close()
+
+    The same seeds, options and actions in between give the same actions to the last bit. The env itself is only read, and
+    the process's random generators stay as they were.
+    """
+
+    def __init__(
+        self, env: gym.Env, *, threads: int | None = None, exact: bool = True, **options: Any
+    ) -> None:
+        """
+        Args:
+            env: as `workbench.make` gives it, wrapped or not.
+            threads: threads that step the rollouts on the CPU; None for one per core that the process may use.
+            exact: False restores faster, and may give another plan from the last bit of a contact on.
+            options: fields of `PlanOptions`: ``method``, ``rollouts``, ``horizon`` (seconds), ``knots``, ``noise``,
+                ``temperature``, ``elites``, ``rounds``, ``every``.
+
+        Raises:
+            TypeError: `env` is no ManiSkill env, or there is no option of a name.
+            ValueError: an option is out of its range, or the task has no actions.
+            Exception: raised by the author's class while the envs for the rollouts are built.
+        """
+        self._live = open_env(env)
+        self.options = PlanOptions(**options)
+        given: Mapping[str, Any] = env.spec.kwargs if env.spec is not None else {}
+        rolled = make_rollout_env(self._live, given, self.options.rollouts, threads)
+        try:
+            self._rollouts = RolloutPlanner(rolled, self.options, exact)
+        except BaseException:
+            rolled.close()
+            raise
+        self._parts = actions.action_parts(self._live)
+        self.plans: dict[int, Plan] = {}
+        """The last plan of each env, with what its rollouts earned."""
+        self._taken: dict[int, int] = {}
+        """Actions of each plan that were given out."""
+
+    def reset(self, env_idx: Sequence[int] | int | None = None, seed: int | None = None) -> None:
+        """Begin an episode of these envs, or of all: forget their plans.
+
+        Args:
+            seed: of the candidates, the same in each of these envs; None for the seed of each env's episode.
+        """
+        seeds = episode_seeds(self._live)
+        for env in self._chosen(env_idx):
+            own = 0 if seeds is None else int(seeds[env])
+            self._rollouts.begin(env, own if seed is None else seed)
+            self.plans.pop(env, None)
+            self._taken[env] = 0
+
+    def actions(self, env_idx: Sequence[int] | int | None = None) -> Any:
+        """The next action, as ``env.step`` takes it: a tensor (N, A), or a dict of them for several robots.
+
+        An env that was not begun (`reset`) is begun by this.
+
+        Args:
+            env_idx: the envs to plan for, in turn; None for all. The others hold still.
+
+        Raises:
+            NotAlike: the task builds other bodies in each env, so that no env can stand for another.
+            IndexError: there is no such env.
+            Exception: raised by the author's task in a step of a rollout.
+        """
+        chosen = self._chosen(env_idx)
+        self.reset([env for env in chosen if env not in self._taken])
+        flat = actions.hold_action(self._parts, self._live.num_envs)
+        due = [env for env in chosen if env not in self.plans or self._taken[env] >= self.options.every]
+        snapshot = take_snapshot(self._live, due) if due else None
+        for env in due:
+            assert snapshot is not None
+            self._rollouts.require_alike(self._live, env)
+            self.plans[env], self._taken[env] = self._rollouts.plan(snapshot, env), 0
+        for env in chosen:
+            flat[env] = self.plans[env].actions[self._taken[env]]
+            self._taken[env] += 1
+        return actions.to_env_action(self._live, self._parts, np.asarray(flat, np.float32))
+
+    def close(self) -> None:
+        """Close the envs of the rollouts; the env that is planned for stays open."""
+        self._rollouts.close()
+
+    def _chosen(self, env_idx: Sequence[int] | int | None) -> list[int]:
+        if env_idx is None:
+            return list(range(self._live.num_envs))
+        return envs_of_batch(env_idx, self._live.num_envs) if np.size(env_idx) else []

@@ -1,0 +1,282 @@
+"""Plans for any env of a task, on a batch of envs of the same task that are its rollouts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosMimicController
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.core.env import actions
+from workbench.core.env.task_env import EnvOptions, build_env
+from workbench.core.maniskill_private import task_class
+from workbench.core.scene.scene_index import once_a_scene, scene_index
+from workbench.core.snapshots.rng import read_shared_rng, write_shared_rng
+from workbench.core.snapshots.snapshot import Snapshot, restore_snapshot
+from workbench.planning.options import PlanOptions
+from workbench.planning.sampling import Sampler
+
+_OF_ABSOLUTE = 0.2
+"""Of the noise, for absolute joint positions: they range over the whole joint, which no plan crosses."""
+_NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "sim_backend")
+"""Arguments of the live env that its rollouts have in their own way: they draw nothing, and nobody observes them."""
+
+
+class NotAlike(ValueError):
+    """The envs of the task are not built alike, so that none can stand for another."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was found for one env, and what the last round of its rollouts earned."""
+
+    actions: NDArray[np.float32]
+    """(H, A) flat actions, the next one first."""
+    rewards: NDArray[np.float32]
+    """(K, H) of all rollouts; 0 after a fail. Rollout 0 is the plan as it was, and rollout 1 holds still."""
+    terms: Mapping[str, NDArray[np.float32]]
+    """(K,) sums of ``info["reward_terms"]`` over each rollout, by name; empty if the task has none."""
+    success_at: NDArray[np.int32]
+    """(K,) the step at which each rollout succeeded, from 1 on; 0 if it did not."""
+    seconds: float
+
+    @property
+    def returns(self) -> NDArray[np.float32]:
+        """(K,) what each rollout earned; NaN or infinite where a reward was."""
+        return self.rewards.sum(1)
+
+    @property
+    def best(self) -> int:
+        """The rollout that earned most; one that is NaN or infinite counts as the worst."""
+        returns = self.returns
+        return int(np.where(np.isfinite(returns), returns, -np.inf).argmax())
+
+
+def make_rollout_env(
+    env: BaseEnv, kwargs: Mapping[str, Any], rollouts: int, threads: int | None = None
+) -> BaseEnv:
+    """Envs for rollouts of the task of `env`, made as it was but for what only a person or a policy sees.
+
+    Args:
+        env: the live env, whose simulation (CPU or GPU) they share.
+        kwargs: the keyword arguments that it was made with.
+        rollouts: how many envs.
+        threads: threads that step them on the CPU; None for one on each core that the process may use.
+
+    Raises:
+        Exception: raised by the author's class while it builds.
+    """
+    kept = {name: value for name, value in kwargs.items() if name not in _NOT_FOR_ROLLOUTS}
+    # The reward gets the same parts with "state", which makes one vector of them for a policy.
+    plain = "state_dict" if "state_dict" in env.SUPPORTED_OBS_MODES else "state"
+    kept["obs_mode"] = "none" if env.obs_mode == "none" else plain
+    kept["reward_mode"] = env.reward_mode
+    options = EnvOptions(
+        rollouts,
+        backend="gpu" if env.device.type == "cuda" else "cpu",
+        render=False,
+        threads=threads,
+        rules="off",  # the live env has them
+        kwargs=kept,
+    )
+    rolled = build_env(task_class(env), options)
+    try:
+        rolled.reset(seed=0)
+    except BaseException:
+        rolled.close()
+        raise
+    return rolled
+
+
+class RolloutPlanner:
+    """Plans for the envs of a task, one after the other, on a batch of K envs of the same task.
+
+    The author's reward decides, unchanged: a rollout is worth the sum of its rewards over the horizon, up to a fail. The envs
+    keep their own state, so a rollout is a restored snapshot and control steps.
+    """
+
+    def __init__(self, env: BaseEnv, options: PlanOptions, exact: bool = True) -> None:
+        """
+        Args:
+            env: K envs as `make_rollout_env` gives them, used by this alone.
+            exact: whether to restore exactly, so that the same snapshot, options and seed give the same plan to the last bit.
+
+        Raises:
+            ValueError: another number of envs than rollouts, or a task without actions.
+        """
+        if env.num_envs != options.rollouts:
+            raise ValueError(f"{options.rollouts} rollouts need as many envs, not {env.num_envs}")
+        self.env, self._options, self._exact = env, options, exact
+        self._parts = actions.action_parts(env)
+        if not self._parts:
+            raise ValueError("there is nothing to plan: the task has no robot with a controller")
+        self.horizon = options.steps(env.control_timestep)
+        """H, control steps that a plan looks ahead."""
+        low, high = actions.bounds(self._parts)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        self._low = torch.from_numpy(np.where(bounded, low, -1.0).astype(np.float32))
+        self._high = torch.from_numpy(np.where(bounded, high, 1.0).astype(np.float32))
+        dimensions = [part for part in self._parts for _ in part.names]
+        self._switches = torch.tensor([_switches(part) for part in dimensions])
+        self._scale = torch.tensor([_noise_scale(part) for part in dimensions])
+        self._samplers: dict[int, Sampler] = {}
+        self._alike: tuple[object, set[int]] = (None, set())
+        """The scene of the live batch, and its envs that were found to be built alike."""
+
+    def begin(self, env: int, seed: int) -> None:
+        """Begin an episode in this env of the live batch: forget its plan, and draw candidates from this seed."""
+        self._samplers[env] = Sampler(self._options, self.horizon, self._switches, self._scale, seed)
+
+    def require_alike(self, live: BaseEnv, env: int) -> None:
+        """Check that the rollouts' envs have the same bodies as this env of the live batch; what is known is not asked again.
+
+        Raises:
+            NotAlike: they have not, as where a scene is built at random; the message names a body.
+        """
+        scene, known = self._alike
+        if scene is not live.scene:
+            self._alike = scene, known = live.scene, set()
+        if env in known:
+            return
+        wanted = bodies_of(live)[env]
+        for bodies in bodies_of(self.env):
+            if bodies == wanted:
+                continue
+            other = sorted(name for name in {*bodies, *wanted} if bodies.get(name) != wanted.get(name))
+            raise NotAlike(
+                f"{', '.join(other)}: another one in each env. A plan is tried in envs that are built alike, so a task whose "
+                "scene is built at random has none: build the same bodies in each env, and place them at random"
+            )
+        known.add(env)
+
+    def plan(self, snapshot: Snapshot, env: int) -> Plan:
+        """Plan from the state that this env has in the snapshot, going on from its last plan.
+
+        The process's random generators are left as they were.
+
+        Raises:
+            KeyError: the env's episode was not begun.
+            Exception: raised by the author's task in a step.
+        """
+        began = time.perf_counter()
+        sampler = self._samplers[env]
+        device = self.env.device
+        shared = read_shared_rng(device)
+        try:
+            for _ in range(self._options.rounds):
+                every = range(self.env.num_envs)
+                restore_snapshot(self.env, snapshot, every, source=env, fresh_physics=self._exact)
+                # What a task draws in a step would else depend on all that was drawn in this process.
+                _seed_shared_rng(sampler.draw_seed())
+                knots = sampler.candidates(self._hold())
+                rewards, terms, succeeded = self._roll_out(self._from_unit(sampler.sequences(knots)))
+                sampler.improve(knots, rewards.sum(1))
+        finally:
+            write_shared_rng(shared, device)
+        sequence = self._from_unit(sampler.sequences(sampler.plan[None]))[0]
+        sampler.shift(self._options.every)
+        return Plan(
+            sequence.numpy(),
+            rewards.numpy(),
+            {name: term.numpy() for name, term in terms.items()},
+            succeeded.numpy(),
+            time.perf_counter() - began,
+        )
+
+    def close(self) -> None:
+        self.env.close()
+
+    def _hold(self) -> torch.Tensor:
+        hold = torch.from_numpy(actions.hold_action(self._parts, self.env.num_envs)[0])
+        return (2 * hold - self._high - self._low) / (self._high - self._low)
+
+    def _from_unit(self, action: torch.Tensor) -> torch.Tensor:
+        sized = self._low + (action + 1) / 2 * (self._high - self._low)
+        return torch.minimum(torch.maximum(sized, self._low), self._high)
+
+    def _roll_out(
+        self, sequences: torch.Tensor
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
+        """Rewards (K, H), sums of the terms (K,), and the steps of success (K,), of actions (K, H, A) from the present state."""
+        count, horizon, _ = sequences.shape
+        env, device = self.env, self.env.device
+        sequences = sequences.to(device)
+        rewards = torch.zeros((count, horizon), device=device)
+        alive = torch.ones(count, dtype=torch.bool, device=device)
+        succeeded = torch.zeros(count, dtype=torch.int32, device=device)
+        terms: dict[str, torch.Tensor] = {}
+        for h in range(horizon):
+            _, reward, _, _, info = env.step(actions.by_robot(self._parts, sequences[:, h]))
+            rewards[:, h] = torch.where(alive, _row(reward, rewards), 0.0)
+            given: Any = info.get("reward_terms")
+            for name, term in given.items() if isinstance(given, Mapping) else ():
+                if isinstance(term, torch.Tensor) and term.shape == (count,):
+                    terms[name] = terms.get(name, 0.0) + torch.where(alive, term.float(), 0.0)
+            if "success" in info:
+                now = _row(info["success"], alive) & alive & (succeeded == 0)
+                succeeded[now] = h + 1
+            if "fail" in info:
+                alive &= ~_row(info["fail"], alive)
+        return rewards.cpu(), {name: term.cpu() for name, term in terms.items()}, succeeded.cpu()
+
+
+def _row(value: Any, like: torch.Tensor) -> torch.Tensor:
+    """A number for each env, with the type and device of `like`."""
+    return torch.as_tensor(value, device=like.device).to(like.dtype)
+
+
+def _seed_shared_rng(seed: int) -> None:
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+
+
+def _switches(part: actions.ActionPart) -> bool:
+    """Whether a controller is a gripper's: what lies between open and closed is of no use to it."""
+    return isinstance(part.controller, PDJointPosMimicController) and len(part.names) == 1
+
+
+def _noise_scale(part: actions.ActionPart) -> float:
+    controller: Any = part.controller
+    absolute = isinstance(controller, PDJointPosController) and not controller.config.use_delta
+    return _OF_ABSOLUTE if absolute and not _switches(part) else 1.0
+
+
+# --- are the envs built alike? ---------------------------------------------------------------------------
+
+
+@once_a_scene
+def bodies_of(env: BaseEnv) -> list[dict[str, tuple[Any, ...]]]:
+    """Of each env, by name: what decides how a body moves and collides, apart from its state."""
+    index = scene_index(env)
+    return [
+        {
+            name: _body(entity)
+            for name, entity in zip(index.names, entities, strict=True)
+            if entity is not None
+        }
+        for entities in index.entities
+    ]
+
+
+def _body(entity: Any) -> tuple[Any, ...]:
+    parts: list[Any] = []
+    for component in entity.components:
+        shapes = getattr(component, "collision_shapes", None)
+        if shapes is None:
+            continue
+        parts.append(getattr(component, "mass", 0.0))
+        for shape in shapes:
+            sizes = [
+                np.asarray(value).tobytes()
+                for name in ("half_size", "radius", "half_length", "scale", "vertices")
+                if (value := getattr(shape, name, None)) is not None
+            ]
+            pose = shape.local_pose
+            parts.append((type(shape).__name__, *sizes, pose.p.tobytes(), pose.q.tobytes()))
+    return tuple(parts)

@@ -1,0 +1,128 @@
+"""Candidate actions around a plan, and the plan that their returns make of them: predictive sampling, MPPI, CEM."""
+
+from __future__ import annotations
+
+import torch
+
+from workbench.planning.options import PlanOptions
+
+_SMALL = 0.3
+"""Of the noise, for a third of the candidates: what is nearly right is not improved by chance alone."""
+_FLIPS = 0.3
+"""Of the knots of a dimension that switches, those that are drawn anew."""
+_KEPT = 2
+"""Best candidates of a round that are tried again in the next."""
+_LEAST_SPREAD = 0.2
+"""Of CEM, of the noise: a spread that has vanished never finds anything again."""
+
+
+class Sampler:
+    """The plan of one env: knots of actions from -1 to 1, and candidates around them.
+
+    A knot is an action at a time of the horizon: the first is now, the last at its end. Between knots a dimension goes along
+    a straight line; one that switches (a gripper) stays as at the knot before, since what is half closed holds nothing.
+    """
+
+    def __init__(
+        self, options: PlanOptions, steps: int, switches: torch.Tensor, scale: torch.Tensor, seed: int
+    ) -> None:
+        """
+        Args:
+            steps: H, control steps of the horizon.
+            switches: (A,) bool, dimensions that switch.
+            scale: (A,) factor on the noise of each dimension.
+            seed: of the candidates.
+        """
+        self._options, self._steps, self._switches = options, steps, switches
+        self._generator = torch.Generator().manual_seed(seed)
+        self._noise = torch.where(switches, 1.0, options.noise * scale).expand(options.knots, -1)
+        self._spread = self._noise
+        self._mean: torch.Tensor | None = None
+        self._kept: torch.Tensor | None = None
+        self._times = torch.linspace(0, steps - 1, options.knots)
+        self._weights = _weights(torch.arange(steps, dtype=torch.float32), self._times)
+
+    @property
+    def plan(self) -> torch.Tensor:
+        """(P, A) knots of the plan; there is one from the first `candidates` on."""
+        assert self._mean is not None
+        return self._mean
+
+    def draw_seed(self) -> int:
+        """A seed of this plan's own random numbers."""
+        return int(torch.randint(2**31, (1,), generator=self._generator))
+
+    def candidates(self, hold: torch.Tensor) -> torch.Tensor:
+        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, and others around the plan.
+
+        Args:
+            hold: (A,) the action that changes nothing; the plan that an episode begins with.
+        """
+        if self._mean is None:
+            self._mean = hold.expand(self._options.knots, -1).clone()
+        shape = (self._options.rollouts, *self._mean.shape)
+        drawn = torch.randn(shape, generator=self._generator)
+        flips = torch.rand(shape, generator=self._generator) < _FLIPS
+        # What only a long motion shows is found by a third of one action throughout.
+        drawn[0::3] = drawn[0::3, :1].clone()
+        drawn[2::3] *= _SMALL
+        knots = self._mean + drawn * self._spread
+        switched = torch.where(flips, torch.sign(drawn), self._mean)
+        knots = torch.where(self._switches, switched, knots)
+        knots[0], knots[1] = self._mean, hold
+        if self._kept is not None:
+            knots[2 : 2 + len(self._kept)] = self._kept
+        return knots.clamp_(-1, 1)
+
+    def sequences(self, knots: torch.Tensor) -> torch.Tensor:
+        """(K, H, A) actions of (K, P, A) knots."""
+        return self._between(knots, self._weights)
+
+    def improve(self, knots: torch.Tensor, returns: torch.Tensor) -> None:
+        """Make the plan of the returns (K,) of candidates (K, P, A). One that is NaN or infinite counts as the worst."""
+        finite = torch.isfinite(returns)
+        if not finite.any():
+            return
+        returns = torch.where(finite, returns, -torch.inf)
+        # Stable: equal returns would else be in an order that depends on the machine.
+        best = returns.argsort(descending=True, stable=True)
+        if self._options.method == "predictive":
+            self._mean = knots[best[0]].clone()
+        elif self._options.method == "cem":
+            count = max(2, round(self._options.elites * len(knots)))
+            elites = knots[best[: min(count, int(finite.sum()))]]
+            self._mean = elites.mean(0)
+            least = _LEAST_SPREAD * self._noise
+            self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0, correction=0), least)
+        else:
+            width = self._options.temperature * returns[finite].std(correction=0)
+            weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
+            self._mean = (weights[:, None, None] * knots).sum(0)
+        self._kept = knots[best[:_KEPT]].clone()
+
+    def shift(self, steps: int) -> None:
+        """Move the plan on by control steps that were taken: what was planned for then is at its beginning now."""
+        weights = _weights((self._times + steps).clamp(max=self._steps - 1), self._times)
+        if self._mean is not None:
+            self._mean = self._between(self._mean, weights)
+        if self._kept is not None:
+            self._kept = self._between(self._kept, weights)
+        self._spread = self._noise
+
+    def _between(self, knots: torch.Tensor, weights: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        lines, held = (torch.matmul(each, knots) for each in weights)
+        return torch.where(self._switches, held, lines)
+
+
+def _weights(at: torch.Tensor, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(T, P) parts of each knot in the value at times (T,): along straight lines, and as at the knot before."""
+    after = torch.searchsorted(times, at, right=True).clamp(1, len(times) - 1)
+    part = ((at - times[after - 1]) / (times[after] - times[after - 1])).clamp(0, 1)
+    return _rows(after, part, len(times)), _rows(after, (part >= 1).float(), len(times))
+
+
+def _rows(after: torch.Tensor, part: torch.Tensor, knots: int) -> torch.Tensor:
+    weights, rows = torch.zeros(len(after), knots), torch.arange(len(after))
+    weights[rows, after - 1] += 1 - part
+    weights[rows, after] += part
+    return weights
