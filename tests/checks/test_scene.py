@@ -65,10 +65,27 @@ def test_a_body_that_stays_at_the_origin_needs_no_pose(checked: Checked) -> None
             assert checked(rule, away, seeds=4).state == "kept"
 
 
+TABLE = """table = self.scene.create_articulation_builder()
+        top = table.create_link_builder(None)
+        top.set_name("top")
+        top.add_box_collision(half_size=[0.3, 0.3, 0.01])
+        {pose}
+        table.build(name="top_table", fix_root_link=True)"""
+
+
+def test_an_articulation_that_cannot_move_and_stays_at_the_origin_needs_no_pose(checked: Checked) -> None:
+    """It overlaps the ground and the table, which do not move either."""
+    for rule in ("initial-pose", "overlap-at-load"):
+        cube_away = CUBE_AT, "builder.initial_pose = sapien.Pose(p=[0, 0, 0.1])"
+        assert checked(rule, cube_away, added(TABLE.format(pose="")), seeds=4).state == "kept"
+
+
 def test_a_body_at_the_origin_that_is_inside_another_is_told(checked: Checked) -> None:
-    kinematic = added(FIXED.format(x=0, build="build_kinematic"))
-    finding = the_finding(checked("initial-pose", kinematic, seeds=4))
-    assert finding.code.startswith("fixed.build_kinematic")
+    built = FIXED.format(x=0, build="build_kinematic").replace("fixed.build", "self.fixed = fixed.build")
+    kinematic = added(built)
+    aside = GOAL_POSE, f"{GOAL_POSE}\n            self.fixed.set_pose(Pose.create_from_pq(p=[0, 0.4, 0]))"
+    finding = the_finding(checked("initial-pose", kinematic, aside, seeds=4))
+    assert finding.code.startswith("self.fixed = fixed.build_kinematic")
     static = added(FIXED.format(x=0, build="build_static"))
     assert checked("initial-pose", static, seeds=4).state == "kept"
     assert "cube and fixed are built" in the_finding(checked("overlap-at-load", static, seeds=4)).message

@@ -259,8 +259,9 @@ def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreig
 def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = str(author / "recordings")
     assert run([recordings, "--task", "x.py", "--recorded-source"], capsys)[0] == 2
-    code, _, err = run([recordings, "--csv-file", str(author / "no" / "where.csv")], capsys)
-    assert code == 2 and "there is no folder" in err
+    (author / "file").touch()
+    code, _, err = run([recordings, "--csv-file", str(author / "file" / "where.csv")], capsys)
+    assert code == 2 and "cannot be made" in err
     code, _, err = run([str(author / "nothing")], capsys)
     assert code == 2 and "There is nothing at" in err
 

@@ -2,6 +2,7 @@
 
     python -m tests.sweeps.check_tasks                  all ids, into check_tasks.json
     python -m tests.sweeps.check_tasks PickCube-v1 ...  some ids
+    python -m tests.sweeps.check_tasks --select RULE    one rule, as after a change of it
 
 Each id gets a process of its own: a task that ends the process or never returns is one row. Nothing can be asked
 there and nothing fetched, and ManiSkill's folder for downloads is an empty one. What is found is read by a person and
@@ -36,20 +37,26 @@ LIMIT = 900.0
 CRASHES = ("crashed", "hung")
 
 
-def sweep(ids: Sequence[str], workers: int, limit: float = LIMIT) -> Iterator[dict[str, Any]]:
-    """A row for each id, as they are done."""
+def sweep(
+    ids: Sequence[str], workers: int, limit: float = LIMIT, select: tuple[str, ...] = ()
+) -> Iterator[dict[str, Any]]:
+    """A row for each id, as they are done.
+
+    Args:
+        select: only these rules; empty for all.
+    """
     with tempfile.TemporaryDirectory() as nothing_downloaded, ThreadPoolExecutor(workers) as pool:
         os.environ["MS_ASSET_DIR"] = nothing_downloaded
         # Forked from a process that has imported all, which takes ten seconds, and has used nothing.
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(["mani_skill.envs", "workbench.jobs.check"])
-        for done in as_completed([pool.submit(_row, context, env_id, limit) for env_id in ids]):
+        for done in as_completed([pool.submit(_row, context, env_id, limit, select) for env_id in ids]):
             yield done.result()
 
 
-def _row(context: Any, env_id: str, limit: float) -> dict[str, Any]:
+def _row(context: Any, env_id: str, limit: float, select: tuple[str, ...]) -> dict[str, Any]:
     receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=check_here, args=(env_id, sender))
+    child = context.Process(target=check_here, args=(env_id, select, sender))
     begun = time.monotonic()
     child.start()
     sender.close()
@@ -70,7 +77,7 @@ def _row(context: Any, env_id: str, limit: float) -> dict[str, Any]:
 # --- in the child ------------------------------------------------------------------------------------
 
 
-def check_here(env_id: str, sender: Any) -> None:
+def check_here(env_id: str, select: tuple[str, ...], sender: Any) -> None:
     """Send the row of one id."""
     # What the task prints is not wanted, and it can ask nothing.
     nothing = os.open(os.devnull, os.O_RDWR)
@@ -78,7 +85,7 @@ def check_here(env_id: str, sender: Any) -> None:
         os.dup2(nothing, stream)
     refuse_the_network()
     try:
-        row = _needs(env_id) or _checked(env_id)
+        row = _needs(env_id) or _checked(env_id, select)
     except Exception:
         row = {"outcome": "crashed", "why": traceback.format_exc()}
     sender.send(row)
@@ -106,11 +113,11 @@ def _needs(env_id: str) -> dict[str, Any] | None:
     return None
 
 
-def _checked(env_id: str) -> dict[str, Any]:
+def _checked(env_id: str, select: tuple[str, ...]) -> dict[str, Any]:
     from workbench.jobs.check import CheckOptions, check
     from workbench.jobs.task import TaskOptions
 
-    what = CheckOptions(env_id, TaskOptions(num_envs=NUM_ENVS), seeds=SEEDS, workers=1)
+    what = CheckOptions(env_id, TaskOptions(num_envs=NUM_ENVS), seeds=SEEDS, select=select, workers=1)
     report = check(what)
     return {
         "outcome": "checked",
@@ -149,10 +156,11 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("ids", nargs="*")
     parser.add_argument("--json", type=Path, default=FILE)
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--select", action="append", default=[], help="only this rule; repeatable")
     parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for one id")
     given = parser.parse_args(arguments)
     rows: list[dict[str, Any]] = []
-    for row in sweep(given.ids or registered_ids(), given.workers, given.limit):
+    for row in sweep(given.ids or registered_ids(), given.workers, given.limit, tuple(given.select)):
         print(line_of(row), flush=True)
         rows.append(row)
         given.json.write_text(json.dumps(rows, indent=1))

@@ -232,8 +232,8 @@ def check(
         workers: processes, which share the groups of rules; as many as cores and groups allow.
         select: check only this rule; repeatable, or several with commas. workbench help rules lists them.
         ignore: do not check this rule; repeatable, or several with commas.
-        actions: who acts in further episodes, beside random actions, for the rules of evaluate() and of rewards: as
-            of workbench record, so zero, hold, a policy as module:function or file.py:function, or a file of actions.
+        actions: zero, hold, a policy as module:function or file.py:function, or a file, as of workbench record: it acts
+            in further episodes, beside random actions, for the rules of evaluate() and of rewards.
         fail_on: lowest degree of a finding that makes the exit code 1; never is for a job that only reports.
         json: print the result as JSON in place of text.
         json_file: also write the result to this file, as JSON.

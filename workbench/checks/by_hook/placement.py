@@ -86,7 +86,7 @@ def _is_num_envs(node: ast.AST) -> bool:
 
 def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
     """Over all seeds."""
-    fixed = _immovable(checkup)
+    fixed = immovable(checkup)
     seeds_of: dict[tuple[str, str], list[int]] = {}
     depths: dict[tuple[str, str], float] = {}
     for seed, overlaps in checkup.overlaps.items():
@@ -366,7 +366,7 @@ def _is_fixed(articulation: Any) -> bool:
     return all(each.links[0].joint.type == "fixed" for each in objects_of(articulation))
 
 
-def _immovable(checkup: Checkup) -> set[str]:
+def immovable(checkup: Checkup) -> set[str]:
     """Bodies that no contact moves: static and kinematic ones, and links between which and a fixed root no joint is."""
     index: SceneIndex = scene_index(checkup.task.env)
     found = {

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from workbench.checks.by_hook.placement import immovable
 from workbench.checks.evidence.builds import Built
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
@@ -55,11 +56,28 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _is_unposed(checkup: Checkup, each: Built) -> bool:
-    """Whether it should have an initial pose and has none: a static body stays at the origin, and a kinematic one harms only
-    what it is inside of."""
+    """Whether it should have an initial pose and has none. What stays at the origin is where it belongs, and a kinematic body
+    harms only what it is inside of."""
     if each.quaternion is not None or each.kind == "static":
         return False
-    return each.kind != "kinematic" or each.name in _inside_others(checkup)
+    if each.kind == "kinematic" and each.name not in _inside_others(checkup):
+        return False
+    return each.kind == "dynamic" or not checkup.look(_stay_at_origin).issuperset([each.name])
+
+
+def _stay_at_origin(checkup: Checkup) -> set[str]:
+    """Evidence: names of what no contact moves, and that is at the origin after a reset."""
+    task = checkup.task
+    checkup.reset(task, next(checkup.batches()))
+    index, fixed = scene_index(task.env), immovable(checkup)
+    moved = {owner for owner, name in zip(index.owners, index.names, strict=True) if name not in fixed}
+    structs = {**task.env.scene.actors, **task.env.scene.articulations}
+    origin = np.array([0, 0, 0, 1, 0, 0, 0])
+    return {
+        name
+        for name, struct in structs.items()
+        if name not in moved and (np.abs(struct.pose.raw_pose.numpy(force=True) - origin) < STILL).all()
+    }
 
 
 def _inside_others(checkup: Checkup) -> set[str]:
@@ -75,9 +93,11 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     unposed = {each.name for each in builds if _is_unposed(checkup, each)}
     unposed |= {str(merge.name) for merge in _merges(checkup) if not unposed.isdisjoint(merge.parts)}
     places = {each.name: each.place for each in builds}
+    fixed = immovable(checkup)
     for overlap in checkup.alone.overlaps:
         owners = [body.split("/", 1)[0] for body in overlap.bodies]
-        if overlap.depth < DEEP_AT_LOAD or not unposed.isdisjoint(owners):
+        harmless = overlap.depth < DEEP_AT_LOAD or fixed.issuperset(overlap.bodies)
+        if harmless or not unposed.isdisjoint(owners):
             continue
         own = [places[owner] for owner in owners if places.get(owner) is not None]
         first, second = overlap.bodies

@@ -184,7 +184,7 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
                 else "self._batched_episode_rng, which has a generator for each env's seed"
             )
             yield Found(
-                f"no reset seeds {drawn}: the same seed gives another episode each time. Draw from {write}.",
+                f"{drawn} is seeded by no reset: the same seed gives another episode each time. Draw from {write}.",
                 module.place(node, function.name),
             )
 
