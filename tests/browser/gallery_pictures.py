@@ -103,6 +103,7 @@ def take(browser: Browser, name: str, view: View) -> None:
         if view.all_cameras:
             for tick in page.get_by_role("checkbox", name="rgb").all():
                 tick.check(force=True)
+            page.get_by_text("Show in 3D view").scroll_into_view_if_needed()
         desk.press(*view.keys)
         time.sleep(4)
         turn(page, view)

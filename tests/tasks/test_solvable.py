@@ -21,9 +21,14 @@ def make_batch() -> Iterator[Callable[[str], Any]]:
     envs: list[Any] = []
 
     def make(name: str) -> Any:
-        keywords = {"backend": "cpu", "render_backend": "none", "obs_mode": "state", "rules": "stop"}
         env = workbench.make(
-            FOLDER / f"{name}.py", num_envs=SEEDS, control_mode="pd_ee_delta_pos", **keywords
+            FOLDER / f"{name}.py",
+            num_envs=SEEDS,
+            backend="cpu",
+            rules="stop",
+            render_backend="none",
+            obs_mode="state",
+            control_mode="pd_ee_delta_pos",
         )
         envs.append(env)
         return env
