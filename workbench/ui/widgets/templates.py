@@ -97,6 +97,6 @@ def _environment() -> jinja2.Environment:
     environment.filters.update({filter.__name__: filter for filter in filters})
     macros = environment.get_template("can_be_pressed.html").module
     environment.globals.update(
-        {name: getattr(macros, name) for name in ("press", "to_copy", "at_line", "badge")}
+        {name: getattr(macros, name) for name in ("press", "to_copy", "at_line", "badge", "with_code")}
     )
     return environment
