@@ -55,8 +55,8 @@ COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 
 
 def letter(index: int) -> str:
-    """Label of a recording on the page: A to D, then numbers."""
-    return "ABCD"[index] if index < 4 else str(index + 1)
+    """Label of a recording on the page: A to Z, then AA, AB."""
+    return ("" if index < 26 else letter(index // 26 - 1)) + chr(ord("A") + index % 26)
 
 
 def colour(index: int) -> str:
