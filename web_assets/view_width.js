@@ -1,6 +1,6 @@
 // How wide what lies over the view may be, for the style sheet, in pixels: --wb-timeline-most, and --wb-view-most of what
-// begins at the view's right edge; and --wb-timeline-shift, from where viser puts the timeline. It must not lie over the
-// controls beside the view.
+// begins at the view's right edge, --wb-view-right; and --wb-timeline-shift, from where viser puts the timeline. It must not
+// lie over the controls beside the view.
 "use strict";
 {
   const GAP = 12; // as timeline.py has it
@@ -17,6 +17,7 @@
     const { style } = document.documentElement;
     style.setProperty("--wb-timeline-shift", `${shift}px`);
     style.setProperty("--wb-timeline-most", `${inView.right - given - shift - GAP}px`);
+    style.setProperty("--wb-view-right", `${inView.right}px`);
     style.setProperty("--wb-view-most", `${inView.width - 2 * GAP}px`);
   }
   const resized = new ResizeObserver(tell);

@@ -73,7 +73,9 @@ def mistake(fence: Fence, text: str) -> str:
     old, new = (
         "".join(f"{line[1:]}\n" for line in lines if line[0] in kept) for kept in ((" ", "-"), (" ", "+"))
     )
-    assert old != new and text.count(old) == 1, f"{fence.place}: the task has these lines {text.count(old)} times"
+    assert old != new and text.count(old) == 1, (
+        f"{fence.place}: the task has these lines {text.count(old)} times"
+    )
     return text.replace(old, new)
 
 

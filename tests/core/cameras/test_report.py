@@ -176,11 +176,11 @@ def test_what_was_measured_is_said_of_what_is_there() -> None:
     whole = thing("cube", pixels=[200, 221])
     half = thing("ball", pixels=[3, 0, 6], unhindered=[4, 0, 6], alone=[4, 0, 6], cut=[True, False, False])
     hardly = thing("peg", pixels=[995, 995], unhindered=[1000, 998])
-    found = report(whole, half, hardly, thing("gone", present=False))
-    assert report_text(found, ("cube", "gone")) == "cube: in 2 of 2 envs, about 210 pixels"
+    found = report(whole, half, hardly, thing("gone", present=False), size=(128, 128))
+    assert report_text(found, ("cube", "gone")) == "cube: in 2 of 2 envs, about 210 pixels (1.3 %)"
     assert report_text(found, ("ball", "peg")) == (
-        "ball: in 2 of 3 envs, about 3 pixels, cut by the border in 33%, 12% behind the robot; "
-        "peg: in 2 of 2 envs, about 995 pixels"
+        "ball: in 2 of 3 envs, about 3 pixels (0.018 %), cut by the border in 33%, 12% behind the robot; "
+        "peg: in 2 of 2 envs, about 995 pixels (6.1 %)"
     )
 
 

@@ -71,7 +71,8 @@ def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidde
     )
     rows = object_rows(report)
     assert [row["name"] for row in rows] == ["cube", "bowl", "goal"]
-    assert (rows[0]["seen"], rows[0]["pixels"], rows[0]["cut"]) == ("75 %", "35", "25 %")
+    assert (rows[0]["seen"], rows[0]["pixels"], rows[0]["share"]) == ("75 %", "35", "0.21 %")
+    assert rows[0]["cut"] == "25 %"
     assert rows[0]["bad"] == ["seen", "cut", "hidden"] and rows[1]["bad"] == []
     assert rows[2]["seen"] == "" and "hides" in rows[2]["note"]
 

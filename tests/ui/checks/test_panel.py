@@ -136,6 +136,12 @@ def test_a_finding_has_rule_degree_line_code_and_message_escaped_and_the_tab_cou
     assert "Checks" in shown.panels.folders() and shown.panels.html("wb-rules-mark") == ""
 
 
+def test_what_a_message_has_between_backticks_is_code_and_the_rest_is_as_it_is(shown: Shown) -> None:
+    finding = replace(FOUND, message="`evaluate` gives `a<b>`, and ` alone")
+    shown.draw(replace(DONE, results=(RuleResult("success-at-reset", "broken", (finding,)),)))
+    assert "<code>evaluate</code> gives <code>a&lt;b&gt;</code>, and ` alone" in shown.panels.html()
+
+
 def test_why_and_the_rules_without_a_finding_are_folded_out_by_a_press(shown: Shown) -> None:
     shown.draw(DONE)
     assert "Episodes end before the policy acts" not in shown.panels.html("wb-checks")

@@ -148,6 +148,26 @@ def test_a_dataset_goes_into_the_recordings_folder(
     assert (wanted.export.instruction, wanted.export.only_successes) == ("push it", True)
 
 
+def test_only_successes_cannot_be_ticked_where_none_reaches_success(
+    panel: SharePanel, panels: Panels, making: Noted
+) -> None:
+    several = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(3))
+    panels.set("Make", "LeRobot dataset")
+    panel.draw(Chosen(several, successes=0))
+    ticked = panels.control("Only successes")
+    assert ticked.disabled and not ticked.value and "None of them reaches success" in panels.html()
+    panels.press("Make")
+    assert not making.wanted[-1].export.only_successes
+    panel.draw(Chosen(several, successes=2))
+    assert not ticked.disabled and ticked.value and "None of them" not in panels.html()
+    assert "one dataset of the 2 of these 3 recordings that reach success" in panels.html()
+    panels.set("Only successes", False)
+    panel.draw(Chosen(several, successes=2))
+    assert not ticked.value and "one dataset of these 3 recordings" in panels.html()
+    panel.draw(Chosen(several))
+    assert not ticked.disabled and not ticked.value
+
+
 def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
     panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
 ) -> None:

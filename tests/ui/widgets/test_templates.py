@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
 from workbench.ui.live.banners import banner_html
-from workbench.ui.widgets.templates import counted, percent, place, render, size
+from workbench.ui.widgets.templates import counted, letter, percent, place, render, size
 
 
 def test_a_name_that_cannot_be_sent_is_shown() -> None:
@@ -44,3 +44,7 @@ def test_parts_and_counts_are_said_as_a_person_says_them() -> None:
     nowhere = Problem("step", "it failed", None, None, None, "")
     assert [place(one) for one in (None, nowhere, replace(nowhere, file="/a/push.py"))] == ["", "", "push.py"]
     assert place(replace(nowhere, file="/a/push.py", line=8)) == "push.py:8"
+
+
+def test_recordings_are_lettered_as_columns_of_a_sheet() -> None:
+    assert [letter(index) for index in (0, 3, 4, 25, 26, 63)] == ["A", "D", "E", "Z", "AA", "BL"]

@@ -282,6 +282,14 @@ def _end_to_end(parts: Sequence[_Part]) -> _Part:
     )
 
 
+def size_text(pixels: float, size: tuple[int, int]) -> str:
+    """The share of a picture of this width and height, to two digits: ``0.13 %``."""
+    share = 100 * pixels / (size[0] * size[1])
+    if 0 < share < 0.01:
+        return "< 0.01 %"
+    return f"{share:.0f} %" if share >= 10 else f"{share:.2g} %"
+
+
 def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
     """Text about these objects: ``cube: in 8 of 8 envs, about 210 pixels``."""
     texts = []
@@ -290,9 +298,8 @@ def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
         if not all_envs.present:
             continue
         seen = round(all_envs.seen * all_envs.present)
-        words = (
-            f"{thing.name}: in {seen} of {all_envs.present} envs, about {all_envs.median_pixels:.0f} pixels"
-        )
+        size = f"{all_envs.median_pixels:.0f} pixels ({size_text(all_envs.median_pixels, report.size)})"
+        words = f"{thing.name}: in {seen} of {all_envs.present} envs, about {size}"
         if all_envs.cut > 0:
             words += f", cut by the border in {all_envs.cut:.0%}"
         if all_envs.hidden > 0.005:

@@ -10,7 +10,7 @@ import numpy as np
 import viser
 
 from workbench.core.camera_data import Picture
-from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
+from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, size_text
 from workbench.session.cameras.reports import MOST_SEEDS, MOST_STEPS
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
@@ -290,6 +290,7 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
                 "note": ", ".join(notes),
                 "seen": percent(found.seen),
                 "pixels": f"{found.median_pixels:.0f}",
+                "share": size_text(found.median_pixels, report.size),
                 "cut": percent(found.cut),
                 "hidden": percent(found.hidden),
                 "bad": bad,

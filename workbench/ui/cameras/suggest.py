@@ -31,6 +31,8 @@ OF_THE_ROBOT = 4
 """Links of a robot that are offered at first, its hand's; the others on demand."""
 MOST_RESETS = 256
 LARGEST = 160
+ALIKE = 0.995
+"""Scores of at least this are shown as 1.00."""
 BOX_COLOUR = (230, 73, 128)
 
 Corner = tuple[float, float, float]
@@ -189,6 +191,7 @@ class CameraSuggest:
         return render(
             "camera_offers",
             new=new,
+            alike=len(offered) > 1 and min(offer.score for offer in offered) >= ALIKE,
             offers=[
                 {
                     "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),

@@ -52,6 +52,8 @@ class Chosen:
     """They are those selected in the library."""
     in_view: bool = False
     """It is the one recording in the 3-D view: a film of the view uses the page's viewpoint."""
+    successes: int | None = None
+    """How many of them reach success at some step; None where it is not known of each."""
 
 
 class SharePanel:
@@ -89,8 +91,15 @@ class SharePanel:
         self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
         self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         self._made = server.gui.add_html("")
+        self._wants_successes = True
+        """As a person ticked it, while there is a success to choose."""
+        self._successes.on_update(self._on_successes)
         self._make.on_click(lambda event: self._start(event.client))
         self._stop.on_click(lambda _: self._making.stop())
+
+    def _on_successes(self, event: viser.GuiEvent) -> None:
+        if event.client is not None and not self._successes.disabled:
+            self._wants_successes = self._successes.value
 
     def takes_opened(self, choice: bool) -> bool:
         """Whether the person chose the open recordings instead of the selected ones; `choice`: there are both."""
@@ -102,7 +111,7 @@ class SharePanel:
         view = self._making.view()
         what = WHAT[self._what.value]
         camera = self._camera.value
-        now = (chosen, view, what, camera)
+        now = (chosen, view, what, camera, self._wants_successes)
         if now == self._drawn:
             return
         self._drawn = now
@@ -114,14 +123,19 @@ class SharePanel:
             self._camera.options = options
         self._camera.visible = what == "film" and len(options) > 2
         self._successes.visible = what == "lerobot"
+        self._successes.disabled = chosen.successes == 0
+        self._successes.value = self._wants_successes and chosen.successes != 0
         self._fitting.visible = what == "lerobot" and len(names) > 1
         self._task.visible = what == "lerobot"
         self._make.visible = not view.running
         self._stop.visible = view.running
         self._make.disabled = not chosen.sources
-        will = None if view.running or not names else will_make(what, chosen, camera, self._folder)
+        will = None if view.running or not names else self._will_make(what, camera)
         self._will.content = "" if will is None else render("share_will", **will, most=MOST_NAMED)
         self._made.content = self._html(view)
+
+    def _will_make(self, what: What, camera: str) -> dict[str, Any]:
+        return will_make(what, self._chosen, camera, self._folder, self._successes.value)
 
     def _start(self, client: viser.ClientHandle | None) -> None:
         chosen, what = self._chosen, WHAT[self._what.value]
@@ -155,14 +169,25 @@ class SharePanel:
         return [(self._offers.address(path, download=True), path, name) for path, name in zip(files, short)]
 
 
-def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str, Any]:
+def will_make(
+    what: What, chosen: Chosen, camera: str, folder: Path, only_successes: bool = False
+) -> dict[str, Any]:
     """What a press on *Make* will make, as far as known before the recordings are read: a description, the files with
-    their short names, and the folder ``where`` they go (empty for downloads)."""
+    their short names, the folder ``where`` they go (empty for downloads), and a sentence of what to know before."""
     names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what == "lerobot":
         where = f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a"
-        return {"what": f"one dataset {of}", "files": (), "where": where}
+        known, note = chosen.successes, ""
+        if known == 0:
+            note = (
+                "It does not reach success."
+                if len(names) == 1
+                else "None of them reaches success: all are taken."
+            )
+        elif only_successes and known is not None and known < len(names):
+            of = f"of the {known} of these {len(names)} recordings that reach success"
+        return {"what": f"one dataset {of}", "files": (), "where": where, "note": note}
     if what != "film":
         files = [file_name(what, name) for name in names]
     elif camera in chosen.cameras:
@@ -171,8 +196,9 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str
         files = [file_name(what, name, known) for name in names for known in chosen.cameras]
     else:
         known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
-        return {"what": f"one video for each camera{known} {of}", "files": (), "where": ""}
-    return {"what": counted(len(files), "file"), "files": list(zip(files, short_names(files))), "where": ""}
+        return {"what": f"one video for each camera{known} {of}", "files": (), "where": "", "note": ""}
+    named = list(zip(files, short_names(files)))
+    return {"what": counted(len(files), "file"), "files": named, "where": "", "note": ""}
 
 
 _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
@@ -239,9 +265,10 @@ class SharePart(PagePart[ReviewView]):
         rows = [row for row in rows if row.problem is None]
         cameras = {name: None for row in rows if row.id in opened for name in cameras_by_name(opened[row.id])}
         alone = len(rows) == 1 and len(view.opened) == 1 and rows[0].id in opened
-        self._share.draw(
-            Chosen(tuple(row.source for row in rows), tuple(cameras), selected=bool(ids), in_view=alone)
-        )
+        reached = [row.success_once for row in rows]
+        successes = None if not rows or None in reached else reached.count(True)
+        sources = tuple(row.source for row in rows)
+        self._share.draw(Chosen(sources, tuple(cameras), bool(ids), alone, successes))
         states = {one.id: state for one, state in zip(view.opened, view.states)}
         moments = {path: states[row.id] for row in rows if row.id in states for path in rerun_files((row,))}
         self._rerun.draw(rerun_files(rows), len(rows), moments)

@@ -55,8 +55,8 @@ COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 
 
 def letter(index: int) -> str:
-    """Label of a recording on the page: A to D, then numbers."""
-    return "ABCD"[index] if index < 4 else str(index + 1)
+    """Label of a recording on the page: A to Z, then AA, AB."""
+    return ("" if index < 26 else letter(index // 26 - 1)) + chr(ord("A") + index % 26)
 
 
 def colour(index: int) -> str:
@@ -97,6 +97,6 @@ def _environment() -> jinja2.Environment:
     environment.filters.update({filter.__name__: filter for filter in filters})
     macros = environment.get_template("can_be_pressed.html").module
     environment.globals.update(
-        {name: getattr(macros, name) for name in ("press", "to_copy", "at_line", "badge")}
+        {name: getattr(macros, name) for name in ("press", "to_copy", "at_line", "badge", "with_code")}
     )
     return environment
