@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import linecache
 import re
-import shlex
 from pathlib import Path
 
 import pytest
@@ -65,12 +64,12 @@ def test_what_is_quoted_is_of_all_steps_and_the_whole_page() -> None:
     assert [step.title.split(".")[0] for step in STEPS] == [str(number) for number in range(1, 11)]
     quoted = [fence for step in STEPS for fence in step.fences if fence.language == "diff"]
     assert len(quoted) >= 14
-    assert {rule for step in STEPS for fence in step.fences for rule in _RULE.findall(fence.text)} <= set(RULES)
+    assert {rule for step in STEPS for fence in step.fences for rule in _RULE.findall(fence.text)} <= set(
+        RULES
+    )
 
 
-def walk(
-    step: Step, folder: Path, capfd: pytest.CaptureFixture[str], marks: tuple[str, ...]
-) -> None:
+def walk(step: Step, folder: Path, capfd: pytest.CaptureFixture[str], marks: tuple[str, ...]) -> None:
     """Do a step, in a folder where those before it are done."""
     after(STEPS.index(step), folder)
     file = folder / FILE

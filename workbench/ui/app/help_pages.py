@@ -38,8 +38,8 @@ GROUPS = (
 RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
-    OVERVIEW, "install", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env", "safety",
-    "limits", "gallery", "rules", "keys", "cli",
+    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env",
+    "safety", "limits", "gallery", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics; those that are not listed follow by name."""
 _DOCS = "web_assets/docs/"
