@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -25,6 +26,8 @@ from playwright.sync_api import Browser, Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.browser.film import take_film
+from tests.browser.tutorial_pictures import take_steps, text_after
+from tests.docs.walk import FILE, STEPS, after
 from tests.drive.page import browser_at, close_notice, new_page, open_workbench
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
@@ -110,13 +113,15 @@ def picture_of(page: Page) -> Image.Image:
 
 
 @contextmanager
-def live_page(browser: Browser, *arguments: str, task: str = "") -> Iterator[Desk]:
-    """The page of a copy of the example, paused; `task` is another text of it."""
+def live_page(
+    browser: Browser, *arguments: str, task: str = "", name: str = TASK.name, checks: bool = False
+) -> Iterator[Desk]:
+    """The page of a copy of the example, paused; `task` is another text, `name` another name of the file."""
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / TASK.name
+        file = Path(folder) / name
         file.write_text(task or TASK.read_text())
         shutil.copy(POLICY, file.parent)
-        with open_workbench(str(file), *arguments, cwd=file.parent) as opened:
+        with open_workbench(str(file), *arguments, cwd=file.parent, checks=checks) as opened:
             page, _ = new_page(browser)
             page.goto(opened.url)
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
@@ -352,6 +357,29 @@ def shoot_review(browser: Browser) -> None:
             page.close()
 
 
+def shoot_tutorial(browser: Browser) -> None:
+    """What the reader of the tutorial sees: the live page after each step, then the recorded success."""
+    with live_page(browser, "--num-envs", "8", task=text_after(1), name=FILE, checks=True) as desk:
+        take_steps(desk)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        after(len(STEPS), folder)
+        (typed, *_) = (fence for fence in STEPS[-1].fences if fence.text.startswith("workbench record"))
+        words = shlex.split(typed.text.replace("\\\n", ""))
+        subprocess.run([sys.executable, "-m", "workbench.cli.main", *words[1:]], check=True, cwd=folder)
+        with open_workbench("recordings", cwd=folder, what="review") as opened:
+            page, _ = new_page(browser)
+            page.goto(opened.url)
+            expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
+            close_notice(page)
+            desk = Desk(page, folder / FILE)
+            time.sleep(FRAME)
+            desk.press(*10 * ["ArrowRight"])
+            desk.tab("Cameras")
+            desk.shoot("tutorial_recorded", kind="webp")
+            page.close()
+
+
 SHOTS: dict[str, Callable[[Browser], None]] = {
     "page": shoot_page,
     "reload": shoot_reload,
@@ -362,8 +390,9 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "rescored": shoot_rescored,
     "busy": shoot_busy,
     "review": shoot_review,
+    "tutorial": shoot_tutorial,
 }
-"""``page`` takes run, cameras and banner too, ``review`` library and compare."""
+"""``page`` takes run, cameras and banner too, ``review`` library and compare, ``tutorial`` all of its own."""
 
 
 def main(names: list[str]) -> None:

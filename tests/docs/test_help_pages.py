@@ -13,6 +13,7 @@ from workbench.cli.help import show_help
 from workbench.machine.folders import web_assets_folder
 from workbench.ui.app import help_pages
 from workbench.ui.app.help_pages import ADDRESS, RULE_PAGES, Topic, find_topic, html_of, reply, topics
+from workbench.ui.widgets.templates import render
 
 MOST_LINES_OF_README = 150
 MOST_ENTRIES = 12
@@ -53,6 +54,11 @@ def page_of(topic: Topic) -> Seen:
     status, kind, body = reply(topic.name)
     assert status == 200 and kind.startswith("text/html")
     return Seen(body.decode())
+
+
+def test_the_start_page_leads_to_the_tutorial() -> None:
+    linked = Seen(render("start_head", version="1")).links
+    assert linked == {f"{ADDRESS}tutorial"} and find_topic("tutorial") is not None
 
 
 def test_every_page_of_the_docs_is_a_topic() -> None:

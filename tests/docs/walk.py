@@ -54,7 +54,7 @@ def write(fence: Fence, folder: Path) -> None:
     """Do in the folder what a fence of Python tells the reader to do.
 
     One whose first line is a comment with a file's name is that file. Of any other, imports and constants go below the
-    imports of the task, and the class's attributes and methods take the place of those of the same name.
+    imports of the task, and the class's docstring, attributes and methods take the place of those of the same name.
     """
     named = _NAMED.match(fence.text)
     if named is not None:
@@ -84,7 +84,8 @@ def mistake(fence: Fence, text: str) -> str:
 
 def _below_imports(text: str, added: str) -> str:
     imports = [node for node in ast.parse(text).body if isinstance(node, (ast.Import, ast.ImportFrom))]
-    return _with_lines(text, [(imports[-1].end_lineno or 0, 0, added)])
+    gap = "" if isinstance(ast.parse(added).body[0], (ast.Import, ast.ImportFrom)) else "\n"
+    return _with_lines(text, [(imports[-1].end_lineno or 0, 0, gap + added)])
 
 
 def _into_class(text: str, added: str) -> str:
@@ -109,7 +110,7 @@ def _into_class(text: str, added: str) -> str:
 def _with_lines(text: str, changes: Sequence[tuple[int, int, str]]) -> str:
     """The text with (lines before, lines that go, lines that come), several at one place in their order."""
     lines = text.splitlines(keepends=True)
-    for at, gone, new in reversed(sorted(changes, key=lambda change: change[0])):
+    for at, gone, new in sorted(changes, key=lambda change: change[0])[::-1]:
         lines[at : at + gone] = [new]
     return "".join(lines)
 
@@ -122,5 +123,7 @@ def _first(node: ast.stmt) -> int:
 def _name(node: ast.stmt) -> str:
     if isinstance(node, ast.FunctionDef):
         return node.name
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return "__doc__"
     target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
     return target.id if isinstance(target, ast.Name) else ""

@@ -38,8 +38,8 @@ GROUPS = (
 RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
-    OVERVIEW, "install", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env", "safety",
-    "limits", "gallery", "rules", "keys", "cli",
+    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env",
+    "safety", "limits", "gallery", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics; those that are not listed follow by name."""
 _DOCS = "web_assets/docs/"
@@ -135,7 +135,7 @@ def html_of(topic: Topic) -> str:
     from markdown_it import MarkdownIt  # late: a page that nobody opens needs none
 
     # HTML in the text is our own: README's <picture>.
-    markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
+    markdown = MarkdownIt("commonmark", {"html": True, "highlight": _coloured}).enable("table")
     tokens = markdown.parse(topic.text)
     for token in _all(tokens):
         if token.type == "link_open":
@@ -163,6 +163,17 @@ def html_of(topic: Topic) -> str:
     made = made.replace("<table>", '<div class="wide"><table>').replace("</table>", "</table></div>")
     # Each picture of the page was taken dark and light.
     return re.sub(r'<img src="(/workbench/screenshots/)dark/([\w.]+)" alt="([^"]*)" />', _PICTURE, made)
+
+
+def _coloured(code: str, language: str, attributes: str) -> str:
+    """The lines of a diff as HTML with their signs as classes; empty for other code, which is then only escaped."""
+    if language != "diff":
+        return ""
+    kinds = {"-": "gone", "+": "come"}
+    return "".join(
+        f'<span class="{kinds[line[0]]}">{escape(line)}</span>' if line[0] in kinds else escape(line)
+        for line in code.splitlines(keepends=True)
+    )
 
 
 _PICTURE = (
