@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from tests.ui.scenes import description, table_scene
+from tests.drive.panels import Panels
+from tests.ui.scenes import description, running, table_scene
 from workbench.core.camera_data import CameraInfo, CameraSettings
 from workbench.core.cameras.conventions import matrix_of, pose_of
 from workbench.core.cameras.report import ObjectToSee
-from workbench.session.cameras.view import StudioCamera
-from workbench.ui.cameras.compare import what_differs
+from workbench.session.cameras.view import StudioCamera, StudioView
+from workbench.session.live.view import SessionView
+from workbench.ui.cameras.compare import BEFORE, CameraCompare, what_differs
 from workbench.ui.cameras.export import as_lists, file_name, matrices_html
 from workbench.ui.cameras.suggest import box_edges, choices_of
 from workbench.ui.widgets.progress import NewResult
@@ -136,3 +139,38 @@ def test_what_a_body_is_called_does_not_become_html() -> None:
 def test_a_download_is_named_by_plain_letters(name: str, wanted: str) -> None:
     assert file_name(name, "json", "json") == wanted
     assert file_name(name, "ros", "yaml") == wanted.replace(".json", "_ros.yaml")
+
+
+class RecordedReports:
+    """Stands where the session stands for the Compare folder, and notes what is compared."""
+
+    def __init__(self) -> None:
+        self.shown = running(1)
+        self.compared: list[CameraSettings] = []
+        self.studio = self.reports = self
+
+    def view(self) -> SessionView:
+        return self.shown
+
+    def compare(self, other: CameraSettings) -> None:
+        self.compared.append(other)
+
+
+def test_a_placement_is_compared_with_that_of_the_file_before_it_was_saved(panels: Panels) -> None:
+    session = RecordedReports()
+    folder = CameraCompare(panels.server, cast(Any, session))
+
+    def draw(settings: CameraSettings) -> None:
+        one = camera()
+        in_file = replace(one, info=replace(one.info, settings=settings), now=settings)
+        session.shown = running(1, studio=StudioView(cameras=(in_file,), selected=in_file.key))
+        folder.draw(session.shown)
+
+    draw(SETTINGS)
+    panels.set("Now, with", BEFORE)
+    panels.press("Show side by side")
+    assert session.compared == [] and "in one way" in panels.client.notices[-1]
+    draw(replace(SETTINGS, far=50.0))
+    draw(replace(SETTINGS, far=50.0))
+    panels.press("Show side by side")
+    assert session.compared == [SETTINGS]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -155,6 +156,20 @@ def test_what_cannot_be_read_is_not_opened_and_says_why(
     table.panel.select([damaged.id])
     table.command("Open the selected recordings")
     assert told.opened == []
+
+
+def test_of_a_damaged_recording_what_is_left_is_opened(
+    table: Table, library: Library, told: Told, tmp_path: Path
+) -> None:
+    for file in (Path(__file__).parents[2] / "golden/v1/damaged").glob("*seed0008*"):
+        shutil.copy(file, tmp_path)
+    library.refresh()
+    until(lambda: any(row.problem for row in library.view().rows), "the damaged recording")
+    table.draw()
+    (damaged,) = (row for row in library.view().rows if row.problem)
+    table.panel.select([damaged.id])
+    table.command("Open the selected recordings")
+    assert told.opened == [(damaged.id,)]
 
 
 def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> None:

@@ -144,7 +144,7 @@ class Page:
                 clock=clock,
             )
         with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
-            self._studio = StudioPanel(server, session, clock)
+            self._studio = StudioPanel(server, session, self._view_panel, clock)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             reward = [
                 NumbersPanel(server),

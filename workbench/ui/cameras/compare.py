@@ -17,7 +17,7 @@ from workbench.ui.widgets.inputs import refusals_told
 from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
 
-FILE, KEPT = "as in the file", "saved as A"
+FILE, BEFORE, KEPT = "as in the file", "as in the file before", "saved as A"
 LARGEST = 256
 """Pixels along the longer side of each picture."""
 
@@ -28,12 +28,16 @@ class CameraCompare:
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._kept: dict[CameraKey, CameraSettings] = {}
+        self._in_file: dict[CameraKey, CameraSettings] = {}
+        self._before: dict[CameraKey, CameraSettings] = {}
+        """As the file placed it before the newest change of that."""
         self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
         with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:
             self._other = server.gui.add_dropdown(
                 "Now, with",
-                (FILE, KEPT),
-                hint="The placement to compare with the camera's current one.",
+                (FILE, BEFORE, KEPT),
+                hint="The placement to compare with the camera's current one. The file before: as it was before the "
+                "last change of this camera that was saved.",
             )
             self._keep = server.gui.add_button(
                 "Keep this placement as A",
@@ -76,14 +80,27 @@ class CameraCompare:
                 raise ValueError(
                     "No placement of this camera is kept yet: click Keep this placement as A, then move the camera."
                 )
-            other = camera.info.settings if choice == FILE else self._kept[camera.key]
+            if choice == BEFORE and camera.key not in self._before:
+                raise ValueError("The file has placed this camera in one way since the page was opened.")
+            earlier = self._before if choice == BEFORE else self._kept
+            other = camera.info.settings if choice == FILE else earlier[camera.key]
             self._asked = (camera.key, camera.now, other, choice)
             self._pair.asked(self._session.view().studio.results.compared)
             self._session.studio.reports.compare(other)
 
+    def _note_file(self, cameras: tuple[StudioCamera, ...]) -> None:
+        for camera in cameras:
+            settings, known = camera.info.settings, self._in_file.get(camera.key)
+            if settings is None:
+                continue
+            if known is not None and what_differs(known, settings):
+                self._before[camera.key] = known
+            self._in_file[camera.key] = settings
+
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         camera = studio.chosen
+        self._note_file(studio.cameras)
         usable = camera is not None and camera.now is not None
         for button in (self._keep, self._compare):
             button.disabled = not usable

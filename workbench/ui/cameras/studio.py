@@ -29,6 +29,7 @@ from workbench.ui.cameras.pose_math import Floats, Frame, Placing, Snap, nudged,
 from workbench.ui.cameras.report import CameraReportPanel
 from workbench.ui.cameras.suggest import CameraSuggest
 from workbench.ui.cameras.write_to_file import WriteToFile
+from workbench.ui.scene.viewpoint import ViewPanel
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.hotkeys import Command
 from workbench.ui.widgets.inputs import Control, refusals_told
@@ -42,6 +43,7 @@ STEP = 0.01
 """Metres by which a key moves the camera."""
 TURN = 1.0
 """Degrees by which a key turns it."""
+VIEW = "Envs in the 3D view (O). With one alone the handles are large."
 HANDLES = (
     "pose: move or rotate the camera; its target moves with it.\n"
     "eye and target: move the eye, and it keeps looking at its target; or move the target."
@@ -73,8 +75,14 @@ class StudioPanel(PagePart[SessionView]):
     used all the time (look through it, undo); the pose; the lens, folded.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        self._server, self._session = server, session
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        view_panel: ViewPanel,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self._server, self._session, self._view_panel = server, session, view_panel
         self._placing = Placing(session)
         self._keys: tuple[CameraKey, ...] = ()
         self._names: dict[str, CameraKey | None] = {NO_CAMERA: None}
@@ -103,8 +111,8 @@ class StudioPanel(PagePart[SessionView]):
         self._suggest = CameraSuggest(server, session)
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
-        self._presses.when_unfolded(self._choose_first)
-        self._was_opened = False
+        self._presses.when_unfolded(self._on_opened)
+        self._was_opened = self._has_chosen = False
         with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
         self._gizmo = CameraGizmo(
@@ -115,12 +123,16 @@ class StudioPanel(PagePart[SessionView]):
             look_at=lambda: self._look_at,
         )
 
-    def _choose_first(self) -> None:
-        """The tab was opened: choose its first sensor camera, once. A person may then choose none."""
-        view = self._session.view()
-        if self._was_opened or view.task is None:
-            return
+    def _on_opened(self) -> None:
+        """The tab was opened, perhaps before the task was loaded."""
         self._was_opened = True
+        self._choose_first(self._session.view())
+
+    def _choose_first(self, view: SessionView) -> None:
+        """Choose the first sensor camera once the tab was opened. A person may then choose none."""
+        if self._has_chosen or not self._was_opened or view.task is None:
+            return
+        self._has_chosen = True
         cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras and view.studio.selected is None:
             self._session.studio.select(cameras[0].key)
@@ -173,6 +185,7 @@ class StudioPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio
+        self._choose_first(view)
         self._draw_choice(view)
         self._writing.draw(studio)
         chosen, camera = studio.chosen, studio.placeable
@@ -193,7 +206,8 @@ class StudioPanel(PagePart[SessionView]):
             self._facts.content = self._facts_of(chosen, view)
         if camera is not None:
             self._tools.content = self._tools_of(camera, studio)
-            self._handles.content = self._handles_of(studio.preview_scale)
+            several = view.task is not None and view.task.num_envs > 1
+            self._handles.content = self._handles_of(studio.preview_scale, several)
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
@@ -275,10 +289,18 @@ class StudioPanel(PagePart[SessionView]):
         ]
         return render("studio_tools", rows=rows)
 
-    def _handles_of(self, scale: float) -> str:
-        """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size)."""
+    def _handles_of(self, scale: float, several: bool) -> str:
+        """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size).
+
+        Args:
+            several: there is more than one env. Among many the handles are a small knot.
+        """
         kinds = {kind: kind for kind in self._picture.kinds}
+        show = self._view_panel
+        choices = {"all envs": False, "this env": True}
+        envs = Toggle("View", VIEW, choices, show.only_selected, show.show_only_selected)
         toggles = (
+            *((envs,) if several else ()),
             Toggle(
                 "Handles",
                 HANDLES,

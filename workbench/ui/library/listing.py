@@ -176,6 +176,8 @@ class Action:
     modifier: KeyModifier | None = None
     reads: bool = True
     """Whether it reads the recordings; False for what also applies to files that cannot be read."""
+    salvages: bool = False
+    """Whether it takes what is left of a damaged recording."""
 
 
 def walking(listed: LibraryList) -> list[Command]:

@@ -76,8 +76,7 @@ class LibraryPanel(PagePart[object]):
                 MOST_OPEN,
                 "Open the selected recordings",
                 "enter",
-                # Of a damaged one it shows what can be read.
-                reads=False,
+                salvages=True,
             ),
             Action(
                 "Tag",
@@ -376,15 +375,23 @@ class LibraryPanel(PagePart[object]):
         elif action.most is not None and len(ids) > action.most:
             body = f"{action.label} takes at most {action.most} at once."
             tell_all(self._server, f"{len(ids)} are selected", body, seconds=8.0)
-        elif action.reads and (why := self._why_unreadable(ids)):
+        elif action.reads and (why := self._why_unreadable(ids, action.salvages)):
             tell_all(self._server, f"{action.label} needs a recording that is not damaged", why, "red")
         else:
             action.run(ids)
+            for row in self._library.view().rows if action.salvages else ():
+                if row.id in ids and row.problem:
+                    body = f"{row.problem} What can be read of it is shown."
+                    tell_all(self._server, "This recording is damaged", body, "orange")
 
-    def _why_unreadable(self, ids: tuple[str, ...]) -> str:
-        """Why none of these can be read; empty if one can."""
+    def _why_unreadable(self, ids: tuple[str, ...], salvages: bool) -> str:
+        """Why none of these can be read; empty if one can.
+
+        Args:
+            salvages: what is left of a damaged recording of the workbench is enough.
+        """
         rows = [row for row in self._library.view().rows if row.id in ids]
-        broken = [row for row in rows if row.problem]
+        broken = [row for row in rows if row.problem and not (salvages and row.kind == "workbench")]
         if len(broken) < len(rows) or not rows:
             return ""
         return (

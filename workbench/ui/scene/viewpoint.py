@@ -272,8 +272,11 @@ class ViewPanel(PagePart[SessionView]):
     def looks(self) -> Looks:
         return Looks(DETAILS[self._detail.value], self.dark)
 
+    def show_only_selected(self, only: bool) -> None:
+        self._show.value = ONE if only else ALL
+
     def toggle_only_selected(self) -> None:
-        self._show.value = ALL if self.only_selected else ONE
+        self.show_only_selected(not self.only_selected)
 
     def toggle_dark(self) -> None:
         self._theme.value = LIGHT if self._theme.value == DARK else DARK
