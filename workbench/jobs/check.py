@@ -66,6 +66,8 @@ class CheckOptions:
     """As `RecordArguments.actions`. In further episodes, beside random ones, what it names acts."""
     workers: int | None = None
     """Processes; None for as many as cores and groups of rules allow."""
+    solve: bool = False
+    """Whether the rules that need planned episodes are checked too."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
     for name, number in (("seeds", what.seeds), ("workers", what.workers)):
         if number is not None and number < 1:
             raise ValueError(f"--{name} must be at least 1, not {number}")
-    degrees = degree_of_each(what.select, what.ignore)
+    degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
     if not groups_of(degrees):
         raise ValueError("no rule is left to check")
     return degrees
@@ -281,7 +283,7 @@ class _Stopped(Exception):
 def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
     """Check the groups that one process gets. Raises as `check`."""
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
-    degrees = degree_of_each(what.select, what.ignore)
+    degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
     groups = groups_of(degrees)
     number = -1
 

@@ -64,7 +64,7 @@ class Sampler:
         drawn = torch.randn(shape, generator=self._generator)
         flips = torch.rand(shape, generator=self._generator) < _FLIPS
         # What only a long motion shows is found by a third of one action throughout.
-        drawn[0::3] = drawn[0::3, :1].clone()
+        drawn[0::3], flips[0::3] = drawn[0::3, :1].clone(), flips[0::3, :1].clone()
         drawn[2::3] *= _SMALL
         knots = self._mean + drawn * self._spread
         switched = torch.where(flips, torch.sign(drawn), self._mean)
@@ -98,6 +98,8 @@ class Sampler:
             width = self._options.temperature * returns[finite].std(correction=0)
             weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
             self._mean = (weights[:, None, None] * knots).sum(0)
+        # A gripper does not go by halves.
+        self._mean = torch.where(self._switches, knots[best[0]], self._mean)
         self._kept = knots[best[:_KEPT]].clone()
 
     def shift(self, steps: int) -> None:

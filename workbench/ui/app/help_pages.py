@@ -39,7 +39,7 @@ RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
     OVERVIEW, "install", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env", "safety",
-    "limits", "gallery", "rules", "keys", "cli",
+    "limits", "gallery", "solve", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics; those that are not listed follow by name."""
 _DOCS = "web_assets/docs/"
