@@ -65,6 +65,6 @@ def test_its_rule_is_broken_where_it_is_solved_and_no_other(name: str) -> None:
 
 @pytest.mark.slow
 def test_the_mended_version_of_it_breaks_none() -> None:
-    results = check_rules(SOLVE_RULES, str(FOLDER.parent / "reach_ball.py"), num_envs=4, seeds=4)
+    results = check_rules(SOLVE_RULES, str(FOLDER / "mended" / "reach_ball.py"), num_envs=4, seeds=4)
     assert {result.state for result in results.values()} == {"kept"}
     assert results["reward-exploited"].notes[0].startswith("planning solved 4 of 4 seeds")

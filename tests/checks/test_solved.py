@@ -23,6 +23,8 @@ def test_they_are_off_unless_they_are_asked_for() -> None:
     assert degree_of_each(ignore=["reward-flat"], solve=True)["reward-flat"] == "off"
     counted = [count_rules(degrees_of_request(CheckOptions("x", solve=solve))) for solve in (False, True)]
     assert counted[1] - counted[0] == len(SOLVE_RULES)
+    with pytest.raises(ValueError, match="--solve checks"):
+        degrees_of_request(CheckOptions("x", actions="solve"))
 
 
 @pytest.mark.parametrize(

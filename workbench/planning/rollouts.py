@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -104,7 +104,13 @@ def make_rollout_env(
         rules="off",  # the live env has them
         kwargs=kept,
     )
-    rolled = build_env(task_class(env), options)
+    try:
+        rolled = build_env(task_class(env), options)
+    except Exception:
+        # A task may want a renderer to be built, in many ways: only trying says whether that was it.
+        if not env.scene.can_render():
+            raise
+        rolled = build_env(task_class(env), replace(options, render=True))
     try:
         rolled.reset(seed=0)
     except BaseException:
