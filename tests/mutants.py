@@ -99,7 +99,7 @@ PROTECTED = {
     "session/history/history": "session/history/test_history.py session/history/test_env_table.py",
     "session/history/env_table": "session/history/test_env_table.py",
     "session/history/curves": "session/history/test_curves.py",
-    "jobs/verdict": "jobs/test_verdict.py",
+    "jobs/rescore/verdict": "jobs/test_verdict.py",
     "session/rescore/past": "session/rescore/test_past.py session/rescore/test_past_rescorer.py",
     "session/process/supervisor": "session/process/test_supervisor.py",
     "session/live/versions": "session/live/test_recovery.py session/live/test_versions.py",

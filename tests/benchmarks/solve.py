@@ -70,7 +70,7 @@ def measure(env_id: str, options: Options) -> dict[str, float]:
     for _ in range(options.steps):
         plan = planners["quick"].plan(workbench.take_snapshot(live), 0)
         live.step(torch.from_numpy(plan.actions[:1]))
-    many.reset(seed=list(range(options.plan.rollouts)))
+    many.reset(seed=0)
     snapshot = workbench.take_snapshot(live)
     tried: list[Any] = []
 

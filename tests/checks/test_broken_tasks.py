@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import check_rules, the_finding
-from workbench.checks.rules import RULES
+from workbench.checks.rules import RULES, SOLVE_RULES
 
 FOLDER = Path(__file__).parents[2] / "tasks" / "broken"
 BROKEN = {
@@ -25,6 +25,8 @@ BROKEN = {
     "touch_cube": ("camera-sees", ""),
 }
 """The rule, and how the line of its finding begins."""
+WHEN_SOLVED = {"reach_ball": ("reward-exploited", "def compute_dense_reward(")}
+"""Likewise, of rules that need planned episodes."""
 BESIDES = {
     "calm_reach": {"rows-rewritten"},
     "push_to_square": {"reward-changes"},
@@ -36,14 +38,33 @@ BESIDES = {
 
 
 def test_every_small_task_is_listed() -> None:
-    assert {file.stem for file in FOLDER.glob("*.py")} == BROKEN.keys()
+    assert {file.stem for file in FOLDER.glob("*.py")} == BROKEN.keys() | WHEN_SOLVED.keys()
 
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_its_rule_is_broken_at_its_line_and_no_other(name: str, renderer: None) -> None:
     rule, line = BROKEN[name]
-    results = check_rules(RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=4)
+    results = check_rules(RULES.keys() - SOLVE_RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=4)
     assert the_finding(results[rule]).code.startswith(line)
     broken = {each for each, result in results.items() if result.state == "broken"}
     assert broken - {rule} <= BESIDES.get(name, set())
     assert not [result for result in results.values() if result.state == "failed"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WHEN_SOLVED)
+def test_its_rule_is_broken_where_it_is_solved_and_no_other(name: str) -> None:
+    rule, line = WHEN_SOLVED[name]
+    # The last seeds of eight are those that are solved.
+    results = check_rules(RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=8, render_backend="none")
+    finding = the_finding(results[rule])
+    assert finding.code.startswith(line) and "without success" in finding.message
+    assert results[rule].notes == ("planning solved 2 of 8 seeds, in 6 control steps (median)",)
+    assert {each for each, result in results.items() if result.state in ("broken", "failed")} == {rule}
+
+
+@pytest.mark.slow
+def test_the_mended_version_of_it_breaks_none() -> None:
+    results = check_rules(SOLVE_RULES, str(FOLDER / "mended" / "reach_ball.py"), num_envs=4, seeds=4)
+    assert {result.state for result in results.values()} == {"kept"}
+    assert results["reward-exploited"].notes[0].startswith("planning solved 4 of 4 seeds")

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from workbench.cli.rescore import print_verdicts
-from workbench.jobs.verdict import Verdict
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.row import Source
 
 NAME = "WorkbenchPushCube-v1_seed626610453_env00_2026-11-22T01-07-22"

@@ -40,6 +40,7 @@ COMMANDS = (
     "review",
     "record",
     "check",
+    "solve",
     "rescore",
     "share",
     "export",

@@ -41,7 +41,7 @@ RUN = ("", "slow", "wrong")
 OPENS_A_PAGE = ("open", "review")
 COMMANDS = {"open": main.open_page} | {
     name: getattr(main, name)
-    for name in ("new", "record", "check", "review", "rescore", "share", "export", "view", "doctor")
+    for name in ("new", "record", "check", "solve", "review", "rescore", "share", "export", "view", "doctor")
 }
 TYPED = [
     page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))

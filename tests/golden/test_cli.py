@@ -31,6 +31,7 @@ COMMANDS = (
     "new",
     "record",
     "check",
+    "solve",
     "review",
     "rescore",
     "share",
@@ -92,6 +93,15 @@ CALLS = {
         "check push.py --fail-on off",
         "check push.py --sarif push.py/report.sarif",
         "check untidy.py",
+    ],
+    "solve": [
+        "solve",
+        "solve gone.py",
+        "solve push.py --seeds 0",
+        "solve push.py --workers 0",
+        "solve push.py --rollouts 2",
+        "solve push.py --method guess",
+        "solve push.py --junit .",
     ],
     "review": ["review gone", "review made --task gone.py", "review made --host 0.0.0.0 --no-token"],
     "rescore": [

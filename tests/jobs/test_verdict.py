@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from workbench.jobs.verdict import (
+from workbench.jobs.rescore.verdict import (
     DOUBTFUL_METRES,
     DOUBTFUL_RADIANS,
     Scores,

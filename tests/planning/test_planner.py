@@ -13,13 +13,11 @@ import pytest
 import torch
 
 import workbench
-from workbench.core.maniskill_private import open_env
+from tests.planning.walking import MADE, SMALL, walk
 from workbench.core.snapshots.cpu_state import CpuState
 from workbench.planning.rollouts import NotAlike
 
 TASKS = Path(__file__).parents[2] / "tasks"
-SMALL: dict[str, Any] = {"rollouts": 8, "horizon": 0.2}
-MADE: dict[str, Any] = {"control_mode": "pd_ee_delta_pose", "render_backend": "none", "backend": "cpu"}
 REACHES = '''
 """The hand is to rise, the author's way: NaN, an early end and a draw of random numbers where a test asks for them."""
 import torch
@@ -72,18 +70,6 @@ def push() -> Iterator[tuple[Any, workbench.Planner]]:
     env.close()
 
 
-def walk(env: Any, planner: workbench.Planner, env_idx: list[int] | None, steps: int = 3) -> np.ndarray:
-    """(T, N, A) the actions that are planned and taken from a reset on."""
-    env.reset(seed=[5, 6, 7, 8][: open_env(env).num_envs])
-    planner.reset()
-    taken = []
-    for _ in range(steps):
-        action = planner.actions(env_idx)
-        env.step(action)
-        taken.append(action.numpy().copy())
-    return np.stack(taken)
-
-
 def test_the_same_state_and_seed_give_the_same_plan_whatever_was_planned_before(
     push: tuple[Any, workbench.Planner],
 ) -> None:
@@ -112,7 +98,7 @@ def test_another_process_gives_the_same_plan(push: tuple[Any, workbench.Planner]
     env, planner = push
     here = walk(env, planner, None)
     program = (
-        "import workbench; from tests.planning.test_planner import MADE, SMALL, walk\n"
+        "import workbench; from tests.planning.walking import MADE, SMALL, walk\n"
         "env = workbench.make('PushCube-v1', 4, **MADE); planner = workbench.Planner(env, threads=1, **SMALL)\n"
         "print(walk(env, planner, None).tobytes().hex())"
     )

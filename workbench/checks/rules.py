@@ -421,6 +421,49 @@ _TABLE = (
         "Thousands of envs do not fit the GPU's memory.",
         "_default_sensor_configs",
     ),
+    # --- solved by planning (--solve) ------------------------------------------------------------------------
+    Rule(
+        "reward-exploited",
+        "warn",
+        "An episode without success earns less than a successful one.",
+        "A policy learns what pays as much, and never solves the task.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "reward-flat",
+        "warn",
+        "While the task is unsolved, some actions earn more than others.",
+        "Nothing leads on: training stays where the reward is flat.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "reward-stuck",
+        "warn",
+        "While the task is unsolved, some actions earn more than holding still.",
+        "A policy learns to stop there: what leads on costs reward first.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "reward-against",
+        "warn",
+        "The reward does not fall on the way to success.",
+        "A policy has to learn against its reward, and most turn back.",
+        "compute_dense_reward",
+    ),
+    Rule(
+        "success-lost",
+        "warn",
+        "A solved task stays solved while its reward is sought.",
+        "Success depends on the step at which it is looked at, and the reward leads away from it.",
+        "evaluate",
+    ),
+    Rule(
+        "failing-pays",
+        "warn",
+        "Failing early does not earn more than going on.",
+        "A policy learns to end the episode as soon as it can.",
+        "compute_dense_reward",
+    ),
     # --- time ------------------------------------------------------------------------------------------------
     Rule(
         "loop-over-envs",
@@ -446,6 +489,10 @@ _TABLE = (
 )
 CHECK_RULES: Mapping[str, Rule] = {rule.id: rule for rule in _TABLE}
 """Those that `checks` looks at, beyond the rules of GPU simulation."""
+SOLVE_RULES = frozenset(
+    ("reward-exploited", "reward-flat", "reward-stuck", "reward-against", "success-lost", "failing-pays")
+)
+"""Those of them that need planned episodes, which take minutes: off unless they are asked for."""
 RULES: Mapping[str, Rule] = {**core_rules.RULES, **CHECK_RULES}
 """All, by id."""
 
@@ -457,7 +504,10 @@ def did_you_mean(rule: str) -> str:
 
 
 def degree_of_each(
-    select: Collection[str] = (), ignore: Collection[str] = (), choice: Degree | None = None
+    select: Collection[str] = (),
+    ignore: Collection[str] = (),
+    choice: Degree | None = None,
+    solve: bool = False,
 ) -> dict[str, Degree]:
     """The degree of each rule.
 
@@ -465,6 +515,7 @@ def degree_of_each(
         select: only these rules; all others are off. Empty for all.
         ignore: rules that are off.
         choice: the degree of all others; None for each rule's own.
+        solve: whether `SOLVE_RULES` are among all; else they are off unless `select` names them.
 
     Raises:
         ValueError: an id that no rule has.
@@ -474,7 +525,7 @@ def degree_of_each(
             raise ValueError(
                 f"no rule is called {rule!r}{did_you_mean(rule)}; `workbench help rules` lists them"
             )
-    return {
-        rule.id: "off" if rule.id in ignore or (select and rule.id not in select) else choice or rule.degree
-        for rule in RULES.values()
-    }
+    chosen = set(select or RULES) - set(ignore)
+    if not solve and not select:
+        chosen -= SOLVE_RULES
+    return {rule.id: (choice or rule.degree) if rule.id in chosen else "off" for rule in RULES.values()}

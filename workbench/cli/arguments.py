@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import tyro
 
 from workbench.core.rules import DEGREES, Degree
+from workbench.planning.options import PlanArguments, PlanOptions
 
 if TYPE_CHECKING:
     from workbench.jobs.task import TaskOptions
@@ -118,6 +119,14 @@ class CheckArguments:
 
     def options(self) -> TaskOptions:
         return EnvArguments(self.num_envs, "cpu", None, self.imports, self.seed, self.env).options()
+
+
+def plan_options(plan: PlanArguments) -> PlanOptions:
+    """Raises ValueError with a message that names the argument."""
+    try:
+        return PlanOptions(**vars(plan))
+    except ValueError as error:
+        raise ValueError(f"--{error}") from error
 
 
 def separated(names: Sequence[str]) -> tuple[str, ...]:

@@ -77,7 +77,7 @@ def as_json(said: Reported) -> str:
     """All that is known, as one object."""
     report, what = said.report, said.what
     task = report.task
-    return _json(
+    return json_text(
         {
             "task": {
                 "id": task.env_id,
@@ -149,7 +149,8 @@ def _rule(result: RuleResult, root: Path) -> dict[str, Any]:
     }
 
 
-def _json(value: Any) -> str:
+def json_text(value: Any) -> str:
+    """The value as JSON, in ASCII alone."""
     # Not every program reads bytes of a file's name that are no UTF-8: ASCII alone.
     return json.dumps(value, indent=1) + "\n"
 
@@ -174,12 +175,12 @@ def as_junit(said: Reported) -> str:
     totals = {**{name: str(count) for name, count in counts.items()}, "time": f"{report.seconds:.3f}"}
     suites = ElementTree.Element("testsuites", {"name": "workbench check", **totals})
     now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    named = {"name": _xml(report.task.env_id), "timestamp": now}
+    named = {"name": xml_text(report.task.env_id), "timestamp": now}
     suite = ElementTree.SubElement(suites, "testsuite", {**named, **totals})
     suite.extend(cases)
     if report.comments:
         told = [f"{shown_path(one.file, root)}:{one.line}: {one.message}" for one in report.comments]
-        ElementTree.SubElement(suite, "system-out").text = _xml("\n".join(told))
+        ElementTree.SubElement(suite, "system-out").text = xml_text("\n".join(told))
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -191,26 +192,28 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
     file = task.file if place is None else place.file
     case = _test_case(task.env_id, result.rule, result.seconds)
     if file is not None:
-        case.set("file", _xml(shown_path(file, root)))
+        case.set("file", xml_text(shown_path(file, root)))
         case.set("line", str(1 if place is None else place.line or 1))
     failing = [finding for finding in result.findings if said.fails(finding)]
     if failing:
-        failure = ElementTree.SubElement(case, "failure", type=result.rule, message=_xml(failing[0].message))
-        failure.text = _xml("\n\n".join(_text(finding, root) for finding in failing))
+        failure = ElementTree.SubElement(
+            case, "failure", type=result.rule, message=xml_text(failing[0].message)
+        )
+        failure.text = xml_text("\n\n".join(_text(finding, root) for finding in failing))
     elif result.state == "failed" and said.fail_on == "never":
         ElementTree.SubElement(
-            case, "skipped", type="workbench.undecided", message=_xml(f"not decided: {result.why}")
+            case, "skipped", type="workbench.undecided", message=xml_text(f"not decided: {result.why}")
         )
     elif result.state == "failed":
-        error = ElementTree.SubElement(case, "error", type="TaskError", message=_xml(result.why))
-        error.text = _xml(result.why)
+        error = ElementTree.SubElement(case, "error", type="TaskError", message=xml_text(result.why))
+        error.text = xml_text(result.why)
     elif result.state == "skipped":
-        ElementTree.SubElement(case, "skipped", type="workbench.skip", message=_xml(result.why))
+        ElementTree.SubElement(case, "skipped", type="workbench.skip", message=xml_text(result.why))
     lines = [_text(finding, root) for finding in result.findings if not said.fails(finding)]
     lines += [f"silenced: {_text(one.finding, root)}\nreason: {one.reason}" for one in result.silenced]
     lines += result.notes
     if lines:
-        ElementTree.SubElement(case, "system-out").text = _xml("\n\n".join(lines))
+        ElementTree.SubElement(case, "system-out").text = xml_text("\n\n".join(lines))
     return case
 
 
@@ -225,17 +228,17 @@ def _error_case(said: Reported, error: Problem, root: Path) -> ElementTree.Eleme
     where = ""
     if (place := said.place_of_error) is not None:
         file, line = shown_path(place[0], root), place[1]
-        case.set("file", _xml(file))
+        case.set("file", xml_text(file))
         case.set("line", str(line))
         where = f"{file}:{line}: "
-    found = ElementTree.SubElement(case, "error", type=_xml(error.stage), message=_xml(error.message))
+    found = ElementTree.SubElement(case, "error", type=xml_text(error.stage), message=xml_text(error.message))
     code = f"\n    {error.code}" if error.code else ""
-    found.text = _xml(f"{where}{error.stage} failed\n{error.message}{code}\n{error.traceback}".rstrip())
+    found.text = xml_text(f"{where}{error.stage} failed\n{error.message}{code}\n{error.traceback}".rstrip())
     return case
 
 
 def _test_case(env_id: str, name: str, seconds: float) -> ElementTree.Element:
-    classname = _xml(f"workbench.check.{env_id}")
+    classname = xml_text(f"workbench.check.{env_id}")
     return ElementTree.Element("testcase", classname=classname, name=name, time=f"{seconds:.3f}")
 
 
@@ -246,7 +249,7 @@ def _text(finding: Finding, root: Path) -> str:
     return f"{place}{finding.rule} ({finding.degree})\n{finding.message}{code}\nOtherwise: {otherwise}"
 
 
-def _xml(text: str) -> str:
+def xml_text(text: str) -> str:
     """The text with what XML cannot hold escaped."""
     return _NOT_IN_XML.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
@@ -307,7 +310,7 @@ def as_sarif(said: Reported) -> str:
         "columnKind": "unicodeCodePoints",
         "results": results,
     }
-    return _json({"$schema": SCHEMA, "version": "2.1.0", "runs": [run]})
+    return json_text({"$schema": SCHEMA, "version": "2.1.0", "runs": [run]})
 
 
 _ERROR_RULE = {

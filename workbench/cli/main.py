@@ -24,6 +24,7 @@ from workbench.cli.arguments import (
     Rules,
     history_bytes,
     imported,
+    plan_options,
     separated,
 )
 from workbench.cli.terminal import Exit, print_problem, print_text, refuse, warn
@@ -32,11 +33,13 @@ from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mix
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
+from workbench.planning.options import PlanArguments
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
 
 _FEW = EnvArguments(num_envs=4)
+_PLAN = PlanArguments()
 
 app = tyro.extras.SubcommandApp()
 # Commands import what they need when they are chosen, so that ``--help`` and a mistyped option answer at once.
@@ -176,6 +179,7 @@ def new(
 @app.command
 def record(
     recording: Annotated[RecordArguments, tyro.conf.PositionalRequiredArgs],
+    plan: PlanArguments = _PLAN,
     envs: EnvArguments = _FEW,
     debug: bool = False,
 ) -> int:
@@ -198,14 +202,14 @@ def record(
         from workbench.machine.processes.debugger import debug_here
 
     try:
-        options = envs.options()
+        options, planned = envs.options(), plan_options(plan)
         if debug and recording.workers > 1:
             raise ValueError("--debug is for one process: leave out --workers")
         if debug:
             debug_here(print_text)
     except ValueError as error:
         return refuse(str(error))
-    return record_in_terminal(RecordOptions(**vars(recording), options=options))
+    return record_in_terminal(RecordOptions(**vars(recording), options=options, plan=planned))
 
 
 @app.command
@@ -218,6 +222,7 @@ def check(
     select: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     ignore: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     actions: str = "random",
+    solve: bool = False,
     fail_on: Literal["stop", "warn", "never"] = "stop",
     json: bool = False,
     json_file: Path | None = None,
@@ -234,6 +239,8 @@ def check(
         ignore: do not check this rule; repeatable, or several with commas.
         actions: zero, hold, a policy as module:function or file.py:function, or a file, as of workbench record: it acts
             in further episodes, beside random actions, for the rules of evaluate() and of rewards.
+        solve: also plan episodes with the task's own reward, and check what that shows of it: minutes more. See workbench
+            help solve.
         fail_on: lowest degree of a finding that makes the exit code 1; never is for a job that only reports.
         json: print the result as JSON in place of text.
         json_file: also write the result to this file, as JSON.
@@ -266,8 +273,82 @@ def check(
         from workbench.jobs.check import CheckOptions
 
     rules = separated(select), separated(ignore)
-    what = CheckOptions(task, options, envs.seeds, *rules, actions, workers)
+    what = CheckOptions(task, options, envs.seeds, *rules, actions, workers, solve)
     return check_in_terminal(what, CheckOutput(json, json_file, junit, sarif, fail_on), began)
+
+
+@app.command
+def solve(
+    task: Task,
+    /,
+    *,
+    plan: PlanArguments = _PLAN,
+    seeds: int = 32,
+    seed: int = 0,
+    workers: int | None = None,
+    max_steps: int | None = None,
+    pictures: bool = False,
+    out: Path = Path("recordings"),
+    imports: Imports = (),
+    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    json: bool = False,
+    json_file: Path | None = None,
+    csv: bool = False,
+    csv_file: Path | None = None,
+    junit: Path | None = None,
+) -> int:
+    """Solve a task by planning with its own reward, before anyone trains on it: how many seeds, in how many steps, and what
+    the rollouts tell of the reward. Episodes are recorded. The exit code is 1 where the reward breaks a rule, or no seed is
+    solved.
+
+    Args:
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
+        seeds: how many seeds are tried.
+        seed: the first of them; each further one counts up.
+        workers: processes, as many as cores if it is not given; the result is the same with any number.
+        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
+        pictures: record what every camera sees.
+        out: folder for the recordings.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
+        env: further arguments of the task class, as name=value (value in JSON, or text), such as
+            control_mode=pd_ee_delta_pose; repeatable.
+        json: print the result as JSON in place of text.
+        json_file: also write the result to this file, as JSON.
+        csv: print a row for each seed as CSV in place of text.
+        csv_file: also write the rows to this file, as CSV.
+        junit: also write the result to this file as JUnit's XML.
+    """
+    if _lacks_maniskill("solve"):
+        return Exit.REFUSED
+    from workbench.authoring.loading.reference import why_missing
+
+    if (why := why_missing(task)) is not None:
+        return refuse(why)
+    if json and csv:
+        return refuse(
+            "--json and --csv both print the result: give one of them, and --json-file or --csv-file"
+        )
+    if (why := _without_folder(json_file, csv_file, junit)) is not None:
+        return refuse(why)
+    cores = len(os.sched_getaffinity(0))
+    try:
+        options = EnvArguments(1, "auto", None, imports, seed, env).options()
+        planned = plan_options(plan)
+        for name, number in (("seeds", seeds), ("workers", workers), ("max-steps", max_steps)):
+            if number is not None and number < 1:
+                raise ValueError(f"--{name} must be at least 1, not {number}")
+    except ValueError as error:
+        return refuse(str(error))
+    if pictures and options.env_kwargs.get("render_backend") != "none":
+        use_private_driver()
+    with quick_imports():
+        from workbench.cli.solve import SolveOutput, solve_in_terminal
+        from workbench.jobs.solve import SolveOptions
+
+    processes = min(seeds, cores if workers is None else workers)
+    what = SolveOptions(task, out, seeds, processes, pictures, max_steps, planned, options)
+    return solve_in_terminal(what, SolveOutput(json, json_file, csv, csv_file, junit))
 
 
 @app.command
@@ -418,7 +499,8 @@ def share(
 def export(
     files: Annotated[tuple[Path, ...], tyro.conf.Positional],
     /,
-    lerobot: Path,
+    lerobot: Path | None = None,
+    maniskill: Path | None = None,
     only_successes: bool = False,
     only_fitting: bool = False,
     task: str | None = None,
@@ -432,6 +514,8 @@ def export(
     Args:
         files: recordings, or folders of them.
         lerobot: folder that becomes a LeRobot dataset (version 3); must not exist yet.
+        maniskill: file (.h5) that becomes ManiSkill's demonstrations, with its .json, as its baselines load them; must not
+            exist yet. Of the other options it takes --only-successes and --only-fitting.
         only_successes: leave out recordings that reach success at no step.
         only_fitting: leave out recordings that cannot be read, or lack what the first one has (cameras, dimensions), and
             say which; else such a one ends it.
@@ -441,8 +525,15 @@ def export(
         state: observations that become observation.state, such as agent/qpos; else all that the robot knows of itself.
         environment_state: observations that become observation.environment_state, such as extra; else none.
     """
+    if (lerobot is None) == (maniskill is None):
+        return refuse("say what to make: --lerobot FOLDER or --maniskill FILE.h5, one of them")
     if fps is not None and fps < 1:
         return refuse(f"--fps must be 1 or more, not {fps}")
+    if lerobot is None:
+        from workbench.cli.share import demonstrations_in_terminal
+
+        assert maniskill is not None
+        return demonstrations_in_terminal(files, maniskill, only_successes, only_fitting)
     from workbench.cli.share import export_in_terminal
     from workbench.recording.lerobot.export import ExportOptions
     from workbench.recording.lerobot.format import Choice

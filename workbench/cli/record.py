@@ -22,17 +22,23 @@ from workbench.recording.writing.publish import try_folder
 from workbench.session.rescore.recordings import hidden_modules_text
 
 
-class _RecordBar:
+class RecordBar:
     """The progress bar, and Ctrl-C: the first ends the recording after the current step; before it, or again, at once."""
 
-    def __init__(self, bar: Bar, total: int | None) -> None:
+    def __init__(self, bar: Bar, total: int | None, doing: str = "recording") -> None:
+        """
+        Args:
+            total: episodes that are wanted, if it is known.
+            doing: what the bar says while episodes run.
+        """
+        self._doing = doing
         self._bar, self._row = bar, bar.add_task("opening", total=total)
         self._total = total
         self.stop_requested = False
         self._began: float | None = None
         """When the first episode began."""
 
-    def __enter__(self) -> _RecordBar:
+    def __enter__(self) -> RecordBar:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
         return self
 
@@ -54,7 +60,7 @@ class _RecordBar:
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.kept)
         if not self.stop_requested:
-            self.describe(f"recording, {now.steps / seconds:.0f} steps a second")
+            self.describe(f"{self._doing}, {now.steps / seconds:.0f} steps a second")
         if now.over is not None and not err.is_terminal:
             # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
             err.print(escape(_episode_line(*now.over, now.kept, self._total)), soft_wrap=True)
@@ -82,7 +88,7 @@ def record_in_terminal(what: RecordOptions) -> int:
             warn(left_alone)
         left = (TextColumn("left"), TimeRemainingColumn())
         with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
-            with _RecordBar(bar, requested.successes or requested.episodes) as record_bar:
+            with RecordBar(bar, requested.successes or requested.episodes) as record_bar:
                 recorded = record(
                     what,
                     record_bar.describe,

@@ -32,9 +32,9 @@ from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.open_task import open_task
-from workbench.jobs.rescore_run import rescore
+from workbench.jobs.rescore.run import rescore
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.jobs.task import TaskOptions
-from workbench.jobs.verdict import Verdict
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text

@@ -56,8 +56,20 @@ def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptio
     return _make_all(files, lambda sources: [MakeRequest("lerobot", sources, folder, export=options)])
 
 
+def demonstrations_in_terminal(
+    files: Sequence[Path], file: Path, only_successes: bool, only_fitting: bool
+) -> int:
+    """Make one file of ManiSkill's demonstrations of recordings; returns the exit code."""
+    from workbench.recording.lerobot.export import ExportOptions
+    from workbench.ui.share.make import MakeRequest
+
+    options = ExportOptions(only_successes=only_successes, only_fitting=only_fitting)
+    return _make_all(files, lambda sources: [MakeRequest("maniskill", sources, file, export=options)])
+
+
 def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
     from workbench.recording.lerobot.export import DoesNotFit
+    from workbench.recording.maniskill.export import OtherDemonstration
     from workbench.recording.reader.reading import find_all_sources
     from workbench.ui.share.make import make
 
@@ -78,7 +90,7 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
                 try:
                     made.append(make(request, on_progress))
                     not_made += made[-1].not_made
-                except DoesNotFit as error:
+                except (DoesNotFit, OtherDemonstration) as error:
                     not_made.append(f"{error} With --only-fitting such recordings are left out.")
                 except ValueError as error:
                     not_made.append(str(error))

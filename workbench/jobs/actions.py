@@ -1,4 +1,4 @@
-"""Chooses actions: random, zero, hold, sliders, a policy, or a file."""
+"""Chooses actions: random, zero, hold, sliders, a policy, a plan, or a file."""
 
 from __future__ import annotations
 
@@ -12,18 +12,26 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
+from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env import actions
+from workbench.core.env.keywords import constructor_arguments
+from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.policy import Policy, find_policy, load_policy, policy_problem
 from workbench.jobs.task import ActionSource
 from workbench.machine.files import open_regular_file
 from workbench.machine.folders import CurrentFolder
+from workbench.planning.episodes import EpisodeLog, PlannedEpisode
+from workbench.planning.options import PlanOptions
+from workbench.planning.planner import Planner
 from workbench.recording.episode.row import Source
 from workbench.recording.reader.reading import find_trajectories, read_recording
 
@@ -125,12 +133,13 @@ class RecordActionChooser:
     envs and processes.
     """
 
-    def __init__(self, chooser: ActionChooser | None) -> None:
+    def __init__(self, chooser: ActionChooser | None, planned: PlannedActions | None = None) -> None:
         """
         Args:
-            chooser: chooses actions that are neither random nor from a file; None for those two.
+            chooser: chooses actions that are neither random, planned nor from a file; None for those three.
+            planned: plans them; None where they are not planned.
         """
-        self._chooser = chooser
+        self._chooser, self._planned = chooser, planned
         self._rng: dict[int, np.random.Generator] = {}
         self._given: dict[int, RecordedRun] = {}
 
@@ -141,6 +150,9 @@ class RecordActionChooser:
         if given is not None:
             self._given[env] = given
             return given.name
+        if self._planned is not None:
+            self._planned.begin(env, seed)
+            return self._planned.name
         return "random" if self._chooser is None else self._chooser.name
 
     def end(self, env: int) -> None:
@@ -151,9 +163,11 @@ class RecordActionChooser:
         """(N, A); `steps` has the number of steps so far for each env with an episode.
 
         Raises:
-            TaskError: the policy raised, or returned no action.
+            TaskError: the policy raised, or returned no action; or the task raised in a rollout.
             ValueError: the file's actions have another size.
         """
+        if self._planned is not None:
+            return self._planned.next_action(list(steps))
         action = actions.hold_action(task.parts, task.num_envs)
         if self._chooser is not None:
             # For the whole batch: that is what a policy expects.
@@ -175,16 +189,75 @@ class RecordActionChooser:
         return action
 
 
+class PlannedActions:
+    """Plans the actions of a batch's episodes, each as it would be planned alone, and keeps what the rollouts earned."""
+
+    def __init__(
+        self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
+    ) -> None:
+        """
+        Args:
+            task: the live batch.
+            env_kwargs: as of the `TaskOptions` that it was opened with.
+
+        Raises:
+            TaskError: the task fails while the envs of the rollouts are built.
+            ValueError: it has no actions.
+        """
+        self._loaded, self._task = loaded, task
+        made_with = {**loaded.default_kwargs, **constructor_arguments(loaded.cls, env_kwargs, BaseEnv)}
+        with blamed("build", loaded):
+            self._planner = Planner(task.env, made_with=made_with, **vars(plan))
+        self._rolled = TaskEnv(self._planner.rollout_env)
+        self._logs: dict[int, EpisodeLog] = {}
+        self.name = f"solve ({plan.method}, {plan.rollouts} rollouts of {self._planner.horizon} steps)"
+        """The source's name in a recording."""
+
+    def begin(self, env: int, seed: int) -> None:
+        """Begin an episode in this env, with candidates from this seed."""
+        self._planner.reset([env], seed)
+        self._logs[env] = EpisodeLog(seed, self._planner.horizon)
+
+    def next_action(self, env_idx: Sequence[int]) -> NDArray[np.float32]:
+        """(N, A): plans for these envs; the others hold still.
+
+        Raises:
+            TaskError: the task raised in a rollout.
+            NotAlike: it builds other bodies in each env.
+        """
+        for env in env_idx:
+            self._planner.require_alike(env)
+        with blamed("step", self._loaded, self._rolled):
+            action = self._planner.flat_actions(env_idx)
+        for env in env_idx:
+            self._logs[env].add_plan(self._planner.plans[env])
+        return action
+
+    def add_step(self, step: StepResult, env_idx: Sequence[int]) -> None:
+        """Note what a step gave these envs."""
+        for env in env_idx:
+            self._logs[env].add_step(step, env)
+
+    def episode(self, env: int) -> PlannedEpisode:
+        """The episode of this env so far."""
+        return self._logs[env].episode()
+
+    def close(self) -> None:
+        self._planner.close()
+
+
 # --- what ``--actions`` names ----------------------------------------------------------------------------
 
 
 KINDS = ("random", "zero", "hold")
+SOLVE = "solve"
+"""What ``--actions`` names where they are planned."""
 STEPS_WITHOUT_LIMIT = 200
 """Of an episode whose task has no time limit."""
 
 
 def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
-    """The runs of a file, and the env's keywords that it needs; both empty for a policy, or one of `KINDS`.
+    """The runs of a file, and the env's keywords that it needs; both empty for a policy, `SOLVE`, or one of `KINDS`.
 
     Args:
         name: as `RecordArguments.actions`.
@@ -195,13 +268,13 @@ def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str,
     """
     if Path(name).suffix in SUFFIXES:
         return read_actions(Path(name))
-    if name not in KINDS:
+    if name not in (*KINDS, SOLVE):
         find_policy(name, _folder_of(task))
     return (), {}
 
 
 def plain_chooser(name: str, task: str, seed: int, here: CurrentFolder) -> ActionChooser:
-    """Chooses what ``--actions`` names where that is neither random nor a file.
+    """Chooses what ``--actions`` names where that is neither random, planned nor a file.
 
     Raises:
         TaskError: the policy cannot be imported.

@@ -38,7 +38,13 @@ from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.rules import DEGREES, Degree, Finding
-from workbench.jobs.actions import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
+from workbench.jobs.actions import (
+    SOLVE,
+    STEPS_WITHOUT_LIMIT,
+    RecordActionChooser,
+    find_actions,
+    plain_chooser,
+)
 from workbench.jobs.open_task import Opening, import_task
 from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work
 from workbench.jobs.replay import begin_run
@@ -66,6 +72,8 @@ class CheckOptions:
     """As `RecordArguments.actions`. In further episodes, beside random ones, what it names acts."""
     workers: int | None = None
     """Processes; None for as many as cores and groups of rules allow."""
+    solve: bool = False
+    """Whether the rules that need planned episodes are checked too."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +166,9 @@ def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
     for name, number in (("seeds", what.seeds), ("workers", what.workers)):
         if number is not None and number < 1:
             raise ValueError(f"--{name} must be at least 1, not {number}")
-    degrees = degree_of_each(what.select, what.ignore)
+    if what.actions == SOLVE:
+        raise ValueError("--actions solve is for workbench record: --solve checks rules on planned episodes")
+    degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
     if not groups_of(degrees):
         raise ValueError("no rule is left to check")
     return degrees
@@ -281,7 +291,7 @@ class _Stopped(Exception):
 def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
     """Check the groups that one process gets. Raises as `check`."""
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
-    degrees = degree_of_each(what.select, what.ignore)
+    degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
     groups = groups_of(degrees)
     number = -1
 

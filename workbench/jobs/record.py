@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.load import undo_load
 from workbench.core.broken_rule import warn_of
 from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.recorded_run import RecordedRun, states_of
@@ -19,13 +20,23 @@ from workbench.core.capture.recorded_state import state_distance
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
-from workbench.jobs.actions import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
+from workbench.jobs.actions import (
+    SOLVE,
+    STEPS_WITHOUT_LIMIT,
+    PlannedActions,
+    RecordActionChooser,
+    find_actions,
+    plain_chooser,
+)
 from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work, envs_per_process
 from workbench.jobs.replay import restore_recorded
 from workbench.jobs.task import RecordArguments, Stepped, TaskOptions
 from workbench.machine.folders import CurrentFolder
+from workbench.planning.episodes import PlannedEpisode
+from workbench.planning.options import PlanOptions
+from workbench.planning.rollouts import control_mode_to_plan
 from workbench.recording.writing.episode_writer import EpisodeFiles
 from workbench.recording.writing.publish import RecordingError
 
@@ -40,6 +51,10 @@ class RecordOptions(RecordArguments):
     """What to record, and the options of its task."""
 
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
+    plan: PlanOptions = PlanOptions()
+    """Of actions that are planned."""
+    after_success: int = 0
+    """Control steps that an episode goes on after its success."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +71,8 @@ class Written:
     success: bool | None
     start_corrected: bool = False
     """Its seed gave another start than the demonstration's, and the demonstration's first state was restored."""
+    planned: PlannedEpisode | None = None
+    """What is known of it where its actions were planned."""
 
 
 @dataclass(frozen=True)
@@ -225,13 +242,22 @@ def _record_items(what: RecordOptions, queue: ItemQueue, given: Sequence[Recorde
     here = CurrentFolder()  # the task may change it
     with here.again():
         folder = what.out.absolute()
-        opened = open_task(
-            what.task, what.options, on_activity=queue.send_update, on_finding=queue.send_update
-        )
+        opened = _opened(what, queue)
         try:
             _Episodes(opened, what, here, folder, given, queue).run()
         finally:
             opened.env.close()
+
+
+def _opened(what: RecordOptions, queue: ItemQueue) -> OpenedTask:
+    opened = open_task(what.task, what.options, on_activity=queue.send_update, on_finding=queue.send_update)
+    given = {**opened.loaded.default_kwargs, **what.options.env_kwargs}
+    if what.actions != SOLVE or not (mode := control_mode_to_plan(opened.env.env, given)):
+        return opened
+    opened.env.close()
+    undo_load(opened.loaded)
+    options = replace(what.options, env_kwargs={**what.options.env_kwargs, **mode})
+    return open_task(what.task, options, on_activity=queue.send_update, on_finding=queue.send_update)
 
 
 class _Episodes:
@@ -250,9 +276,13 @@ class _Episodes:
         self._finisher = EpisodeFinisher()
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
-        plain = not given and what.actions != "random"
+        self._planned: PlannedActions | None = None
+        if what.actions == SOLVE:
+            queue.send_update("building the envs of the rollouts")
+            self._planned = PlannedActions(opened.loaded, opened.env, what.options.env_kwargs, what.plan)
+        plain = not given and what.actions not in ("random", SOLVE)
         self._chooser = RecordActionChooser(
-            plain_chooser(what.actions, what.task, what.options.seed, here) if plain else None
+            plain_chooser(what.actions, what.task, what.options.seed, here) if plain else None, self._planned
         )
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
         self._running: dict[int, int] = {}
@@ -260,6 +290,10 @@ class _Episodes:
         self._steps: dict[int, int] = {}
         self._start_corrected: set[int] = set()
         """Numbers of the episodes with `Written.start_corrected`."""
+        self._succeeded: dict[int, int] = {}
+        """Of each env with an episode, the steps since its success."""
+        self._plans: dict[int, PlannedEpisode] = {}
+        """Of the episodes that are over, by number, where actions are planned."""
         self._made: dict[int, tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = {}
 
     def run(self) -> None:
@@ -271,6 +305,8 @@ class _Episodes:
         finally:
             self._drop_from(0)
             self._finisher.close()
+            if self._planned is not None:
+                self._planned.close()
             self._collect()
 
     def _begin_free(self) -> bool:
@@ -313,6 +349,7 @@ class _Episodes:
                     episode.total_reward,
                     episode.success,
                     start_corrected,
+                    self._plans.pop(index, None),
                 ),
             )
 
@@ -328,7 +365,7 @@ class _Episodes:
             seed = given.seed
         with blamed("reset", self._opened.loaded, task):
             step = task.reset(seed, [env])
-        self._running[env], self._steps[env] = index, 0
+        self._running[env], self._steps[env], self._succeeded[env] = index, 0, 0
         if given is not None and given.env_states:
             step = self._correct_start(env, given, step)
         self._gatherer.acted_by = self._chooser.begin(env, seed, given)
@@ -359,6 +396,8 @@ class _Episodes:
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
         self._queue.send_update(len(self._running))
+        if self._planned is not None:
+            self._planned.add_step(step, sorted(self._running))
         for env in list(self._running):
             self._steps[env] += 1
             if self._is_over(env, step):
@@ -370,7 +409,14 @@ class _Episodes:
         if given is not None:
             return self._steps[env] >= min(given.length, self._what.max_steps or 10**9)
         limit = self._what.max_steps or self._opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
-        return bool(step.terminated[env] or step.truncated[env] or self._steps[env] >= limit)
+        if step.truncated[env] or self._steps[env] >= limit:
+            return True
+        success = "success" in step.evaluate and bool(step.evaluate["success"][env])
+        failed = "fail" in step.evaluate and bool(step.evaluate["fail"][env])
+        self._succeeded[env] += success or self._succeeded[env] > 0
+        if self._what.after_success and not failed:
+            return self._succeeded[env] > self._what.after_success
+        return bool(step.terminated[env])
 
     def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
         task = self._opened.env
@@ -381,8 +427,11 @@ class _Episodes:
 
     def _over(self, episode: GatheredEpisode) -> None:
         index = self._running[episode.env]
+        if self._planned is not None:
+            self._plans[index] = self._planned.episode(episode.env)
         if self._what.successes is not None and not episode.success:
             episode.writer.discard()
+            self._plans.pop(index, None)
             self._queue.send_result(index, None)
         else:
             self._made[index] = episode, self._finisher.finish(episode)

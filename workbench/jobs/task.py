@@ -209,8 +209,9 @@ class RecordArguments:
         episodes: how many, over all envs; 4, or as many as a file of actions has.
         successes: continue until so many episodes succeeded, and keep no others.
         tries: give up after so many episodes where successes are wanted; 100 for each.
-        actions: random, zero, hold; a policy as module:function or file.py:function; or a file: .npy or .npz with
-            actions, or .h5 with ManiSkill's demonstrations, which begin from their own seeds.
+        actions: random, zero, hold; solve, which plans them by rollouts of the task with its own reward; a policy as
+            module:function or file.py:function; or a file: .npy or .npz with actions, or .h5 with ManiSkill's
+            demonstrations, which begin from their own seeds.
         use_env_states: put every env state of a demonstration back after its step.
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.

@@ -14,7 +14,7 @@ _STEPS = 8, 20
 
 
 @dataclass(frozen=True)
-class PlanOptions:
+class PlanArguments:
     """How a plan is searched: candidate actions are rolled out from the present state, and the plan goes to what earned most.
 
     Args:
@@ -40,6 +40,11 @@ class PlanOptions:
     elites: float = 0.1
     rounds: int = 1
     every: int = 1
+
+
+@dataclass(frozen=True)
+class PlanOptions(PlanArguments):
+    """The same, with values that are within their ranges."""
 
     def __post_init__(self) -> None:
         """Raises ValueError with a sentence that names the option."""

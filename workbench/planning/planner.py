@@ -7,6 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
 
 from workbench.core.env import actions
 from workbench.core.env_numbers import envs_of_batch
@@ -32,13 +34,20 @@ class Planner:
     """
 
     def __init__(
-        self, env: gym.Env, *, threads: int | None = None, exact: bool = True, **options: Any
+        self,
+        env: gym.Env,
+        *,
+        threads: int | None = None,
+        exact: bool = True,
+        made_with: Mapping[str, Any] | None = None,
+        **options: Any,
     ) -> None:
         """
         Args:
             env: as `workbench.make` gives it, wrapped or not.
             threads: threads that step the rollouts on the CPU; None for one per core that the process may use.
             exact: False restores faster, and may give another plan from the last bit of a contact on.
+            made_with: keyword arguments that the env was made with; None for those that its ``spec`` tells.
             options: fields of `PlanOptions`: ``method``, ``rollouts``, ``horizon`` (seconds), ``knots``, ``noise``,
                 ``temperature``, ``elites``, ``rounds``, ``every``.
 
@@ -49,7 +58,7 @@ class Planner:
         """
         self._live = open_env(env)
         self.options = PlanOptions(**options)
-        given: Mapping[str, Any] = env.spec.kwargs if env.spec is not None else {}
+        given: Mapping[str, Any] = made_with or (env.spec.kwargs if env.spec is not None else {})
         rolled = make_rollout_env(self._live, given, self.options.rollouts, threads)
         try:
             self._rollouts = RolloutPlanner(rolled, self.options, exact)
@@ -75,6 +84,16 @@ class Planner:
             self.plans.pop(env, None)
             self._taken[env] = 0
 
+    @property
+    def horizon(self) -> int:
+        """H, control steps that a plan looks ahead."""
+        return self._rollouts.horizon
+
+    @property
+    def rollout_env(self) -> BaseEnv:
+        """The env whose K envs are the rollouts."""
+        return self._rollouts.env
+
     def actions(self, env_idx: Sequence[int] | int | None = None) -> Any:
         """The next action, as ``env.step`` takes it: a tensor (N, A), or a dict of them for several robots.
 
@@ -88,19 +107,29 @@ class Planner:
             IndexError: there is no such env.
             Exception: raised by the author's task in a step of a rollout.
         """
+        chosen = list(range(self._live.num_envs)) if env_idx is None else env_idx
+        return actions.to_env_action(self._live, self._parts, self.flat_actions(chosen))
+
+    def flat_actions(self, env_idx: Sequence[int] | int) -> NDArray[np.float32]:
+        """As `actions`, as one array (N, A), robots side by side."""
         chosen = self._chosen(env_idx)
         self.reset([env for env in chosen if env not in self._taken])
         flat = actions.hold_action(self._parts, self._live.num_envs)
         due = [env for env in chosen if env not in self.plans or self._taken[env] >= self.options.every]
-        snapshot = take_snapshot(self._live, due) if due else None
         for env in due:
-            assert snapshot is not None
-            self._rollouts.require_alike(self._live, env)
-            self.plans[env], self._taken[env] = self._rollouts.plan(snapshot, env), 0
+            self.require_alike(env)
+        if due:
+            snapshot = take_snapshot(self._live, due)
+            for env in due:
+                self.plans[env], self._taken[env] = self._rollouts.plan(snapshot, env), 0
         for env in chosen:
             flat[env] = self.plans[env].actions[self._taken[env]]
             self._taken[env] += 1
-        return actions.to_env_action(self._live, self._parts, np.asarray(flat, np.float32))
+        return flat
+
+    def require_alike(self, env: int) -> None:
+        """Raise NotAlike if the rollouts' envs are built otherwise than this env; see `RolloutPlanner.require_alike`."""
+        self._rollouts.require_alike(self._live, env)
 
     def close(self) -> None:
         """Close the envs of the rollouts; the env that is planned for stays open."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from workbench.planning.sampling import Sampler
 
 _OF_ABSOLUTE = 0.2
 """Of the noise, for absolute joint positions: they range over the whole joint, which no plan crosses."""
+_PLANNED_MODE = "pd_ee_delta_pose"
 _NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "sim_backend")
 """Arguments of the live env that its rollouts have in their own way: they draw nothing, and nobody observes them."""
 
@@ -58,6 +59,22 @@ class Plan:
         return int(np.where(np.isfinite(returns), returns, -np.inf).argmax())
 
 
+def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, str]:
+    """The keyword argument of the control mode in which a plan is found soonest; empty where `env` has it, where one is
+    `given`, or where there is no choice.
+
+    Six numbers that move the hand have one meaning each for a task that is about bodies; joints have none.
+    """
+    modes = getattr(env.agent, "supported_control_modes", ())
+    if (
+        given.get("control_mode") is not None
+        or _PLANNED_MODE not in modes
+        or env.control_mode == _PLANNED_MODE
+    ):
+        return {}
+    return {"control_mode": _PLANNED_MODE}
+
+
 def make_rollout_env(
     env: BaseEnv, kwargs: Mapping[str, Any], rollouts: int, threads: int | None = None
 ) -> BaseEnv:
@@ -77,6 +94,8 @@ def make_rollout_env(
     plain = "state_dict" if "state_dict" in env.SUPPORTED_OBS_MODES else "state"
     kept["obs_mode"] = "none" if env.obs_mode == "none" else plain
     kept["reward_mode"] = env.reward_mode
+    if env.agent is not None and isinstance(env.control_mode, str):
+        kept["control_mode"] = env.control_mode
     options = EnvOptions(
         rollouts,
         backend="gpu" if env.device.type == "cuda" else "cpu",
@@ -85,7 +104,13 @@ def make_rollout_env(
         rules="off",  # the live env has them
         kwargs=kept,
     )
-    rolled = build_env(task_class(env), options)
+    try:
+        rolled = build_env(task_class(env), options)
+    except Exception:
+        # A task may want a renderer to be built, in many ways: only trying says whether that was it.
+        if not env.scene.can_render():
+            raise
+        rolled = build_env(task_class(env), replace(options, render=True))
     try:
         rolled.reset(seed=0)
     except BaseException:

@@ -8,6 +8,8 @@ from workbench.planning.options import PlanOptions
 
 _SMALL = 0.3
 """Of the noise, for a third of the candidates: what is nearly right is not improved by chance alone."""
+_MOVED = 0.5
+"""Of the dimensions, for a third of the candidates, those that differ from the plan."""
 _FLIPS = 0.3
 """Of the knots of a dimension that switches, those that are drawn anew."""
 _KEPT = 2
@@ -63,12 +65,14 @@ class Sampler:
         shape = (self._options.rollouts, *self._mean.shape)
         drawn = torch.randn(shape, generator=self._generator)
         flips = torch.rand(shape, generator=self._generator) < _FLIPS
-        # What only a long motion shows is found by a third of one action throughout.
-        drawn[0::3] = drawn[0::3, :1].clone()
+        some = torch.rand((shape[0], 1, shape[2]), generator=self._generator) < _MOVED
+        # What only a long motion shows is found by a third of one action throughout, in some of the dimensions.
+        drawn[0::3], flips[0::3] = drawn[0::3, :1].clone(), flips[0::3, :1].clone()
+        side = torch.sign(drawn)
+        drawn[0::3] *= some[0::3]
         drawn[2::3] *= _SMALL
-        knots = self._mean + drawn * self._spread
-        switched = torch.where(flips, torch.sign(drawn), self._mean)
-        knots = torch.where(self._switches, switched, knots)
+        switched = torch.where(flips, side, self._mean)
+        knots = torch.where(self._switches, switched, self._mean + drawn * self._spread)
         knots[0], knots[1] = self._mean, hold
         if self._kept is not None:
             knots[2 : 2 + len(self._kept)] = self._kept

@@ -20,8 +20,8 @@ from msgspec import inspect
 from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.core.capture.inspection import Inspection
 from workbench.core.rules import Finding
+from workbench.jobs.rescore.verdict import Rescore
 from workbench.jobs.task import Stepped, TaskOptions
-from workbench.jobs.verdict import Rescore
 from workbench.machine.processes.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
 from workbench.recording.episode.row import Source
 from workbench.session.protocol.messages import Answer, Event, Load, Loaded, LoadFailed, Loading, Status

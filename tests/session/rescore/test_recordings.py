@@ -13,8 +13,8 @@ import pytest
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states
-from workbench.jobs.rescore_run import rescore
-from workbench.jobs.verdict import Verdict
+from workbench.jobs.rescore.run import rescore
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.episode import Episode, EpisodeInfo
 
 pytestmark = pytest.mark.thorough

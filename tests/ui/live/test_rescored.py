@@ -11,7 +11,7 @@ import pytest
 from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
-from workbench.jobs.verdict import Verdict
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.live.timeline import TimelineView
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView

@@ -15,7 +15,7 @@ from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from workbench.authoring.problem import Problem
-from workbench.jobs.verdict import Verdict
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
 from workbench.session.rescore import verdict_text

@@ -19,6 +19,7 @@ from workbench.checks.by_hook import (
     reproduce,
     reward,
     scene,
+    solved,
     source,
 )
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of, raised
@@ -47,6 +48,7 @@ GROUPS: tuple[Group, ...] = (
     Group("observations", observation.CHECKS),
     Group("the scene", scene.CHECKS),
     Group("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
+    Group("planned episodes", solved.CHECKS),
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"

@@ -39,13 +39,14 @@ def write_h5(episode: Episode, path: Path) -> None:
     # In memory: on a disk error HDF5 leaves files half open.
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
-        _put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
+        put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
     with path.open("xb") as file:
         file.write(content.getbuffer())
     h5py.File(path, "r").close()  # fails on a truncated file
 
 
-def _put_columns(episode: Episode, trajectory: h5py.Group) -> None:
+def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
+    """Write the columns of an episode into its group, as `write_h5` says."""
     # Names in the file: asking h5py is slow.
     groups: dict[tuple[str, ...], h5py.Group] = {(): trajectory}
     taken: set[tuple[str, ...]] = set()
@@ -111,12 +112,13 @@ def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path]
         sealed: add this installation's seal.
     """
     described = describe_json(episode, folder, files, sealed)
-    content = json_text({**_maniskill_json(episode), "workbench": described}, indent=2).encode()
+    content = json_text({**maniskill_json(episode), "workbench": described}, indent=2).encode()
     with path.open("xb") as file:
         file.write(content)
 
 
-def _maniskill_json(episode: Episode) -> dict[str, Any]:
+def maniskill_json(episode: Episode) -> dict[str, Any]:
+    """ManiSkill's metadata of a file with this episode as ``traj_0``."""
     info = episode.info
     seed = info.seed if info.seed >= 0 else None
     entry: dict[str, Any] = {

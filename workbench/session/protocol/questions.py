@@ -18,7 +18,7 @@ from workbench.core.cameras.report import CameraReport, OfferedPlacement, Search
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Degree
 from workbench.core.scene.shapes import SceneGeometry
-from workbench.jobs.verdict import Rescore
+from workbench.jobs.rescore.verdict import Rescore
 from workbench.machine.processes.wire import Question
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset, WarmUp
 

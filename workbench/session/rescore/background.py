@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
-from workbench.jobs.verdict import Verdict
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
+from workbench.jobs.rescore.verdict import Scores, Verdict, compare, scalar_entries
 from workbench.jobs.task import TaskDescription
-from workbench.jobs.verdict import Scores, Verdict, compare, scalar_entries
 from workbench.session.history.history import History, Moment
 from workbench.session.process.askers import Background
 from workbench.session.process.job_lane import Job, JobFailed

@@ -22,8 +22,8 @@ from workbench.jobs.from_recording import (
     recorded_source,
     reference_of,
 )
+from workbench.jobs.rescore.verdict import Rescore, Rescored, Verdict
 from workbench.jobs.task import TaskOptions
-from workbench.jobs.verdict import Rescore, Rescored, Verdict
 from workbench.recording.episode.document import WrongDocument, read_document
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.made_here import made_here

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.jobs.verdict import FLAGS, Verdict
+from workbench.jobs.rescore.verdict import FLAGS, Verdict
 from workbench.machine.text import length, mean_text, number_text
 from workbench.recording.episode.row import Source
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.capture.recorded_run import pose_distances
-from workbench.jobs.verdict import gap, numbers_differ
+from workbench.jobs.rescore.verdict import gap, numbers_differ
 from workbench.machine.text import length, number_text
 from workbench.recording.episode.episode import Episode
 

@@ -22,8 +22,8 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import ActionChooser
 from workbench.jobs.open_task import OpenedTask, Opening, warm_up
+from workbench.jobs.rescore.verdict import Rescore
 from workbench.jobs.task import Restored, TaskOptions
-from workbench.jobs.verdict import Rescore
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.processes.debugger import (
     CannotDebug,
@@ -219,7 +219,7 @@ class Worker:
             return self._checks.answer(opened, options, question, report)
         assert isinstance(question, Rescore)
         # Imported late: rerun and the readers take a third of a second.
-        from workbench.jobs import rescore_run
+        from workbench.jobs.rescore import run as rescore_run
 
         return rescore_run.answer(opened, question, report)
 

@@ -38,8 +38,8 @@ GROUPS = (
 RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
-    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "batched_env",
-    "safety", "limits", "gallery", "rules", "keys", "cli",
+    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
+    "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics; those that are not listed follow by name."""
 _DOCS = "web_assets/docs/"
@@ -171,7 +171,7 @@ def _coloured(code: str, language: str, attributes: str) -> str:
         return ""
     kinds = {"-": "gone", "+": "come"}
     return "".join(
-        f'<span class="{kinds[line[0]]}">{escape(line)}</span>' if line[0] in kinds else escape(line)
+        f'<span class="{kinds[line[0]]}">{html.escape(line)}</span>' if line[0] in kinds else html.escape(line)
         for line in code.splitlines(keepends=True)
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.jobs.verdict import Verdict, by_change
+from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text

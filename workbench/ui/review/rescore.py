@@ -12,7 +12,7 @@ import viser
 
 from workbench.authoring.loading.reference import RecordedTask, named_file
 from workbench.jobs.from_recording import class_in, recorded_version, reference_of
-from workbench.jobs.verdict import Verdict, by_change
+from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library

@@ -35,11 +35,12 @@ from workbench.recording.films import (
     write_mp4,
 )
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
+from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.reading import read_recording
 from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
 from workbench.ui.widgets.templates import counted, sentence
 
-What = Literal["film", "scene", "page", "sheet", "lerobot"]
+What = Literal["film", "scene", "page", "sheet", "lerobot", "maniskill"]
 MOST_SAID = 5
 """Sentences about recordings that were left out."""
 EVERY_CAMERA = ""
@@ -52,7 +53,7 @@ class MakeRequest:
     what: What
     sources: tuple[Source, ...]
     folder: Path
-    """Of the files; for a dataset the folder that it becomes."""
+    """Of the files; for a dataset the folder that it becomes, for ManiSkill's demonstrations their ``.h5``."""
     camera: str = EVERY_CAMERA
     """Of a film."""
     eye: Eye | None = None
@@ -88,6 +89,8 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
     """
     if wanted.what == "lerobot":
         return _dataset(wanted, on_progress)
+    if wanted.what == "maniskill":
+        return _demonstrations(wanted, on_progress)
     paths: list[Path] = []
     not_made: list[str] = []
     for number, source in enumerate(wanted.sources):
@@ -166,6 +169,23 @@ def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     if made.not_fitting:
         words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
     return Made((made.folder,), " ".join([words + ".", *made.not_fitting[:MOST_SAID], *made.notes]))
+
+
+def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
+    count = len(wanted.sources)
+    made = export_maniskill(
+        [(source.stem, partial(read_recording, source)) for source in wanted.sources],
+        wanted.folder,
+        wanted.export.only_successes,
+        wanted.export.only_fitting,
+        lambda done, doing: on_progress(done / max(count, 1), doing),
+    )
+    words = f"{counted(made.episodes, 'episode')}, {counted(made.steps, 'step')}"
+    if made.left_out:
+        words += f"; {made.left_out} without success left out"
+    if made.not_fitting:
+        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+    return Made((made.file,), " ".join([words + ".", *made.not_fitting[:MOST_SAID]]))
 
 
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 import viser
 from numpy.typing import NDArray
 
-from workbench.jobs.verdict import Verdict
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RUNNING, RescoreView
 from workbench.ui.widgets.click_targets import Paged, Presses

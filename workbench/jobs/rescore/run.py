@@ -20,7 +20,7 @@ from workbench.core.snapshots.snapshot import step_only
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayable
-from workbench.jobs.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
+from workbench.jobs.rescore.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_recording

@@ -1,0 +1,39 @@
+"""Rules on planned episodes: off unless they are asked for, and skipped where nothing can be planned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.checks.checked import check_rule
+from workbench.checks.rules import CHECK_RULES, SOLVE_RULES, degree_of_each
+from workbench.jobs.check import CheckOptions, count_rules, degrees_of_request
+from workbench.planning.verdicts import RULES as VERDICTS
+
+TASKS = Path(__file__).parents[2] / "tasks"
+
+
+def test_they_are_off_unless_they_are_asked_for() -> None:
+    assert set(VERDICTS) == SOLVE_RULES <= set(CHECK_RULES)
+    assert {degree_of_each()[rule] for rule in SOLVE_RULES} == {"off"}
+    assert {degree_of_each(solve=True)[rule] for rule in SOLVE_RULES} == {"warn"}
+    selected = degree_of_each(["reward-flat"])
+    assert selected["reward-flat"] == "warn" and selected["reward-stuck"] == "off"
+    assert degree_of_each(ignore=["reward-flat"], solve=True)["reward-flat"] == "off"
+    counted = [count_rules(degrees_of_request(CheckOptions("x", solve=solve))) for solve in (False, True)]
+    assert counted[1] - counted[0] == len(SOLVE_RULES)
+    with pytest.raises(ValueError, match="--solve checks"):
+        degrees_of_request(CheckOptions("x", actions="solve"))
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("different_objects", "another one in each env"), ("minimal", "no reward")],
+)
+def test_a_task_that_cannot_be_planned_is_skipped_with_the_reason(name: str, why: str) -> None:
+    given = {"reward_mode": "none"} if name == "minimal" else {}
+    result = check_rule(
+        "reward-flat", str(TASKS / f"{name}.py"), num_envs=2, seeds=1, render_backend="none", **given
+    )
+    assert result.state == "skipped" and why in result.why

@@ -1,0 +1,145 @@
+"""``workbench solve``: a row for each seed, verdicts, reports for programs, the episodes in the library."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from workbench.cli.main import main
+from workbench.jobs.record import RecordProgress
+from workbench.jobs.solve import SolveOptions, SolveReport, solve
+from workbench.jobs.task import TaskOptions
+from workbench.planning.options import PlanOptions
+from workbench.recording.reader.read_episode import read_episode
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+LIFT = '''
+"""The hand is to rise; with `pays` the same without it."""
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+
+@register_env("SolveLift-v1", max_episode_steps=8)
+class LiftEnv(PushCubeEnv):
+    def evaluate(self):
+        height = self.agent.tcp.pose.p[:, 2]
+        return {"success": (height > 0.22) & (self.start < 1), "height": height}
+
+    def _initialize_episode(self, env_idx, options):
+        super()._initialize_episode(env_idx, options)
+        if not hasattr(self, "start"):
+            self.start = self.elapsed_steps * 0
+        self.start[env_idx] = (self.obj.pose.p[env_idx, 0] > self.half).to(self.start.dtype)
+
+    half = 9.0
+
+    def compute_dense_reward(self, obs, action, info):
+        return info["height"]
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info)
+'''
+
+
+@pytest.fixture
+def lift(tmp_path: Path) -> Path:
+    file = tmp_path / "lift.py"
+    file.write_text(LIFT)
+    return file
+
+
+def options_of(file: Path, seeds: int = 3) -> SolveOptions:
+    return SolveOptions(
+        str(file),
+        file.parent / "out",
+        seeds,
+        plan=PlanOptions(rollouts=16, horizon=0.2),
+        options=TaskOptions(seed=4, env_kwargs={"render_backend": "none"}),
+    )
+
+
+def test_each_seed_is_told_and_its_episode_is_in_the_library(lift: Path) -> None:
+    report = solve(options_of(lift))
+    assert [one.seed for one in report.seeds] == [4, 5, 6]
+    assert all(1 <= one.solved_at <= 8 and one.in_the_way == "" for one in report.seeds)
+    assert report.verdicts == () and not report.fails and report.median_steps is not None
+    for one in report.seeds:
+        episode = read_episode(one.path)
+        assert (episode.info.seed, episode.length) == (one.seed, one.steps)
+        assert bool(episode.evaluate["success"][one.solved_at])
+        assert episode.info.control_mode == "pd_ee_delta_pose"
+        assert one.steps == min(8, one.solved_at + 5)
+
+
+def test_what_pays_without_success_is_told_with_its_seeds(lift: Path) -> None:
+    # Where the cube begins beyond x, no height is a success: what the reward does not know.
+    lift.write_text(LIFT.replace("half = 9.0", "half = 0.013"))
+    report = solve(options_of(lift, seeds=4))
+    (verdict,) = [one for one in report.verdicts if one.rule == "reward-exploited"]
+    unsolved = [one.seed for one in report.seeds if not one.solved_at]
+    assert unsolved and set(verdict.seeds) <= set(unsolved) and report.fails
+    assert "height" in verdict.message
+
+
+@pytest.mark.slow
+def test_the_report_is_the_same_with_several_processes(lift: Path) -> None:
+    def same(report: SolveReport) -> list[tuple[int, int, int, float]]:
+        return [(one.seed, one.solved_at, one.steps, one.total_reward) for one in report.seeds]
+
+    what = options_of(lift)
+    assert same(solve(what)) == same(solve(replace(what, workers=2, out=lift.parent / "two")))
+
+
+def test_what_is_done_is_kept_and_reported_where_it_is_stopped(lift: Path) -> None:
+    done = threading.Event()
+
+    def on_progress(progress: RecordProgress) -> None:
+        if progress.over is not None:
+            done.set()
+
+    report = solve(options_of(lift), on_progress=on_progress, stop=done.is_set)
+    assert report.stopped and len(report.seeds) == 1 and report.seeds[0].path.is_file()
+
+
+def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = {name: lift.parent / f"solved.{name}" for name in ("json", "csv", "xml")}
+    call = f"solve {lift} --seeds 2 --workers 1 --rollouts 16 --horizon 0.2 --env render_backend=none --out {lift.parent}/out"
+    written = f"--json-file {files['json']} --csv-file {files['csv']} --junit {files['xml']}"
+    with pytest.raises(SystemExit) as ended:
+        main(f"{call} {written}".split())
+    said = capsys.readouterr().out
+    assert ended.value.code == 0, said
+    assert "Solved 2 of 2 seeds, in" in said and "workbench review" in said
+    told = json.loads(files["json"].read_text())
+    assert (told["solved"], told["tried"], told["fails"], told["plan"]["rollouts"]) == (2, 2, False, 16)
+    rows = list(csv.DictReader(io.StringIO(files["csv"].read_text())))
+    assert [row["seed"] for row in rows] == ["0", "1"] and all(
+        Path(row["recording"]).is_file() for row in rows
+    )
+    suite = ElementTree.fromstring(files["xml"].read_text())
+    assert (suite.get("tests"), suite.get("failures")) == ("2", "0")
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ("--seeds 0", "--seeds must be at least 1"),
+        ("--rollouts 1", "--rollouts must be at least 4"),
+        ("--horizon -1", "--horizon is a time in seconds"),
+        ("--json --csv", "both print the result"),
+        ("--junit .", "is a folder"),
+    ],
+)
+def test_a_wrong_option_is_refused_by_name(given: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["solve", "PushCube-v1", *given.split()])
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err

@@ -1,0 +1,140 @@
+"""Verdicts on a reward, each on arrays of episodes that show it and of ones that do not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from workbench.planning.episodes import PlannedEpisode
+from workbench.planning.verdicts import in_the_way, of_episodes
+
+STEPS, HORIZON = 20, 10
+
+
+def row(values: Sequence[float] | float, dtype: type = np.float32) -> Any:
+    return np.broadcast_to(np.asarray(values, dtype), (STEPS,)).copy()
+
+
+def rises(seed: int = 0, solved_at: int = 15) -> PlannedEpisode:
+    """A good episode: the reward rises to success, and rollouts differ until then."""
+    reward = np.minimum(np.arange(1, STEPS + 1) / solved_at, 1.0).astype(np.float32)
+    success = np.arange(1, STEPS + 1) >= solved_at
+    best, one = row((HORIZON * reward + 1).tolist()), np.float32(1)
+    return PlannedEpisode(seed, HORIZON, reward, success, row(0, bool), best, best - one, best - 2 * one)
+
+
+def unsolved(
+    reward: Sequence[float] | float, seed: int = 9, gain: float = 1.0, spread: float = 2.0
+) -> PlannedEpisode:
+    rewards = row(reward)
+    best = HORIZON * rewards + gain
+    return PlannedEpisode(
+        seed, HORIZON, rewards, row(0, bool), row(0, bool), best, best - gain, best - spread
+    )
+
+
+def rules(*episodes: PlannedEpisode) -> list[str]:
+    return [verdict.rule for verdict in of_episodes(episodes)]
+
+
+def test_good_episodes_show_nothing() -> None:
+    assert rules(rises(0), rises(1), rises(2, solved_at=9)) == []
+    assert rules() == []
+    assert in_the_way(rises(), [rises()]) == ""
+
+
+def test_an_unsolved_episode_that_simply_ran_out_of_time_shows_nothing() -> None:
+    slow = unsolved(np.linspace(0, 0.7, STEPS).tolist())
+    assert rules(rises(), slow) == []
+    assert in_the_way(slow, [rises(), slow]) == "not solved when the time was up"
+
+
+def test_more_pay_without_success_than_with_it_is_an_exploit() -> None:
+    held = replace(unsolved(1.0, seed=7), evaluate={"success": 0.0, "height": 0.2})
+    (verdict,) = of_episodes([rises(0), held])
+    assert (verdict.rule, verdict.seeds) == ("reward-exploited", (7,))
+    assert "earned 1.000 a step at their end without success" in verdict.message
+    assert "evaluate said at the end of seed 7: success 0, height 0.2" in verdict.message
+    assert rules(rises(0), unsolved(0.99)) == []
+    # What success pays is known from successes only.
+    assert rules(held) == []
+    assert in_the_way(held, [rises(), held]) == "earned 1.000 a step without success"
+
+
+def test_where_all_rollouts_earn_the_same_nothing_leads_on() -> None:
+    plateau = unsolved(0.4, seed=3, gain=0.0, spread=0.0)
+    plateau.best[:6] += 3
+    plateau = replace(plateau, terms={"reach": row(0.0), "place": row(2.0)})
+    (verdict,) = of_episodes([rises(0), plateau])
+    assert (verdict.rule, verdict.seeds) == ("reward-flat", (3,))
+    assert "seed 3 from step 7 on, at 0.400 a step; flat are reach" in verdict.message
+    assert in_the_way(plateau, [rises(), plateau]) == "all rollouts earned the same from step 7 on"
+
+
+def test_a_sparse_reward_is_told_as_what_planning_cannot_find() -> None:
+    (verdict,) = of_episodes([unsolved(0.0, seed, gain=0.0, spread=0.0) for seed in (1, 2)])
+    assert (verdict.rule, verdict.seeds) == ("reward-flat", (1, 2))
+    assert "sparse" in verdict.message
+    lucky = replace(rises(0), reward=row([0.0] * 14 + [1.0] * 6))
+    lucky = replace(lucky, best=lucky.reward * 3, hold=row(0.0), worst=row(0.0))
+    assert "sparse" in of_episodes([lucky, unsolved(0.0, gain=0.0, spread=0.0)])[0].message
+
+
+def test_where_nothing_earns_more_than_holding_still_it_is_stuck() -> None:
+    (verdict,) = of_episodes([rises(0), unsolved(0.6, seed=4, gain=0.0)])
+    assert (verdict.rule, verdict.seeds) == ("reward-stuck", (4,))
+    assert "--horizon" in verdict.message
+
+
+def test_a_reward_that_falls_on_the_way_to_success_is_against() -> None:
+    dip = rises(5)
+    dip.reward[6:11] = [0.4, 0.2, 0.0, 0.1, 0.5]
+    (verdict,) = of_episodes([dip])
+    assert (verdict.rule, verdict.seeds) == ("reward-against", (5,))
+    assert (
+        "from 0.400 at step 6 to 0.000 at step 9, success at step 15" in verdict.message
+        or "step 7" in verdict.message
+    )
+    # After success it may fall.
+    after = rises(5)
+    after.reward[16:] = 0.0
+    assert rules(after) == []
+    assert rules(dip, rises(0), rises(1)) == []
+
+
+def test_success_that_does_not_stay_is_lost() -> None:
+    blinking = rises(6)
+    blinking.success[16] = False
+    (verdict,) = of_episodes([blinking])
+    assert (verdict.rule, verdict.seeds) == ("success-lost", (6,))
+    assert "at step 15 and not 2 steps later" in verdict.message
+    assert rules(blinking, rises(0)) == []
+
+
+def test_an_early_fail_where_every_step_costs_pays() -> None:
+    ended = unsolved(-0.5, seed=8)
+    ended.fail[-1] = True
+    (verdict,) = of_episodes([ended])
+    assert (verdict.rule, verdict.seeds) == ("failing-pays", (8,))
+    assert in_the_way(ended, [ended]) == "failed at step 20"
+    paid = replace(ended, reward=row(0.5))
+    assert rules(paid) == []
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_rewards_that_are_no_numbers_do_not_end_it(value: float) -> None:
+    broken = unsolved(0.4)
+    for each in (broken.reward, broken.best, broken.hold, broken.worst):
+        each[:] = value
+    of_episodes([rises(0), broken])
+    assert in_the_way(broken, [rises(0), broken])
+
+
+def test_an_episode_of_no_step_is_no_evidence() -> None:
+    none = row(0)[:0]
+    empty = PlannedEpisode(0, HORIZON, none, none.astype(bool), none.astype(bool), none, none, none)
+    assert rules(empty) == []

@@ -1,0 +1,120 @@
+"""Many recordings as one file of demonstrations: loaded by ManiSkill's dataset class, and replayed by its own tool."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import h5py
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
+
+from workbench.cli.main import main
+from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.task import TaskOptions
+from workbench.recording.reader.read_episode import read_episode, read_maniskill
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+PUSHER = Path(__file__).parents[2] / "browser" / "pusher.py"
+PUSHED = {"control_mode": "pd_ee_delta_pos", "render_backend": "none"}
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The .rrd of three episodes that succeed, and one that does not."""
+    out, options = tmp_path_factory.mktemp("recorded"), TaskOptions(num_envs=3, seed=1, env_kwargs=PUSHED)
+    pushed = RecordOptions("PushCube-v1", out, 3, actions=f"{PUSHER}:act", pictures=False, options=options)
+    held = RecordOptions("PushCube-v1", out, 1, actions="hold", pictures=False, max_steps=3, options=options)
+    return [one.path for what in (pushed, held) for one in record(what).written]
+
+
+def export(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["export", *map(str, arguments)])
+    return int(ended.value.code or 0)
+
+
+def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "demos.h5"
+    assert export(*recordings, "--maniskill", file, "--only-successes") == 0
+    data: Any = ManiSkillTrajectoryDataset(str(file), success_only=True)
+    ours = [read_episode(path) for path in recordings[:3]]
+    assert data.env_id == "PushCube-v1" and data.env_kwargs["control_mode"] == "pd_ee_delta_pos"
+    assert len(data) == sum(one.length for one in ours)
+    np.testing.assert_array_equal(np.concatenate([one.action for one in ours]), data.actions)
+    np.testing.assert_array_equal(np.concatenate([one.reward for one in ours]), data.rewards)
+    stock: Any = gym.make("PushCube-v1", obs_mode="state", render_backend="none", control_mode="pd_ee_delta_pos")
+    obs, _ = stock.reset(seed=ours[0].info.seed)
+    np.testing.assert_allclose(data.obs[0], obs[0].numpy(), atol=1e-5)
+    stock.close()
+
+
+def test_each_episode_is_numbered_in_both_files(recordings: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "new" / "demos.h5"
+    assert export(recordings[0].parent, "--maniskill", file) == 0
+    entries = json.loads(file.with_suffix(".json").read_text())["episodes"]
+    assert [entry["episode_id"] for entry in entries] == [0, 1, 2, 3]
+    with h5py.File(file) as written:
+        assert sorted(written) == ["traj_0", "traj_1", "traj_2", "traj_3"]
+        actions: list[Any] = [written[f"traj_{k}/actions"] for k in range(4)]
+        assert [len(each) for each in actions] == [one["elapsed_steps"] for one in entries]
+    assert {path.name for path in file.parent.iterdir()} == {"demos.h5", "demos.json"}
+    assert sorted(read_maniskill(file, f"traj_{k}").info.seed for k in range(4)) == [1, 1, 2, 3]
+
+
+@pytest.mark.slow
+def test_replay_trajectory_takes_them(recordings: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "demos.h5"
+    assert export(*recordings, "--maniskill", file, "--only-successes") == 0
+    command = [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", str(file)]
+    done = subprocess.run(
+        [*command, "--save-traj", "--use-env-states"], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "3/3=100.00% demos saved" in done.stdout
+
+
+def test_an_episode_of_another_kind_is_refused_or_left_out(
+    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = TaskOptions(num_envs=1, env_kwargs={**PUSHED, "control_mode": "pd_joint_delta_pos"})
+    (joint,) = record(
+        RecordOptions("PushCube-v1", tmp_path / "r", 1, pictures=False, max_steps=2, options=other)
+    ).written
+    both = (recordings[0], joint.path)
+    assert export(*both, "--maniskill", tmp_path / "demos.h5") == 2
+    assert "control mode is 'pd_joint_delta_pos'" in capsys.readouterr().err
+    assert not (tmp_path / "demos.h5").exists()
+    assert export(*both, "--maniskill", tmp_path / "demos.h5", "--only-fitting") == 0
+    assert len(json.loads((tmp_path / "demos.json").read_text())["episodes"]) == 1
+
+
+def test_nothing_that_is_there_is_written_over(
+    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "demos.json").write_text("mine")
+    assert export(recordings[0], "--maniskill", tmp_path / "demos.h5") == 2
+    assert export(recordings[0], "--maniskill", tmp_path / "demos.hdf5") == 2
+    assert export(recordings[0]) == 2
+    held = tmp_path / "held"
+    held.mkdir()
+    for path in recordings[3].parent.glob(f"{recordings[3].stem}.*"):
+        shutil.copy(path, held)
+    assert export(held, "--maniskill", tmp_path / "none.h5", "--only-successes") == 2
+    said = capsys.readouterr().err
+    for words in (
+        "There is something at",
+        "ends in .h5",
+        "--lerobot FOLDER or --maniskill FILE.h5",
+        "no episode",
+    ):
+        assert words in said
+    assert [path.name for path in tmp_path.glob("*.*")] == ["demos.json"]

@@ -1,0 +1,96 @@
+"""Checks of the reward on episodes that are solved by planning: what the rollouts of each step earned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.core.env.keywords import constructor_arguments
+from workbench.core.env.task_env import TaskEnv
+from workbench.planning.episodes import EpisodeLog, PlannedEpisode
+from workbench.planning.planner import Planner
+from workbench.planning.rollouts import NotAlike, control_mode_to_plan
+from workbench.planning.verdicts import RULES as VERDICTS
+from workbench.planning.verdicts import Episodes
+
+SEEDS = 8
+"""Most seeds that are solved: each takes seconds."""
+STEPS = 200
+"""Of an episode whose task has no time limit."""
+AFTER_SUCCESS = 5
+"""Control steps that an episode goes on after its success."""
+HOOK = {"success-lost": "evaluate"}
+"""At which a rule is told; the others at the dense reward."""
+
+
+def solved_episodes(checkup: Checkup) -> Episodes:
+    """The first seeds, each to its success, its fail or the end of its time.
+
+    Raises:
+        CannotCheck: nothing can be planned.
+    """
+    cls, found = checkup.loaded.cls, list[PlannedEpisode]()
+    given = {**checkup.loaded.default_kwargs, **checkup.env_kwargs}
+    mode = control_mode_to_plan(checkup.task.env, given)
+    with checkup.env(1, **mode) as live:  # type: ignore[arg-type]
+        if live.env.reward_mode == "none":
+            raise CannotCheck("it has no reward")
+        if not live.parts:
+            raise CannotCheck("there is nothing to plan: it has no robot with a controller")
+        made_with = {
+            **checkup.loaded.default_kwargs,
+            **constructor_arguments(cls, checkup.env_kwargs, BaseEnv),
+        }
+        with blamed("build", checkup.loaded):
+            planner = Planner(live.env, made_with=made_with)  # type: ignore[arg-type]
+        try:
+            for seed in checkup.seeds[:SEEDS]:
+                found.append(_solved(checkup, live, planner, seed))
+        finally:
+            planner.close()
+    return Episodes(tuple(found))
+
+
+def _solved(checkup: Checkup, live: TaskEnv, planner: Planner, seed: int) -> PlannedEpisode:
+    checkup.reset(live, [seed])
+    planner.reset(seed=seed)
+    log, rolled = EpisodeLog(seed, planner.horizon), TaskEnv(planner.rollout_env)
+    try:
+        planner.require_alike(0)
+    except NotAlike as error:
+        raise CannotCheck(str(error)) from error
+    after = 0
+    for _ in range(live.max_episode_steps or STEPS):
+        with blamed("step", checkup.loaded, rolled):
+            action = planner.flat_actions([0])
+        log.add_plan(planner.plans[0])
+        step = checkup.step(live, action)
+        log.add_step(step, 0)
+        success, fail = (bool(step.evaluate.get(name, np.zeros(1))[0]) for name in ("success", "fail"))
+        after += success or after > 0
+        if fail or after > AFTER_SUCCESS:
+            break
+    return log.episode()
+
+
+def _check_of(rule: str) -> Check:
+    def check(checkup: Checkup) -> Iterator[Found | Note]:
+        episodes = checkup.look(solved_episodes)
+        verdict = VERDICTS[rule](episodes)
+        if rule == "reward-exploited":
+            solved = [one.solved_at for one in episodes.solved]
+            steps = f", in {np.median(solved):g} control steps (median)" if solved else ""
+            yield Note(f"planning solved {len(solved)} of {len(episodes.all)} seeds{steps}")
+        if verdict is not None:
+            hook = HOOK.get(rule, "compute_dense_reward")
+            place = checkup.places.hook(hook, "compute_normalized_dense_reward", "evaluate")
+            yield Found(f"{verdict.message[0].upper()}{verdict.message[1:]}.", place, len(verdict.seeds))
+
+    return check
+
+
+CHECKS: dict[str, Check] = {rule: _check_of(rule) for rule in VERDICTS}

@@ -1,0 +1,223 @@
+"""Runs ``workbench solve``: a progress bar, a table of the seeds, what they tell of the reward, and reports for other programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from rich.markup import escape
+from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from workbench.authoring.problem import TaskError
+from workbench.checks.rules import RULES
+from workbench.cli.check_reports import json_text, xml_text
+from workbench.cli.record import RecordBar
+from workbench.cli.terminal import (
+    Exit,
+    out,
+    print_finding,
+    print_problem,
+    print_text,
+    progress_bar,
+    refuse,
+    stdout_to_stderr,
+)
+from workbench.jobs.pool import PoolError
+from workbench.jobs.record import with_given_actions
+from workbench.jobs.solve import SolvedSeed, SolveOptions, SolveReport, solve
+from workbench.machine.files import replace_file
+from workbench.machine.folders import CurrentFolder
+from workbench.machine.text import plain_text
+from workbench.planning.verdicts import Verdict
+from workbench.recording.reader.reading import recover_confined
+from workbench.recording.writing.publish import try_folder
+
+_COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "recording")
+
+
+@dataclass(frozen=True)
+class SolveOutput:
+    """What it gives besides its text."""
+
+    json: bool = False
+    """Print JSON in place of the text."""
+    json_file: Path | None = None
+    csv: bool = False
+    """Print CSV in place of the text."""
+    csv_file: Path | None = None
+    junit: Path | None = None
+
+
+def solve_in_terminal(what: SolveOptions, output: SolveOutput) -> int:
+    """Solve, print, and write the reports; returns the exit code. Ctrl-C keeps and reports what is done."""
+    here = CurrentFolder()  # a task may change it
+    try:
+        try_folder(what.out)
+        with_given_actions(what.recording())
+        recover_confined(what.out)
+        left = (TextColumn("left"), TimeRemainingColumn())
+        with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
+            with RecordBar(bar, what.seeds, "solving") as shown:
+                report = solve(what, shown.describe, shown.show, lambda: shown.stop_requested, print_finding)
+            shown.describe("solved", len(report.seeds))
+    except TaskError as error:
+        print_problem(error.problem)
+        return Exit.FAILED
+    except (OSError, ValueError, PoolError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted; finished episodes were kept")
+    try:
+        with here.again():
+            for path, made in (
+                (output.json_file, as_json),
+                (output.csv_file, as_csv),
+                (output.junit, as_junit),
+            ):
+                if path is not None:
+                    replace_file(path, made(report, what).encode())
+    except OSError as error:
+        return refuse(str(error))
+    if output.json or output.csv:
+        print((as_json if output.json else as_csv)(report, what), end="", flush=True)
+    else:
+        print_report(report)
+    if report.stopped:
+        return refuse("interrupted; finished episodes were kept")
+    return Exit.FAILED if report.fails else Exit.DONE
+
+
+# --- text ------------------------------------------------------------------------------------------------
+
+
+def print_report(report: SolveReport) -> None:
+    """Print the seeds, what they tell of the reward, and a summary."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("seed", "solved at", "steps", "return", "seconds"):
+        table.add_column(name, justify="right")
+    table.add_column("what stood in the way", overflow="fold")
+    for one in report.seeds:
+        cells = _cells(one)
+        style = "" if one.solved_at else "yellow"
+        table.add_row(*(escape(cell) for cell in cells), style=style)
+    if report.seeds:
+        out.print(table)
+    for verdict in report.verdicts:
+        _print_verdict(verdict)
+    print_text(summary(report))
+    if report.seeds:
+        print_text(f"Look at them with: workbench review {shlex.quote(str(report.seeds[0].path.parent))}")
+
+
+def summary(report: SolveReport) -> str:
+    """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``"""
+    steps = "" if report.median_steps is None else f", in {report.median_steps:g} control steps (median)"
+    return f"Solved {len(report.solved)} of {len(report.seeds)} seeds{steps}. {report.seconds:.0f} s."
+
+
+def _cells(one: SolvedSeed) -> Iterator[str]:
+    yield str(one.seed)
+    yield str(one.solved_at) if one.solved_at else "-"
+    yield str(one.steps)
+    yield f"{one.total_reward:.3f}"
+    yield f"{one.seconds:.1f}"
+    yield one.in_the_way
+
+
+def _print_verdict(verdict: Verdict) -> None:
+    rule = RULES[verdict.rule]
+    out.print(f"\n[yellow]{rule.id}[/] ({rule.degree})", soft_wrap=True)
+    out.print(f"  {escape(plain_text(verdict.message))}", soft_wrap=True)
+    out.print(f"  Otherwise: {escape(rule.otherwise)}", soft_wrap=True)
+    seeds = ", ".join(map(str, verdict.seeds[:12])) + (" ..." if len(verdict.seeds) > 12 else "")
+    out.print(f"  [dim]seeds {seeds}; workbench help {rule.id}[/]", soft_wrap=True)
+
+
+# --- for programs ----------------------------------------------------------------------------------------
+
+
+def as_json(report: SolveReport, what: SolveOptions) -> str:
+    """All that is known, as one object."""
+    return json_text(
+        {
+            "task": what.task,
+            "first_seed": what.options.seed,
+            "plan": vars(what.plan),
+            "env": what.options.env_kwargs,
+            "solved": len(report.solved),
+            "tried": len(report.seeds),
+            "median_steps": report.median_steps,
+            "seconds": round(report.seconds, 3),
+            "stopped": report.stopped,
+            "fails": report.fails,
+            "verdicts": [
+                {"rule": one.rule, "message": one.message, "seeds": list(one.seeds)}
+                for one in report.verdicts
+            ],
+            "seeds": [_row(one) for one in report.seeds],
+        }
+    )
+
+
+def as_csv(report: SolveReport, what: SolveOptions) -> str:
+    """A row for each seed."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list[str](_COLUMNS), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(_row(one) for one in report.seeds)
+    return text.getvalue()
+
+
+def as_junit(report: SolveReport, what: SolveOptions) -> str:
+    """A test case for each rule of `planning.verdicts` that is broken, and one for each seed: skipped where it was not solved,
+    which is no fault of the task by itself."""
+    cases = [_case(what, f"seed {one.seed}", one.seconds) for one in report.seeds]
+    for case, one in zip(cases, report.seeds, strict=True):
+        if not one.solved_at:
+            ElementTree.SubElement(case, "skipped", message=xml_text(one.in_the_way))
+    broken = [_case(what, verdict.rule, 0) for verdict in report.verdicts]
+    for case, verdict in zip(broken, report.verdicts, strict=True):
+        ElementTree.SubElement(case, "failure", type=verdict.rule, message=xml_text(verdict.message))
+    if not report.solved:
+        broken.append(_case(what, "solved", 0))
+        ElementTree.SubElement(broken[-1], "failure", type="solved", message="no seed was solved")
+    totals = {
+        "tests": str(len(cases) + len(broken)),
+        "failures": str(len(broken)),
+        "skipped": str(len(report.seeds) - len(report.solved)),
+        "time": f"{report.seconds:.3f}",
+    }
+    suites = ElementTree.Element("testsuites", {"name": "workbench solve", **totals})
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    suite = ElementTree.SubElement(
+        suites, "testsuite", {"name": xml_text(what.task), "timestamp": now, **totals}
+    )
+    suite.extend([*broken, *cases])
+    ElementTree.indent(suites)
+    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _case(what: SolveOptions, name: str, seconds: float) -> ElementTree.Element:
+    classname = xml_text(f"workbench.solve.{what.task}")
+    return ElementTree.Element("testcase", classname=classname, name=name, time=f"{seconds:.3f}")
+
+
+def _row(one: SolvedSeed) -> dict[str, Any]:
+    values = (
+        one.seed,
+        one.solved_at or None,
+        one.steps,
+        round(one.total_reward, 6),
+        round(one.seconds, 3),
+        one.in_the_way,
+        str(one.path),
+    )
+    return dict(zip(_COLUMNS, values, strict=True))

@@ -1,0 +1,277 @@
+"""What planned episodes tell of the reward: each verdict from numbers, with the seeds of the episodes that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.planning.episodes import PlannedEpisode
+
+_SAME = 0.002
+"""Of the range of rewards that were seen: what differs by less is the same."""
+_FALL = 0.25
+"""Of the rise from the first reward to that at success: a fall on the way that counts."""
+_LAST = 10
+"""Control steps at the end of an episode that are looked at, but no more than half of them."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What some episodes show."""
+
+    rule: str
+    """Its id in the table of rules."""
+    message: str
+    seeds: tuple[int, ...]
+    """Of the episodes that show it."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The planned episodes of a task, and what is compared within them."""
+
+    all: tuple[PlannedEpisode, ...]
+
+    @property
+    def solved(self) -> list[PlannedEpisode]:
+        return [one for one in self.all if one.solved_at]
+
+    @property
+    def unsolved(self) -> list[PlannedEpisode]:
+        return [one for one in self.all if not one.solved_at and one.steps]
+
+    @property
+    def at_success(self) -> float | None:
+        """The median reward of the step that succeeds; None without one."""
+        rewards = [one.reward[one.solved_at - 1] for one in self.solved]
+        return float(np.median(rewards)) if rewards else None
+
+    @property
+    def same(self) -> float:
+        """Rewards of a control step that differ by less are the same."""
+        seen = [one.reward[np.isfinite(one.reward)] for one in self.all]
+        rewards = np.concatenate([*seen, np.zeros(0, np.float32)])
+        return _SAME * float(np.ptp(rewards)) if len(rewards) else 0.0
+
+    @property
+    def without_reward(self) -> bool:
+        """Whether no rollout earned more than another before a success: a sparse reward, or none."""
+        flat = [(one.best - one.worst)[: (one.solved_at or one.steps + 1) - 1] for one in self.all]
+        return bool(self.all) and all(not len(each) or float(each.max()) == 0 for each in flat)
+
+
+def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[Verdict]:
+    """The verdicts on a task's reward, each at most once."""
+    every = Episodes(tuple(episodes))
+    return [verdict for find in RULES.values() if (verdict := find(every)) is not None]
+
+
+def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> str:
+    """Why an episode was not solved, in a few words; empty if it was."""
+    if episode.solved_at:
+        return ""
+    if episode.failed_at:
+        return f"failed at step {episode.failed_at}"
+    every = Episodes(tuple(episodes))
+    if every.without_reward:
+        return "no rollout earned more than another"
+    if _earns_like_success(every, episode):
+        return f"earned {_end(episode).mean():.3f} a step without success"
+    if _is_flat(every, episode):
+        return f"all rollouts earned the same from step {_since(_spread_a_step(episode), every.same)} on"
+    if _is_stuck(every, episode):
+        return (
+            f"nothing earned more than holding still from step {_since(_gain_a_step(episode), every.same)} on"
+        )
+    return "not solved when the time was up"
+
+
+# --- one function each -----------------------------------------------------------------------------------
+
+
+def exploited(episodes: Episodes) -> Verdict | None:
+    """Episodes without success that earn at their end at least what successful ones earn when they succeed."""
+    found = [one for one in episodes.unsolved if _earns_like_success(episodes, one)]
+    if not found:
+        return None
+    told = ", ".join(f"{name} {value:.4g}" for name, value in found[0].evaluate.items())
+    said = f"; evaluate said at the end of seed {found[0].seed}: {told}" if told else ""
+    rate = float(np.median([_end(one).mean() for one in found]))
+    return Verdict(
+        "reward-exploited",
+        f"{len(found)} of {len(episodes.all)} episodes earned {rate:.3f} a step at their end without success, and successful "
+        f"ones {episodes.at_success:.3f} at theirs{said}",
+        _seeds(found),
+    )
+
+
+def flat(episodes: Episodes) -> Verdict | None:
+    """Unsolved episodes at whose end all rollouts earned the same, so that nothing leads on."""
+    if episodes.without_reward and episodes.unsolved:
+        return Verdict(
+            "reward-flat",
+            "no rollout earned more than another before success: with a sparse reward planning finds only what it happens on. "
+            "Give the task a dense reward, or record demonstrations in another way (workbench record --actions FILE)",
+            _seeds(episodes.unsolved),
+        )
+    found = [one for one in episodes.unsolved if not _ended_early(one) and _is_flat(episodes, one)]
+    if not found:
+        return None
+    first = found[0]
+    since = _since(_spread_a_step(first), episodes.same)
+    still = [
+        name
+        for name, spread in first.terms.items()
+        if not (_end(first, spread) > _least(episodes, first)).any()
+    ]
+    named = f"; flat are {', '.join(still)}" if still else ""
+    return Verdict(
+        "reward-flat",
+        f"at the end of {len(found)} of {len(episodes.all)} episodes all rollouts earned the same, whatever they did: seed "
+        f"{first.seed} from step {since} on, at {first.reward[-1]:.3f} a step{named}",
+        _seeds(found),
+    )
+
+
+def stuck(episodes: Episodes) -> Verdict | None:
+    """Unsolved episodes at whose end no rollout earned more than one that holds still."""
+    found = [
+        one
+        for one in episodes.unsolved
+        if not _ended_early(one)
+        and not _earns_like_success(episodes, one)
+        and not _is_flat(episodes, one)
+        and _is_stuck(episodes, one)
+    ]
+    if not found:
+        return None
+    first = found[0]
+    since = _since(_gain_a_step(first), episodes.same)
+    return Verdict(
+        "reward-stuck",
+        f"at the end of {len(found)} of {len(episodes.all)} episodes nothing earned more than holding still within "
+        f"{first.horizon} steps: seed {first.seed} from step {since} on, at {first.reward[-1]:.3f} a step. What leads on costs "
+        "reward first, or is further away than a plan looks (--horizon)",
+        _seeds(found),
+    )
+
+
+def against(episodes: Episodes) -> Verdict | None:
+    """Solved episodes on whose way the reward fell."""
+    falls = [(one, *_largest_fall(one.reward[: one.solved_at])) for one in episodes.solved]
+    found = [
+        (one, high, low)
+        for one, high, low in falls
+        if one.reward[high] - one.reward[low]
+        > max(_FALL * abs(one.reward[one.solved_at - 1] - one.reward[0]), episodes.same)
+    ]
+    if not found or 2 * len(found) <= len(episodes.solved):
+        return None
+    one, high, low = found[0]
+    return Verdict(
+        "reward-against",
+        f"on the way to success the reward falls, in {len(found)} of {len(episodes.solved)} solved episodes: seed {one.seed} "
+        f"from {one.reward[high]:.3f} at step {high + 1} to {one.reward[low]:.3f} at step {low + 1}, success at step "
+        f"{one.solved_at}",
+        _seeds([each for each, *_ in found]),
+    )
+
+
+def lost(episodes: Episodes) -> Verdict | None:
+    """Solved episodes that were not solved any more a few steps later, though the reward was sought all the time."""
+    found = [one for one in episodes.solved if not one.success[one.solved_at - 1 :].all()]
+    if not found or 2 * len(found) <= len(episodes.solved):
+        return None
+    first = found[0]
+    again = int(first.success[first.solved_at - 1 :].argmin())
+    return Verdict(
+        "success-lost",
+        f"success comes and goes in {len(found)} of {len(episodes.solved)} solved episodes: seed {first.seed} had it at step "
+        f"{first.solved_at} and not {again} {'step' if again == 1 else 'steps'} later, while it was after reward",
+        _seeds(found),
+    )
+
+
+def failing_pays(episodes: Episodes) -> Verdict | None:
+    """Episodes that failed where each step costs, so that an early end earns more than going on."""
+    found = [one for one in episodes.unsolved if one.failed_at and float(one.reward.mean()) < 0]
+    if not found or 2 * len(found) <= len(episodes.all):
+        return None
+    first = found[0]
+    return Verdict(
+        "failing-pays",
+        f"{len(found)} of {len(episodes.all)} episodes end by failing, and rewards are below 0: seed {first.seed} failed at "
+        f"step {first.failed_at}, with {first.reward.mean():.3f} a step until then. Nothing is paid after a fail, so that the "
+        "earliest one earns most",
+        _seeds(found),
+    )
+
+
+RULES: dict[str, Callable[[Episodes], Verdict | None]] = {
+    "reward-exploited": exploited,
+    "reward-flat": flat,
+    "reward-stuck": stuck,
+    "reward-against": against,
+    "success-lost": lost,
+    "failing-pays": failing_pays,
+}
+"""By the ids of the rules, in the order in which they are told."""
+
+
+# --- what is looked at -----------------------------------------------------------------------------------
+
+
+def _end(episode: PlannedEpisode, row: NDArray[Any] | None = None) -> NDArray[Any]:
+    """The last steps of an episode: of its rewards, or of another row (T,)."""
+    row = episode.reward if row is None else row
+    return row[-max(1, min(_LAST, episode.steps // 2)) :]
+
+
+def _ended_early(episode: PlannedEpisode) -> bool:
+    return episode.failed_at > 0
+
+
+def _earns_like_success(episodes: Episodes, episode: PlannedEpisode) -> bool:
+    paid = episodes.at_success
+    return paid is not None and not _ended_early(episode) and float(_end(episode).mean()) >= paid
+
+
+def _spread_a_step(episode: PlannedEpisode) -> NDArray[Any]:
+    return (episode.best - episode.worst) / episode.horizon
+
+
+def _gain_a_step(episode: PlannedEpisode) -> NDArray[Any]:
+    return (episode.best - episode.hold) / episode.horizon
+
+
+def _least(episodes: Episodes, episode: PlannedEpisode) -> float:
+    return episodes.same * episode.horizon
+
+
+def _is_flat(episodes: Episodes, episode: PlannedEpisode) -> bool:
+    return bool((_end(episode, _spread_a_step(episode)) <= episodes.same).all())
+
+
+def _is_stuck(episodes: Episodes, episode: PlannedEpisode) -> bool:
+    return bool((_end(episode, _gain_a_step(episode)) <= episodes.same).all())
+
+
+def _since(row: NDArray[Any], most: float) -> int:
+    """The step, from 1 on, after which a row stays at or below `most`."""
+    above = np.flatnonzero(row > most)
+    return int(above[-1]) + 2 if len(above) else 1
+
+
+def _largest_fall(row: NDArray[np.float32]) -> tuple[int, int]:
+    """Where the highest value before the lowest one after it is, and that one: the two between which a row falls most."""
+    highest = np.maximum.accumulate(row)
+    low = int((highest - row).argmax())
+    return int(row[: low + 1].argmax()), low
+
+
+def _seeds(episodes: Sequence[PlannedEpisode]) -> tuple[int, ...]:
+    return tuple(episode.seed for episode in episodes)

@@ -1,0 +1,156 @@
+"""Writes episodes as one file of demonstrations, as ManiSkill's baselines load it: ``traj_0`` ... and a ``.json`` beside it."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from workbench.recording.episode.document import json_text
+from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.row import UnreadableRecording
+from workbench.recording.maniskill.write import maniskill_json, put_columns
+
+_FLAT = "state"
+"""The observation mode in which ManiSkill gives one vector."""
+
+
+class OtherDemonstration(ValueError):
+    """An episode cannot be in one file with the others; the message is a sentence."""
+
+
+@dataclass
+class Demonstrations:
+    """What was written."""
+
+    file: Path
+    episodes: int = 0
+    steps: int = 0
+    left_out: int = 0
+    """Episodes without success."""
+    not_fitting: list[str] = field(default_factory=list)
+    """A sentence for each episode that was left out since it does not fit."""
+
+
+def export_maniskill(
+    sources: Sequence[tuple[str, Callable[[], Episode]]],
+    file: Path,
+    only_successes: bool = False,
+    only_fitting: bool = False,
+    on_progress: Callable[[int, str], None] = lambda done, doing: None,
+) -> Demonstrations:
+    """Write these episodes to a new ``.h5`` and its ``.json``.
+
+    One by one, so memory use does not grow with their number. Observations of the mode ``state`` are one vector (T + 1, D), as
+    ManiSkill records them. The files get their names when they are complete.
+
+    Args:
+        sources: a name for messages and a function that reads the episode.
+        file: ends in ``.h5``; neither it nor its ``.json`` may exist.
+        only_successes: leave out episodes that reach success at no step.
+        only_fitting: leave out episodes that cannot be read or do not fit the first one.
+        on_progress: called with the number of finished episodes, and the name of the current one.
+
+    Raises:
+        OtherDemonstration: an episode cannot be read, or is of another task or made otherwise than the first one.
+        ValueError: there is no episode to write, or `file` has another suffix.
+        OSError: it cannot be written.
+    """
+    file = Path(file).absolute()
+    if file.suffix != ".h5":
+        raise ValueError(f"{file.name}: demonstrations are a file that ends in .h5")
+    for path in (file, file.with_suffix(".json")):
+        if path.exists():
+            raise FileExistsError(
+                f"There is something at {path} already; name a file that does not exist yet."
+            )
+    made = Demonstrations(file)
+    parts = [file.parent / f".{file.stem}.{uuid.uuid4().hex[:8]}{suffix}" for suffix in (".json", ".h5")]
+    document: dict[str, Any] | None = None
+    first: dict[str, Any] = {}
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(parts[1], "x") as written:
+            for number, (name, read) in enumerate(sources):
+                on_progress(number, name)
+                try:
+                    episode = _read(name, read)
+                    shape = _shape(episode)
+                    if document is not None and (other := _difference(first, shape)):
+                        raise OtherDemonstration(f"{name}: {other}")
+                except OtherDemonstration as error:
+                    if not only_fitting:
+                        raise
+                    made.not_fitting.append(str(error))
+                    continue
+                success = episode.flags.get("success")
+                if only_successes and (success is None or not success.any()):
+                    made.left_out += 1
+                    continue
+                entry = maniskill_json(episode)
+                if document is None:
+                    document, first = {**entry, "episodes": []}, shape
+                trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
+                put_columns(_flat(episode), trajectory)
+                document["episodes"].append({**entry["episodes"][0], "episode_id": made.episodes})
+                made.episodes, made.steps = made.episodes + 1, made.steps + episode.length
+        if document is None:
+            raise ValueError("\n".join(made.not_fitting) or "There is no episode to write.")
+        with parts[0].open("x") as described:
+            described.write(json_text(document, indent=2))
+        for part in parts:
+            os.rename(part, file.with_suffix(part.suffix))
+    except OSError as error:
+        if isinstance(error, FileExistsError) or error.errno is None:
+            raise
+        raise OSError(error.errno, f"Cannot write {file}: {os.strerror(error.errno)}.") from error
+    finally:
+        for part in parts:
+            part.unlink(missing_ok=True)
+    on_progress(len(sources), "done")
+    return made
+
+
+def _read(name: str, read: Callable[[], Episode]) -> Episode:
+    try:
+        episode = read()
+    except (OSError, UnreadableRecording) as error:
+        raise OtherDemonstration(f"{name} cannot be read: {error}") from error
+    if episode.length == 0:
+        raise OtherDemonstration(f"{name}: it has no step")
+    return episode
+
+
+def _shape(episode: Episode) -> dict[str, Any]:
+    """What all episodes of a file have in common, by what a person calls it."""
+    info = episode.info
+    return {
+        "task": info.task,
+        "control mode": info.control_mode,
+        "arguments of the env": dict(info.env_kwargs),
+        "number of action dimensions": episode.action.shape[1],
+        "observations": {name: values.shape[1:] for name, values in episode.obs.items()},
+    }
+
+
+def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
+    """In what an episode differs from the first one, as a sentence; empty if in nothing."""
+    for what, wanted in first.items():
+        if other[what] != wanted:
+            return f"its {what} is {other[what]!r}, and that of the first recording {wanted!r}"
+    return ""
+
+
+def _flat(episode: Episode) -> Episode:
+    """With one vector of observations where the env gives one."""
+    if episode.info.env_kwargs.get("obs_mode") != _FLAT or not episode.obs:
+        return episode
+    count = episode.length + 1
+    rows = [np.asarray(values, np.float32).reshape(count, -1) for values in episode.obs.values()]
+    return replace(episode, obs={"": np.concatenate(rows, axis=1)})
