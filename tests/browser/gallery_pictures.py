@@ -6,7 +6,6 @@ Not a test. It opens each example on the real page and writes ``web_assets/scree
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.take_screenshots import POLICY, Desk, picture_of
+from tests.browser.take_screenshots import POLICY, Desk, as_a_new_person, picture_of
 from tests.drive.page import browser_at, close_notice, new_page, open_workbench
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
@@ -69,7 +68,7 @@ VIEWS: dict[str, View] = {
     "different_objects": View("Reward", 9, nearer=1),
     "fail_conditions": View("Reward", 9, 40, nearer=1),
     "obs_history": View("Inspect", 4, 20, keys=ONE, turned=(-250, 0), nearer=2, show="observation"),
-    "own_robot": View("Run", 4, 12, keys=ONE, turned=(-220, 0), nearer=2),
+    "own_robot": View("Run", 4, 12, nearer=1),
     "reward_terms": View("Reward", 4, 22, "solvers.py:lift_cube", HAND, ONE, (-220, 0), 2),
     "swing_up": View("Reward", 9, 30),
     "task_state": View("Reward", 9, 12),
@@ -147,8 +146,7 @@ def main(names: list[str]) -> None:
     unknown = set(names) - VIEWS.keys()
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(VIEWS)}")
-    # Neither what this person trusts and has used is shown, nor does it get what is pressed here.
-    os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-pictures-")
+    as_a_new_person()
     for name, view in VIEWS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:

@@ -395,6 +395,12 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
 """``page`` takes run, cameras and banner too, ``review`` library and compare, ``tutorial`` all of its own."""
 
 
+def as_a_new_person() -> None:
+    """Neither is what this person trusts and has opened in the pictures, nor is it changed by what is pressed here."""
+    for folder in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):
+        os.environ[folder] = tempfile.mkdtemp(prefix="workbench-pictures-")
+
+
 def main(names: list[str]) -> None:
     chromium = find_chromium()
     if chromium is None:
@@ -402,8 +408,7 @@ def main(names: list[str]) -> None:
     unknown = set(names) - {*SHOTS, "demo"}
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(SHOTS)} and demo")
-    # Neither what this person trusts and has used is shown, nor does it get what is pressed here.
-    os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-pictures-")
+    as_a_new_person()
     for name, shot in SHOTS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:

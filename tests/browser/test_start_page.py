@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.drive.page import TASK, Opened, open_workbench, page_at
+from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at
 from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.session.tasks.registered import LIST_FILE
 from workbench.ui.app.trust_dialog import ONCE
@@ -180,8 +180,10 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
 ) -> None:
     with page_at(browser, started.url) as (page, errors):
         open_list(page)
+        close_notice(page)
         page.get_by_text("New task", exact=True).click()
-        name = page.get_by_role("textbox", name="Name", exact=True)
+        # viser's text fields are not tied to their labels.
+        name = page.get_by_text("Name", exact=True).locator("xpath=following::input[1]")
         page.get_by_role("combobox", name="Template").click()
         expect(page.get_by_role("option")).to_have_text([f"{one.name}: {one.about}" for one in TEMPLATES])
         page.get_by_role("option", name="locomotion").click()
